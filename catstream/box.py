@@ -1,0 +1,98 @@
+"""Boxes: axis-aligned rectangles in pixels, `x, y, w, h`, as the benchmarks write them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from catstream.errors import BoxError
+
+__all__ = ["Box"]
+
+
+class Box(NamedTuple):
+    """A rectangle in pixels: its top left corner, its width and its height.
+
+    >>> Box(10, 20, 30, 40).centre
+    (25.0, 40.0)
+    >>> Box(0, 0, 10, 10).overlap(Box(5, 0, 10, 10))
+    0.3333333333333333
+    """
+
+    x: float
+    y: float
+    w: float
+    h: float
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """The point in the middle, (x, y)."""
+        return self.x + self.w / 2, self.y + self.h / 2
+
+    @property
+    def area(self) -> float:
+        """Square pixels."""
+        return self.w * self.h
+
+    def scaled(self, factor: float) -> Box:
+        """The box with the same centre and `factor` times the width and the height."""
+        w, h = self.w * factor, self.h * factor
+        return Box(self.x + (self.w - w) / 2, self.y + (self.h - h) / 2, w, h)
+
+    def centred(self, x: float, y: float) -> Box:
+        """The box with the same size around another centre."""
+        return Box(x - self.w / 2, y - self.h / 2, self.w, self.h)
+
+    def overlap(self, other: Box) -> float:
+        """Intersection over union, 0 to 1: the overlap score S of the benchmarks."""
+        w = min(self.x + self.w, other.x + other.w) - max(self.x, other.x)
+        h = min(self.y + self.h, other.y + other.h) - max(self.y, other.y)
+        if w <= 0 or h <= 0:
+            return 0.0
+        shared = w * h
+        return shared / (self.area + other.area - shared)
+
+    @classmethod
+    def parse(cls, text: str) -> Box:
+        """Read `x,y,w,h` (commas, blanks or tabs between them).
+
+        Raises
+        ------
+        BoxError
+            Where there are not four numbers.
+
+        >>> Box.parse("10,20,30,40")
+        Box(x=10.0, y=20.0, w=30.0, h=40.0)
+        """
+        fields = text.replace(",", " ").split()
+        try:
+            x, y, w, h = (float(field) for field in fields)
+        except ValueError:
+            raise BoxError(
+                f"a box is four numbers x,y,w,h in pixels, got {text!r}: for example --box 120,80,64,48"
+            ) from None
+        return cls(x, y, w, h)
+
+    def inside(self, width: int, height: int) -> Box:
+        """The same box, once it is known to be a start for a frame of this size.
+
+        Raises
+        ------
+        BoxError
+            Where a number is not finite, the box has no area, or its centre
+            lies outside the frame.
+        """
+        if not all(math.isfinite(value) for value in self):
+            raise BoxError(f"a box needs four finite numbers, got {self}: give x,y,w,h in pixels")
+        if self.w < 2 or self.h < 2:
+            raise BoxError(f"a box needs a width and a height of at least 2 pixels, got {self.w:g} x {self.h:g}")
+        x, y = self.centre
+        if not (0 <= x < width and 0 <= y < height):
+            raise BoxError(
+                f"the box {self} has its centre at ({x:g}, {y:g}), outside the frame of "
+                f"{width} x {height} pixels: give x,y,w,h with x from the left and y from the top"
+            )
+        return self
+
+    def __str__(self) -> str:
+        return ",".join(f"{value:g}" for value in self)

@@ -1,0 +1,32 @@
+"""What can go wrong, by name.
+
+Every message says what was expected, what came, and what to do. The command
+line prints it as one line and exits with 1; a program catches
+`CatstreamError`, or one of its kinds.
+"""
+
+__all__ = ["BoxError", "CatstreamError", "ProtocolError", "ServiceError", "SettingsError", "VideoError"]
+
+
+class CatstreamError(Exception):
+    """Any error that catstream raises on purpose."""
+
+
+class SettingsError(CatstreamError, ValueError):
+    """A setting that does not exist, or a value it cannot take."""
+
+
+class BoxError(CatstreamError, ValueError):
+    """A box that is not in the frame, has no area, or is not a number."""
+
+
+class VideoError(CatstreamError):
+    """A source of frames, or a place for results, that cannot be used."""
+
+
+class ProtocolError(CatstreamError, ValueError):
+    """A message that is not what the channel carries."""
+
+
+class ServiceError(CatstreamError):
+    """A process of the pipeline that failed, or that cannot start."""

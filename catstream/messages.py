@@ -1,0 +1,181 @@
+"""The facts that travel between the stages.
+
+Each message is a noun, frozen, and complete by itself. In one process the
+stages hand them over as they are; between processes `catstream.wire` turns
+them into msgpack and back, and checks every field on arrival.
+
+`d` is the length of a feature row (`catstream.detection.hog.row_length`), `n`
+the coreset size, frames count from 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from catstream.box import Box
+
+__all__ = [
+    "End",
+    "Features",
+    "Health",
+    "Model",
+    "Motion",
+    "Sample",
+    "State",
+    "Stored",
+    "Summary",
+    "Track",
+]
+
+State = Literal["bootstrapping", "present", "absent"]
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """What one frame teaches: rows for the coreset trees, detector -> compressor.
+
+    seq      1, 2, 3 ... without a gap: one message a frame
+    frame    the frame the rows were cut from
+    time     seconds since the start of the source
+    box      where the object was found, or None
+    rows     float32 (k, d); k is 0 where the frame teaches nothing
+    labels   float32 (k,): 1 the object, 0 background, between them a near miss
+    weights  float32 (k,): how many ordinary rows each counts for, above 0
+    """
+
+    seq: int
+    frame: int
+    time: float
+    box: Box | None
+    rows: np.ndarray
+    labels: np.ndarray
+    weights: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """The compressor's acknowledgement, compressor -> detector.
+
+    seq      every Features up to and with this one is stored
+    version  the newest Sample made so far, 0 before the first
+    """
+
+    seq: int
+    version: int
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A hierarchical sample of one coreset tree (paper, section "Coreset Appearance Model").
+
+    rows    float32 (r, d'), r <= 2n, spread and rescaled: a row weighs one original row
+    mean    float32 (d',), the exact mean of all rows ever inserted
+    count   how many rows that was
+    levels  level of each node in memory, oldest first, strictly falling
+    """
+
+    rows: np.ndarray
+    mean: np.ndarray
+    count: int
+    levels: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What the trainer learns from, compressor -> trainer; only the newest counts.
+
+    version     1, 2, 3 ... in order of making
+    frame       newest frame that it summarises
+    object      rows of the object (d columns)
+    background  rows of everything else (d columns)
+    loss        rows [x, 1, y] times the root of their weight (d + 2 columns)
+    centres     float64 (m, 2), object's centre in the last frames in pixels, NaN where absent
+    """
+
+    version: int
+    frame: int
+    object: Summary
+    background: Summary
+    loss: Summary
+    centres: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Parameters of the Kalman filter of the centre, found by EM (paper, section "Classification").
+
+    process      float64 (4, 4), covariance of what the constant-velocity model misses a frame
+    observation  float64 (2, 2), covariance of a measured centre, pixels squared
+    """
+
+    process: np.ndarray
+    observation: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A trained appearance model, trainer -> detector and anyone.
+
+    version  that of the Sample it was learned from
+    frame    newest frame that the sample summarises
+    weights  float32 (d,)
+    bias     score of a window = weights @ row + bias; 0 at the background's mean, 1 at the object's
+    motion   parameters of the Kalman filter, or None before EM had enough centres
+    """
+
+    version: int
+    frame: int
+    weights: np.ndarray
+    bias: float
+    motion: Motion | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Where the object is in one frame, detector -> anyone.
+
+    seq            1, 2, 3 ...: a gap means that this subscriber missed some
+    frame          number of the frame
+    time           seconds since the start of the source
+    state          "bootstrapping" until the first model, then "present" or "absent"
+    box            where, in pixels of the frame; None while absent
+    score          confidence: about 0 on background, about 1 on the object
+    model_version  the model that scored it, 0 before the first
+    """
+
+    seq: int
+    frame: int
+    time: float
+    state: State
+    box: Box | None
+    score: float
+    model_version: int
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """How a process is, once a second, every process -> anyone.
+
+    process   its name
+    time      seconds since the epoch
+    counters  what it counts: name -> number
+    """
+
+    process: str
+    time: float
+    counters: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """The last message of a stream: nothing follows.
+
+    reason  why it ended, for a person to read
+    failed  whether that was an error
+    """
+
+    reason: str
+    failed: bool = False

@@ -1,0 +1,177 @@
+"""Settings: every number that the paper and the design name, with its unit, default and bounds.
+
+Values come, each over the one before, from the defaults here, a preset, a TOML
+file, environment variables (`CATSTREAM_CORESET_SIZE=128`), and what the program
+or the command line sets (`--set coreset_size=128`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_type_hints
+
+import msgspec
+from msgspec import Meta
+
+from catstream.errors import SettingsError
+
+__all__ = ["PRESETS", "Settings", "describe"]
+
+
+def _about(description: str, **bounds: float) -> Meta:
+    return Meta(description=description, **bounds)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All settings of a run. Frozen: `dataclasses.replace` makes a changed copy.
+
+    >>> Settings(coreset_size=128).coreset_size
+    128
+    """
+
+    # --- running -------------------------------------------------------------------------------
+    endpoint: Annotated[
+        str,
+        _about(
+            "Where the processes meet: a folder for ipc:// sockets (empty: a fresh private one), "
+            "or tcp://HOST:PORT, the first of the ports that the channels take."
+        ),
+    ] = ""
+    lockstep: Annotated[
+        bool,
+        _about("Repeat a run bit for bit: the detector waits for each model before it goes on."),
+    ] = False
+    seed: Annotated[int, _about("Seed of everything random.", ge=0)] = 0
+    window: Annotated[
+        int,
+        _about("Features messages that may be sent and not yet stored.", ge=1, le=65536),
+    ] = 256
+    checkpoint_seconds: Annotated[
+        float,
+        _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600),
+    ] = 1.0
+
+    # --- the coreset trees (paper, "Coreset Tree") -----------------------------------------------
+    coreset_size: Annotated[int, _about("n: rows of a node of a coreset tree.", ge=2, le=4096)] = 64
+
+    # --- training --------------------------------------------------------------------------------
+    classifier: Annotated[
+        Literal["joint", "least-squares", "one-class"],
+        _about(
+            "How a model is learned: least squares of the two trees, joined with that of the loss tree (joint), "
+            "of the two trees alone (least-squares), or the paper's one-class linear SVM (one-class)."
+        ),
+    ] = "joint"
+
+    # --- detection ---------------------------------------------------------------------------------
+    detection: Annotated[
+        Literal["local", "full"],
+        _about("Search around the object and the whole frame when unsure (local), or all of every frame (full)."),
+    ] = "local"
+
+    @classmethod
+    def load(
+        cls,
+        *,
+        preset: str | None = None,
+        file: str | os.PathLike[str] | None = None,
+        overrides: Mapping[str, Any] | Iterable[str] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> Settings:
+        """Gather settings from all their places.
+
+        Parameters
+        ----------
+        preset : a name of `PRESETS`, or None
+        file : path of a TOML file with `name = value` lines, or None
+        overrides : names and values, or texts `name=value` as `--set` takes them
+        environment : variables, `CATSTREAM_NAME=value`; the process's own where None
+
+        Raises
+        ------
+        SettingsError
+            For a name that does not exist (names the nearest), or a value that
+            does not fit.
+        """
+        values: dict[str, Any] = {}
+        if preset is not None:
+            if preset not in PRESETS:
+                raise SettingsError(f"there is no preset {preset!r}{_nearest(preset, PRESETS)}")
+            values.update(PRESETS[preset])
+        if file is not None:
+            values.update(_read(Path(file)))
+        for variable, text in (os.environ if environment is None else environment).items():
+            if variable.startswith("CATSTREAM_"):
+                values[variable.removeprefix("CATSTREAM_").lower()] = text
+        if isinstance(overrides, Mapping):
+            values.update(overrides)
+        else:
+            for pair in overrides:
+                name, sign, text = pair.partition("=")
+                if not sign:
+                    raise SettingsError(f"a setting is given as name=value, got {pair!r}")
+                values[name.strip()] = text.strip()
+        return cls.of(values)
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Settings:
+        """Check names and values (texts are read as their setting's type)."""
+        kinds = get_type_hints(cls, include_extras=True)
+        checked = {}
+        for name, value in values.items():
+            if name not in kinds:
+                raise SettingsError(f"there is no setting {name!r}{_nearest(name, kinds)}")
+            try:
+                checked[name] = msgspec.convert(value, kinds[name], strict=not isinstance(value, str))
+            except msgspec.ValidationError as error:
+                raise SettingsError(f"setting {name} cannot be {value!r}: {error}") from None
+        return cls(**checked)
+
+    def values(self) -> dict[str, Any]:
+        """All of them, by name."""
+        return dataclasses.asdict(self)
+
+
+#: What the paper set, and other points of departure, by name.
+PRESETS: dict[str, dict[str, Any]] = {
+    "one-class-paper": {"classifier": "one-class", "detection": "full"},
+}
+
+
+def describe() -> list[tuple[str, str, Any, str]]:
+    """Name, type, default and meaning of every setting: for `--help` and the docs."""
+    kinds = get_type_hints(Settings, include_extras=True)
+    rows = []
+    for field in dataclasses.fields(Settings):
+        kind, meta = kinds[field.name].__origin__, kinds[field.name].__metadata__[0]
+        bounds = [
+            f"{sign} {value:g}"
+            for sign, value in ((">=", meta.ge), (">", meta.gt), ("<=", meta.le), ("<", meta.lt))
+            if value is not None
+        ]
+        options = getattr(kind, "__args__", None)
+        text = " | ".join(map(str, options)) if options else kind.__name__
+        rows.append((field.name, " ".join([text, ", ".join(bounds)]).strip(), field.default, meta.description))
+    return rows
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            return tomllib.load(file)
+    except OSError as error:
+        raise SettingsError(f"cannot read the settings file {path}: {error.strerror}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"the settings file {path} is not TOML: {error}") from None
+
+
+def _nearest(name: str, names: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(names), n=1)
+    return f", did you mean {near[0]!r}?" if near else f": there are {', '.join(sorted(names))}"
