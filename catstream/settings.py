@@ -61,6 +61,10 @@ class Settings:
     # --- the coreset trees (paper, "Coreset Tree") -----------------------------------------------
     coreset_size: Annotated[int, _about("n: rows of a node of a coreset tree.", ge=2, le=4096)] = 64
 
+    train_frames: Annotated[
+        int, _about("Frames at least between two samples that the trainer learns from.", ge=1)
+    ] = 5
+
     # --- training --------------------------------------------------------------------------------
     classifier: Annotated[
         Literal["joint", "least-squares", "one-class"],
@@ -69,12 +73,34 @@ class Settings:
             "of the two trees alone (least-squares), or the paper's one-class linear SVM (one-class)."
         ),
     ] = "joint"
+    ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 2.0
+    loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
+    motion_frames: Annotated[int, _about("Frames whose centres the Kalman filter's parameters are learned from.", ge=8)] = 64
 
     # --- detection ---------------------------------------------------------------------------------
     detection: Annotated[
         Literal["local", "full"],
         _about("Search around the object and the whole frame when unsure (local), or all of every frame (full)."),
     ] = "local"
+
+    object_weight: Annotated[float, _about("object_weight")] = 4.0
+    near_misses: Annotated[int, _about("near_misses")] = 12
+    near_sigma: Annotated[float, _about("near_sigma")] = 0.9
+    negatives: Annotated[int, _about("negatives")] = 12
+    first_negatives: Annotated[int, _about("first_negatives")] = 16
+    sure_score: Annotated[float, _about("sure_score")] = 0.55
+    lost_score: Annotated[float, _about("lost_score")] = 0.3
+    present_score: Annotated[float, _about("present_score")] = 0.3
+    teach_score: Annotated[float, _about("teach_score")] = 0.4
+    global_frames: Annotated[int, _about("global_frames")] = 10
+    jump_margin: Annotated[float, _about("jump_margin")] = 0.1
+    mine_frames: Annotated[int, _about("mine_frames")] = 5
+    mine_score: Annotated[float, _about("mine_score")] = 0.6
+    mine_count: Annotated[int, _about("mine_count")] = 10
+    distance_penalty: Annotated[float, _about("distance_penalty")] = 0.1
+    scale_penalty: Annotated[float, _about("scale_penalty")] = 0.01
+    scale_step: Annotated[float, _about("scale_step")] = 0.03
+    scale_rate: Annotated[float, _about("scale_rate")] = 0.7
 
     @classmethod
     def load(

@@ -1,0 +1,162 @@
+"""The compressor: every frame's features in, now and then a sample to learn from out.
+
+It is the only owner of the coreset trees: one for the object (the paper's), one
+for the background, and one for the loss, whose rows [x, 1, y] times the root of
+their weight make `||A [w; b; -1]||^2` the squared error of any linear model.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+
+import numpy as np
+
+from catstream.box import Box
+from catstream.compression import storage
+from catstream.compression.tree import CoresetTree
+from catstream.errors import ProtocolError
+from catstream.messages import Features, Sample
+from catstream.settings import Settings
+
+__all__ = ["Compressor"]
+
+_TREES = ("object", "background", "loss")
+
+
+class Compressor:
+    """Summarises all frames so far; answers with a sample when there is something new to learn.
+
+    Constant time a frame on average, logarithmic memory. The same messages make
+    the same samples, bit for bit, also across `save` and `load`.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.trees = {name: CoresetTree(settings.coreset_size) for name in _TREES}
+        self.centres: deque[tuple[float, float]] = deque(maxlen=settings.motion_frames)
+        self.seq = 0
+        self.frame = -1
+        self.box: Box | None = None
+        self.version = 0
+        self._sampled_leaves = 0
+        self._sampled_frame = -1
+
+    def take(self, features: Features) -> Sample | None:
+        """Store one frame's features; a sample where the trees have grown enough since the last.
+
+        A message that is stored already (by `seq`) is ignored.
+
+        Raises
+        ------
+        ProtocolError
+            Where a message is missing before this one, or its rows are of
+            another length than those before. Nothing of it is stored.
+        """
+        if features.seq <= self.seq:
+            return None
+        if features.seq != self.seq + 1:
+            raise ProtocolError(
+                f"features {features.seq} came after {self.seq}: {features.seq - self.seq - 1} are missing, "
+                "send from the one after the last acknowledged"
+            )
+        rows, labels = features.rows, features.labels
+        if len(rows):
+            # Only rows of the right length get as far as the first tree, so that all three hold the same frames.
+            self.trees["loss"].insert(_loss_rows(rows, labels, features.weights))
+            self.trees["object"].insert(rows[labels == 1])
+            self.trees["background"].insert(rows[labels == 0])
+        self.seq, self.frame = features.seq, features.frame
+        if features.box is not None:
+            self.box = features.box
+        self.centres.append(features.box.centre if features.box else (np.nan, np.nan))
+        return self._sample() if self._due() else None
+
+    @property
+    def leaves(self) -> int:
+        """Leaves ever inserted into the trees."""
+        return sum(sum(1 << node.level for node in tree.nodes) for tree in self.trees.values())
+
+    @property
+    def last_sample(self) -> Sample | None:
+        """The sample of the trees as they are, under the newest version; None before the first."""
+        return self._made() if self.version else None
+
+    def counters(self) -> dict[str, float]:
+        """What health tells of it."""
+        return {
+            "seq": self.seq,
+            "version": self.version,
+            "rows": sum(tree.rows_seen for tree in self.trees.values()),
+            "leaves": self.leaves,
+            "nodes": sum(len(tree.nodes) for tree in self.trees.values()),
+            "bytes": sum(tree.nbytes for tree in self.trees.values()),
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything to one file, whole or not at all."""
+        arrays: dict[str, np.ndarray] = {"centres": np.array(self.centres, np.float64).reshape(-1, 2)}
+        facts: dict[str, object] = {
+            "seq": self.seq,
+            "frame": self.frame,
+            "box": list(self.box) if self.box else None,
+            "version": self.version,
+            "sampled": [self._sampled_leaves, self._sampled_frame],
+            "trees": {},
+        }
+        for name, tree in self.trees.items():
+            own, facts["trees"][name] = tree.state()  # type: ignore[index]
+            arrays |= {f"{name}.{key}": array for key, array in own.items()}
+        storage.write(path, arrays, facts)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], settings: Settings) -> Compressor:
+        """Go on where `save` was called.
+
+        Raises
+        ------
+        ProtocolError
+            Where the file is torn, or made with another coreset size.
+        """
+        arrays, facts = storage.read(path)
+        self = cls(settings)
+        try:
+            self.seq, self.frame, self.version = int(facts["seq"]), int(facts["frame"]), int(facts["version"])  # type: ignore[call-overload]
+            self.box = Box(*facts["box"]) if facts["box"] else None  # type: ignore[misc]
+            self._sampled_leaves, self._sampled_frame = facts["sampled"]  # type: ignore[misc]
+            self.centres.extend(map(tuple, arrays["centres"].tolist()))
+            for name, tree_facts in facts["trees"].items():  # type: ignore[attr-defined]
+                own = {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
+                self.trees[name] = CoresetTree.from_state(own, tree_facts)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ProtocolError(f"{path} is not a compressor's state ({error!r}): take an older copy") from None
+        sizes = {tree.size for tree in self.trees.values()}
+        if sizes != {settings.coreset_size} or set(self.trees) != set(_TREES):
+            raise ProtocolError(
+                f"{path} holds trees of size {sizes}, the settings say {settings.coreset_size}: "
+                "go on with the same settings"
+            )
+        return self
+
+    def _due(self) -> bool:
+        """Trees that can teach, a leaf more than last time, and not right after the last sample."""
+        if not (self.trees["object"].nodes and self.trees["background"].nodes and self.trees["loss"].nodes):
+            return False
+        waited = self.version == 0 or self.frame - self._sampled_frame >= self.settings.train_frames
+        return waited and self.leaves > self._sampled_leaves
+
+    def _sample(self) -> Sample:
+        self.version += 1
+        self._sampled_leaves, self._sampled_frame = self.leaves, self.frame
+        return self._made()
+
+    def _made(self) -> Sample:
+        summaries = {name: tree.sample() for name, tree in self.trees.items()}
+        return Sample(self.version, self.frame, centres=np.array(self.centres, np.float64), **summaries)
+
+
+def _loss_rows(rows: np.ndarray, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Rows [x, 1, y] times the root of their weight, float32 (k, d + 2)."""
+    wide = np.empty((len(rows), rows.shape[1] + 2), np.float32)
+    wide[:, :-2], wide[:, -2], wide[:, -1] = rows, 1, labels
+    return wide * np.sqrt(weights, dtype=np.float32)[:, None]

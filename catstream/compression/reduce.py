@@ -1,0 +1,52 @@
+"""Reduction: fewer rows that stand for many, in the directions that matter most.
+
+With the singular value decomposition A = U S V', the first n rows of S V' are
+the best n rows there are: no other n keep more of ||A||^2, the sum of squares.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+
+__all__ = ["energy", "reduce"]
+
+
+def energy(rows: np.ndarray) -> float:
+    """||A||^2, the sum of the squares of all elements, summed in float64.
+
+    >>> energy(np.ones((2, 3), np.float32))
+    6.0
+    """
+    flat = rows.ravel().astype(np.float64)
+    return float(flat @ flat)
+
+
+def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np.ndarray:
+    """Shrink rows to at most `size`, keeping the strongest directions.
+
+    For every orthonormal Y, ||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2 with
+    c = ||A||^2 - ||C||^2 (paper, "Coresets"). Costs one Gram matrix and its
+    eigenvectors, O(m^2 d) for m rows of length d > m.
+
+    Parameters
+    ----------
+    rows : float32 (m, d)
+    size : rows to keep (n in the paper), at least 1
+    towards : float (d,), each kept direction gets the sign that points this way, since a singular
+        vector has none of its own; the sum of the rows where None
+
+    Returns
+    -------
+    float32 (min(size, m), d), strongest first, orthogonal to one another
+
+    >>> reduce(np.ones((6, 4), np.float32), size=2).shape
+    (2, 4)
+    """
+    m = len(rows)
+    keep = min(size, m)
+    gram = rows @ rows.T
+    _, vectors = scipy.linalg.eigh(gram, subset_by_index=(m - keep, m - 1), overwrite_a=True, check_finite=False)
+    kept = vectors[:, ::-1].T @ rows
+    kept[kept @ (rows.sum(axis=0) if towards is None else towards).astype(np.float32) < 0] *= -1
+    return kept

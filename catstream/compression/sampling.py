@@ -1,0 +1,70 @@
+"""The hierarchical sample: from each node as many rows as its age leaves it.
+
+A node's rows are singular directions, not images: the sign of each is
+arbitrary, and all but the first have a mean near zero, so a classifier learns
+nothing from them as they are. Any left rotation Q of a coreset is the same
+coreset, ||Q C Y|| = ||C Y||: the reflection that spreads the first, the mean
+direction, evenly over all rows makes every row "the mean plus a variation".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from catstream.compression.tree import Node
+
+__all__ = ["sample", "share", "spread"]
+
+
+def share(level: int, top: int, size: int) -> int:
+    """Rows to take of a node: n w with w = 2**(level - top), rounded down.
+
+    >>> [share(level, top=3, size=64) for level in (3, 2, 0)]
+    [64, 32, 8]
+    """
+    return size >> (top - level)
+
+
+def sample(nodes: Sequence[Node], size: int) -> np.ndarray:
+    """The first n w rows of each node, spread, each weighing one original row.
+
+    Parameters
+    ----------
+    nodes : oldest first, levels strictly falling
+    size : n
+
+    Returns
+    -------
+    float32 (r, d), r <= 2n; (0, 0) for no nodes
+    """
+    if not nodes:
+        return np.empty((0, 0), np.float32)
+    top = nodes[0].level
+    parts = []
+    for node in nodes:
+        rows = node.rows[: share(node.level, top, size)]
+        if not len(rows):
+            break
+        parts.append(spread(rows) * np.float32(np.sqrt(len(rows) / node.count)))
+    return np.vstack(parts)
+
+
+def spread(rows: np.ndarray) -> np.ndarray:
+    """Reflect rows so that the first lies evenly in all: Q C with Q e1 = 1 / sqrt(m).
+
+    A Householder reflection: Q'Q = I, so that the result is the same coreset. Costs O(m d).
+
+    >>> spread(np.array([[2, 0], [0, 1], [0, 0], [0, 0]], np.float32))[:, 0]
+    array([1., 1., 1., 1.], dtype=float32)
+    """
+    m = len(rows)
+    if m < 2:
+        return rows
+    normal = np.full(m, -1 / np.sqrt(m), np.float32)
+    normal[0] += 1
+    normal /= np.linalg.norm(normal)
+    return rows - np.outer(2 * normal, normal @ rows)

@@ -1,0 +1,231 @@
+"""The coreset tree: all rows ever inserted, summarised in logarithmic memory.
+
+Rows gather until there are n; these become a leaf. Whenever the two newest
+nodes have the same level, their 2n rows are reduced to n, a node one level up
+(paper, "Coreset Tree Implementation").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from catstream.compression import sampling, storage
+from catstream.compression.reduce import energy, reduce
+from catstream.errors import ProtocolError
+from catstream.messages import Summary
+
+if TYPE_CHECKING:
+    import os
+
+__all__ = ["CoresetTree", "Node"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Node:
+    """A coreset of `count` consecutive rows.
+
+    level    how often it was merged: 0 for a leaf; it stands for n * 2**level rows
+    rows     float32 (n, d), strongest direction first, orthogonal
+    count    rows it stands for
+    sum      float64 (d,), their exact sum
+    dropped  c of the paper: energy lost in all reductions below it, ||A||^2 = ||C||^2 + c
+    """
+
+    level: int
+    rows: np.ndarray
+    count: int
+    sum: np.ndarray
+    dropped: float
+
+    @classmethod
+    def leaf(cls, rows: np.ndarray) -> Node:
+        """A node of level 0: the rows themselves, turned so that the strongest direction comes first."""
+        total = rows.sum(axis=0, dtype=np.float64)
+        turned = reduce(rows, len(rows), towards=total)
+        return cls(0, turned, len(rows), total, energy(rows) - energy(turned))
+
+    def merged(self, newer: Node) -> Node:
+        """One node, a level up, for the rows of two of the same level."""
+        both = np.vstack([self.rows, newer.rows])
+        total = self.sum + newer.sum
+        rows = reduce(both, len(self.rows), towards=total)
+        dropped = self.dropped + newer.dropped + energy(both) - energy(rows)
+        return Node(self.level + 1, rows, self.count + newer.count, total, dropped)
+
+
+class CoresetTree:
+    """A coreset of a stream of rows, by merge and reduce.
+
+    For p rows it keeps at most log2(p / n) + 1 nodes, O(n d log p) bytes. Inserting a
+    row costs O(n d) on average, and the same at any p. For every orthonormal Y,
+    `||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2`, where A is everything inserted, C the rows of
+    all nodes and those pending, and c is `dropped_energy`.
+
+    Parameters
+    ----------
+    size : rows of a node, n in the paper
+
+    >>> tree = CoresetTree(size=4)
+    >>> tree.insert(np.eye(13, 5, dtype=np.float32))
+    >>> [node.level for node in tree.nodes], len(tree.pending), tree.rows_seen
+    ([1, 0], 1, 13)
+    """
+
+    def __init__(self, size: int) -> None:
+        if size < 1:
+            raise ValueError(f"a coreset needs at least 1 row, got size={size}")
+        self.size = size
+        self.nodes: list[Node] = []
+        self.pending = np.empty((0, 0), np.float32)
+
+    @property
+    def width(self) -> int:
+        """Length d of a row, 0 before the first."""
+        return self.nodes[0].rows.shape[1] if self.nodes else self.pending.shape[1]
+
+    @property
+    def rows_seen(self) -> int:
+        """Rows ever inserted, p in the paper."""
+        return sum(node.count for node in self.nodes) + len(self.pending)
+
+    @property
+    def sum(self) -> np.ndarray:
+        """Exact sum of all rows ever inserted, float64 (d,)."""
+        total = self.pending.sum(axis=0, dtype=np.float64)
+        for node in self.nodes:
+            total = total + node.sum
+        return total
+
+    @property
+    def dropped_energy(self) -> float:
+        """c of the paper: the part of ||A||^2 that the reductions lost."""
+        return sum(node.dropped for node in self.nodes)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays held."""
+        return self.pending.nbytes + sum(node.rows.nbytes + node.sum.nbytes for node in self.nodes)
+
+    def insert(self, rows: np.ndarray) -> None:
+        """Add rows, float32 (k, d), in the order of the stream.
+
+        Raises
+        ------
+        ProtocolError
+            For rows of another length, or with numbers that are not finite.
+        """
+        rows = self._checked(rows)
+        if not len(rows):
+            return
+        waiting = np.vstack([self.pending, rows]) if len(self.pending) else rows
+        while len(waiting) >= self.size:
+            self._push(Node.leaf(waiting[: self.size]))
+            waiting = waiting[self.size :]
+        self.pending = waiting.copy()
+
+    def merge(self, other: CoresetTree) -> None:
+        """Take in the summary of another stream: as if its rows had been inserted here.
+
+        The bound holds for both streams together; the other tree is left as it was.
+        """
+        if other.size != self.size:
+            raise ProtocolError(
+                f"a tree of size {self.size} cannot take in one of size {other.size}: build both with the same size"
+            )
+        if self.width and other.width and self.width != other.width:
+            raise ProtocolError(
+                f"a tree of rows of length {self.width} cannot take in rows of length {other.width}: "
+                "build both from the same features"
+            )
+        # As in adding two binary numbers: equal levels merge, from the lowest up.
+        carried = sorted([*self.nodes, *other.nodes], key=lambda node: -node.level)
+        self.nodes = []
+        while carried:
+            node = carried.pop()
+            if carried and carried[-1].level == node.level:
+                carried.append(carried.pop().merged(node))
+                carried.sort(key=lambda node: -node.level)
+            else:
+                self.nodes.insert(0, node)
+        if len(other.pending):
+            self.insert(other.pending)
+
+    def sample(self) -> Summary:
+        """A hierarchical sample of at most 2n rows (paper, "Coreset Appearance Model")."""
+        return Summary(
+            rows=sampling.sample(self.nodes, self.size),
+            mean=(self.sum / max(self.rows_seen, 1)).astype(np.float32),
+            count=self.rows_seen,
+            levels=tuple(node.level for node in self.nodes),
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the tree to a safetensors file, whole or not at all."""
+        storage.write(path, *self.state())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> CoresetTree:
+        """Read a tree back, bit for bit.
+
+        Raises
+        ------
+        ProtocolError
+            Where the file is not a whole, consistent tree.
+        """
+        return cls.from_state(*storage.read(path))
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+        """Arrays and facts that `from_state` makes this tree of again."""
+        arrays = {"pending": self.pending}
+        for i, node in enumerate(self.nodes):
+            arrays[f"rows.{i}"] = node.rows
+            arrays[f"sum.{i}"] = node.sum
+        nodes = [[node.level, node.count, node.dropped.hex()] for node in self.nodes]
+        return arrays, {"size": self.size, "nodes": nodes}
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], facts: dict[str, object]) -> CoresetTree:
+        """The tree whose `state` this is; ProtocolError where it is not one."""
+        try:
+            tree = cls(int(facts["size"]))  # type: ignore[call-overload]
+            for i, (level, count, dropped) in enumerate(facts["nodes"]):  # type: ignore[arg-type]
+                rows, total = arrays[f"rows.{i}"], arrays[f"sum.{i}"]
+                tree.nodes.append(Node(int(level), rows, int(count), total, float.fromhex(dropped)))
+            tree.pending = arrays["pending"]
+            tree._check()
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ProtocolError(f"not the state of a coreset tree ({error!r}): take an older copy of the file") from None
+        return tree
+
+    def _push(self, node: Node) -> None:
+        self.nodes.append(node)
+        while len(self.nodes) > 1 and self.nodes[-2].level == self.nodes[-1].level:
+            newer, older = self.nodes.pop(), self.nodes.pop()
+            self.nodes.append(older.merged(newer))
+
+    def _checked(self, rows: np.ndarray) -> np.ndarray:
+        rows = np.asarray(rows, np.float32)
+        if rows.ndim != 2 or (self.width and rows.shape[1] != self.width):
+            raise ProtocolError(
+                f"rows have shape {rows.shape}, this tree was built for (any, {self.width or 'any'}): "
+                "start all services with the same settings"
+            )
+        if not np.isfinite(rows).all():
+            raise ProtocolError("rows hold a number that is not finite: check the source of the features")
+        return rows
+
+    def _check(self) -> None:
+        levels = [node.level for node in self.nodes]
+        if levels != sorted(set(levels), reverse=True):
+            raise ValueError(f"levels {levels} do not strictly fall")
+        if self.pending.ndim != 2 or self.pending.dtype != np.float32 or len(self.pending) >= self.size:
+            raise ValueError(f"pending rows of {self.pending.dtype} {self.pending.shape}")
+        for node in self.nodes:
+            whole = node.rows.shape == (self.size, self.width) and node.sum.shape == (self.width,)
+            if not whole or node.rows.dtype != np.float32 or node.sum.dtype != np.float64:
+                raise ValueError(f"a node of {node.rows.dtype} {node.rows.shape}")
+            if node.count != self.size << node.level or not np.isfinite(node.rows).all():
+                raise ValueError(f"a node of level {node.level} and {node.count} rows")

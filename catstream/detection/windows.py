@@ -1,0 +1,166 @@
+"""Windows: features around a box, the score of every window in them, and the best of those.
+
+A window is 8 x 8 cells. Features are computed on an image that is resized until
+the object's box is as large as a window, its aspect with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+
+from catstream.box import Box
+from catstream.detection.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
+
+__all__ = ["Scored", "around", "cut", "peaks", "respond", "whole"]
+
+_WINDOW_PIXELS = WINDOW * CELL
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scored:
+    """Features of a part of a frame at one scale, and the score of each window in them.
+
+    cells    float32 (rows, columns, 34)
+    scores   float32 (rows - 7, columns - 7), of the window whose first cell is there
+    origin   where the first cell's corner lies in the frame, (x, y) in pixels
+    step     pixels of the frame a cell is wide and high
+    """
+
+    cells: np.ndarray
+    scores: np.ndarray
+    origin: tuple[float, float]
+    step: tuple[float, float]
+
+    def box(self, row: float, column: float) -> Box:
+        """Box of the window at (row, column), which may lie between cells."""
+        (x, y), (w, h) = self.origin, self.step
+        return Box(x + column * w, y + row * h, WINDOW * w, WINDOW * h)
+
+    def row(self, row: int, column: int) -> np.ndarray:
+        """Feature row of the window at (row, column), float32 (d,)."""
+        return self.cells[row : row + WINDOW, column : column + WINDOW].reshape(-1)
+
+    def refined(self, row: int, column: int) -> tuple[float, float]:
+        """The peak at (row, column) between the cells, by a parabola in each direction."""
+        scores = self.scores
+        down = _vertex(scores[:, column], row)
+        across = _vertex(scores[row], column)
+        return row + down, column + across
+
+
+def around(image: np.ndarray, box: Box, cells: int) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+    """Features of `cells` x `cells` cells around a box, at the size that makes the box a window.
+
+    Returns
+    -------
+    float32 (cells, cells, 34); origin and step as in `Scored`
+    """
+    step = box.w / WINDOW, box.h / WINDOW
+    x, y = box.centre
+    patch = cut(image, x, y, step[0] / CELL, step[1] / CELL, (cells + 2 * MARGIN) * CELL)
+    inner = grid(patch)[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    return inner, (x - cells / 2 * step[0], y - cells / 2 * step[1]), step
+
+
+def cut(image: np.ndarray, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
+    """A square of `size` pixels cut from a frame, centred at (x, y); beyond the edge the last pixel is repeated.
+
+    Parameters
+    ----------
+    across, down : pixels of the frame a pixel of the cut is wide and high
+    turn : radians by which the cut is rotated in the frame
+
+    Returns
+    -------
+    uint8 (size, size, 3) or (size, size), as the frame
+    """
+    shrink = int(min(across, down))
+    if shrink >= 2:
+        # Linear interpolation would skip pixels: average whole blocks first.
+        reach = size * max(across, down) * (0.75 if turn else 0.5) + shrink
+        left, top = max(int(x - reach), 0), max(int(y - reach), 0)
+        part = image[top : max(int(y + reach), top + shrink), left : max(int(x + reach), left + shrink)]
+        part = part[: part.shape[0] // shrink * shrink, : part.shape[1] // shrink * shrink]
+        if part.size:
+            image = cv2.resize(part, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+            x, y = (x - left) / shrink, (y - top) / shrink
+            across, down = across / shrink, down / shrink
+    cos, sin = np.cos(turn), np.sin(turn)
+    matrix = np.array([[across * cos, -down * sin, 0.0], [across * sin, down * cos, 0.0]])
+    matrix[:, 2] = np.array([x, y]) - 0.5 - matrix[:, :2] @ np.full(2, (size - 1) / 2)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+
+def whole(image: np.ndarray, box: Box) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+    """Features of the whole frame, resized so that `box` is as large as a window.
+
+    Returns
+    -------
+    float32 (rows, columns, 34); origin and step as in `Scored`
+    """
+    height, width = image.shape[:2]
+    columns = max(WINDOW, round(width / box.w * WINDOW))
+    rows = max(WINDOW, round(height / box.h * WINDOW))
+    shrinks = columns * CELL < width and rows * CELL < height
+    size = (columns * CELL, rows * CELL)
+    resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return grid(resized), (0.0, 0.0), (width / columns, height / rows)
+
+
+def respond(cells: np.ndarray, weights: np.ndarray, bias: float) -> np.ndarray:
+    """Score of every window, float32 (rows - 7, columns - 7): one matrix product and shifted sums.
+
+    Parameters
+    ----------
+    cells : float32 (rows, columns, 34)
+    weights : float32 (d,)
+    """
+    rows, columns = cells.shape[:2]
+    parts = cells.reshape(-1, CHANNELS) @ weights.reshape(-1, CHANNELS).T
+    scores = np.full((rows - WINDOW + 1, columns - WINDOW + 1), bias, np.float32)
+    _add_shifted(parts.reshape(rows, columns, WINDOW * WINDOW), scores)
+    return scores
+
+
+def peaks(scores: np.ndarray, most: int, apart: int, least: float = -np.inf) -> list[tuple[int, int]]:
+    """The highest windows, each more than `apart` cells from any higher one: non-maximum suppression.
+
+    Returns
+    -------
+    up to `most` pairs (row, column) with a score above `least`, highest first
+    """
+    left = scores.copy()
+    found = []
+    for _ in range(most):
+        row, column = divmod(int(left.argmax()), left.shape[1])
+        if not left[row, column] > least:
+            break
+        found.append((row, column))
+        left[max(row - apart, 0) : row + apart + 1, max(column - apart, 0) : column + apart + 1] = -np.inf
+    return found
+
+
+def _vertex(values: np.ndarray, i: int) -> float:
+    """Offset of the top of the parabola through three neighbours, -0.5 to 0.5."""
+    if not 0 < i < len(values) - 1:
+        return 0.0
+    before, here, after = float(values[i - 1]), float(values[i]), float(values[i + 1])
+    bend = before - 2 * here + after
+    return float(np.clip((before - after) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
+
+
+@numba.njit("void(float32[:,:,::1], float32[:,::1])", cache=True, nogil=True, fastmath=True)
+def _add_shifted(parts, scores):  # type: ignore[no-untyped-def]
+    rows, columns = scores.shape
+    for row in range(rows):
+        for column in range(columns):
+            total = np.float32(0)
+            for i in range(WINDOW):
+                for j in range(WINDOW):
+                    total += parts[row + i, column + j, i * WINDOW + j]
+            scores[row, column] += total

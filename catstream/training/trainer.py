@@ -1,0 +1,56 @@
+"""The trainer: a sample of the coreset trees in, a model out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from catstream.errors import ProtocolError
+from catstream.messages import Model, Motion, Sample
+from catstream.settings import Settings
+from catstream.training import least_squares
+from catstream.training.one_class import one_class
+
+__all__ = ["Trainer"]
+
+
+class Trainer:
+    """Learns a linear model of the object; the same sample gives the same model."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self._motion: Motion | None = None
+        self._motion_frame = -1
+
+    def train(self, sample: Sample) -> Model:
+        """Learn from a sample, in time that depends on n only.
+
+        The score is scaled to be 0 at the mean of the background and 1 at the mean of the
+        object, so that every model's scores mean the same.
+
+        Raises
+        ------
+        ProtocolError
+            For a sample in which object and background are the same.
+        """
+        mean, background_mean = sample.object.mean, sample.background.mean
+        weights = np.zeros_like(mean)
+        for direction in self._directions(sample):
+            contrast = float(direction @ (mean - background_mean))
+            if not contrast > 0:
+                raise ProtocolError(
+                    f"sample {sample.version} holds no difference between object and background: give another box"
+                )
+            weights += direction / np.float32(contrast)
+        weights /= np.float32(weights @ (mean - background_mean))
+        return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), self._motion)
+
+    def _directions(self, sample: Sample) -> list[np.ndarray]:
+        settings = self.settings
+        if settings.classifier == "one-class":
+            return [one_class(sample.object.rows, sample.background.mean)]
+        of_means = least_squares.of_means(
+            sample.background.rows, sample.background.mean, sample.object.mean, settings.ridge
+        )
+        if settings.classifier == "least-squares":
+            return [of_means]
+        return [of_means, least_squares.of_loss(sample.loss.rows, settings.loss_ridge)]
