@@ -1,0 +1,102 @@
+"""How an object moves, learned from where it was: expectation maximisation (paper, "Classification").
+
+The centre of the object moves at constant velocity, but for a random push a
+frame, and is measured with an error: a linear-Gaussian model. The covariances
+of push and error are what is learned; the detector's Kalman filter then knows
+how far to trust a prediction, and how far a measurement.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from catstream.messages import Motion
+
+__all__ = ["FEWEST", "OBSERVATION_FLOOR", "PROCESS_FLOOR", "learn_motion"]
+
+FEWEST = 8  #: centres that 13 free parameters can be learned from
+PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
+OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels
+
+_TRANSITION = np.eye(4) + np.eye(4, k=2)  # (x, y, vx, vy): each position moves on by its velocity
+_OBSERVED = np.eye(2, 4)  # of which x and y are measured
+
+
+def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
+    """Find the covariances of a constant-velocity model that make these centres likely.
+
+    No iteration lowers their likelihood; the covariances are symmetric, and their
+    eigenvalues are not below `PROCESS_FLOOR` and `OBSERVATION_FLOOR`, so that a
+    motionless object gives a usable filter too. Costs O(m) an iteration, about 50
+    microseconds a frame.
+
+    Parameters
+    ----------
+    centres : float64 (m, 2), x and y in pixels of consecutive frames, NaN where the object was absent
+    iterations : how often to smooth (expectation) and to refit (maximisation)
+
+    Returns
+    -------
+    Motion, or None for fewer than `FEWEST` centres
+
+    >>> walk = np.column_stack([np.arange(20.0) * 3, np.full(20, 7.0)])
+    >>> learn_motion(walk).observation.round(2)  # measured without error: the floor
+    array([[0.01, 0.  ],
+           [0.  , 0.01]])
+    >>> learn_motion(walk[:5]) is None
+    True
+    """
+    present = np.flatnonzero(np.isfinite(centres).all(axis=1))
+    if len(present) < FEWEST:
+        return None
+    mean, covariance, motion = _start(centres[present])
+    # Frames before the first sighting and after the last say nothing.
+    centres = centres[present[0] : present[-1] + 1]
+    for _ in range(iterations):
+        motion = _refit(centres, *_smooth(centres, mean, covariance, motion))
+    return motion
+
+
+def _start(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray, Motion]:
+    """First state, its covariance, and first guess, all in proportion to how the centres move."""
+    speed = np.mean(np.diff(centres, axis=0) ** 2)
+    # In a second difference the variance of the error counts 6 times, of pushes on the place 2, on the velocity 1.
+    share = np.mean(np.diff(centres, n=2, axis=0) ** 2) / 9 + OBSERVATION_FLOOR
+    mean = np.concatenate([centres[0], [0, 0]])
+    return mean, np.diag([share, share, share + speed, share + speed]), Motion(share * np.eye(4), share * np.eye(2))
+
+
+def _smooth(
+    centres: np.ndarray, mean: np.ndarray, covariance: np.ndarray, motion: Motion
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Expectation: states (m, 4) given all centres, their covariances (m, 4, 4), and those of each with the next."""
+    from filterpy.kalman import KalmanFilter  # a second to import: only who learns pays
+
+    kalman = KalmanFilter(dim_x=4, dim_z=2)
+    kalman.x, kalman.P, kalman.F, kalman.H = mean, covariance, _TRANSITION, _OBSERVED
+    kalman.Q, kalman.R = motion.process, motion.observation
+    measured = [centre if np.isfinite(centre).all() else None for centre in centres]
+    # Update first: the starting state is that of the first frame, not of the one before it.
+    states, covariances, _, _ = kalman.batch_filter(measured, update_first=True)
+    states, covariances, gains, _ = kalman.rts_smoother(states, covariances)
+    return states, covariances, covariances[1:] @ gains[:-1].transpose(0, 2, 1)
+
+
+def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lagged: np.ndarray) -> Motion:
+    """Maximisation: mean outer products of the pushes and of the errors, the states' uncertainty included."""
+    push = states[1:] - states[:-1] @ _TRANSITION.T
+    together = (lagged @ _TRANSITION.T).sum(axis=0)
+    spread = covariances[1:].sum(axis=0) + _TRANSITION @ covariances[:-1].sum(axis=0) @ _TRANSITION.T
+    process = (push.T @ push + spread - together - together.T) / len(push)
+
+    seen = np.isfinite(centres).all(axis=1)
+    error = centres[seen] - states[seen] @ _OBSERVED.T
+    observation = error.T @ error / len(error) + _OBSERVED @ covariances[seen].mean(axis=0) @ _OBSERVED.T
+    return Motion(_floored(process, PROCESS_FLOOR), _floored(observation, OBSERVATION_FLOOR))
+
+
+def _floored(covariance: np.ndarray, floor: float) -> np.ndarray:
+    """The most likely covariance with no eigenvalue below the floor: raising those below it is exact."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, floor))
+    return root @ root.T

@@ -1,0 +1,113 @@
+"""Expectation maximisation of the motion, against pykalman and its own laws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pykalman
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from catstream.training import motion_em
+from catstream.training.motion_em import FEWEST, OBSERVATION_FLOOR, PROCESS_FLOOR, learn_motion
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+def walk(rng: np.random.Generator, frames: int = 64) -> np.ndarray:
+    """Centres of an object that is pushed about, measured with an error of 1.5 pixels."""
+    velocity = np.cumsum(rng.normal(scale=0.5, size=(frames, 2)), axis=0)
+    return 100 + np.cumsum(velocity, axis=0) + rng.normal(scale=1.5, size=(frames, 2))
+
+
+def oracle(centres: np.ndarray, motion: motion_em.Motion | None = None) -> pykalman.KalmanFilter:
+    """The same model in pykalman, with these covariances, or those that learning starts from."""
+    mean, covariance, start = motion_em._start(centres[np.isfinite(centres).all(axis=1)])
+    motion = motion or start
+    return pykalman.KalmanFilter(
+        transition_matrices=motion_em._TRANSITION,
+        observation_matrices=motion_em._OBSERVED,
+        transition_covariance=motion.process,
+        observation_covariance=motion.observation,
+        initial_state_mean=mean,
+        initial_state_covariance=covariance,
+        em_vars=["transition_covariance", "observation_covariance"],
+    )
+
+
+def agree(centres: np.ndarray, iterations: int = 10) -> None:
+    learned = learn_motion(centres, iterations)
+    expected = oracle(centres).em(np.ma.masked_invalid(centres), n_iter=iterations)
+    assert learned is not None
+    assert_allclose(learned.process, expected.transition_covariance, rtol=1e-6, atol=1e-6)
+    assert_allclose(learned.observation, expected.observation_covariance, rtol=1e-6, atol=1e-6)
+
+
+def test_agrees_with_pykalman(rng):
+    agree(walk(rng))
+
+
+def test_agrees_with_pykalman_where_centres_are_missing(rng):
+    centres = walk(rng)
+    centres[rng.permutation(62)[:20] + 1] = np.nan
+    agree(centres)
+
+
+def test_frames_before_the_first_and_after_the_last_centre_change_nothing(rng):
+    centres = walk(rng)
+    absent = np.full((5, 2), np.nan)
+    inner, padded = learn_motion(centres), learn_motion(np.vstack([absent, centres, absent]))
+    assert_array_equal(padded.process, inner.process)
+    assert_array_equal(padded.observation, inner.observation)
+
+
+@pytest.mark.parametrize("still", [False, True], ids=["moving", "motionless"])
+def test_likelihood_never_falls(rng, still):
+    centres = np.full((40, 2), 50.0) if still else walk(rng, frames=40)
+    centres[10:15] = np.nan
+    masked = np.ma.masked_invalid(centres)
+    likelihoods = [oracle(centres, learn_motion(centres, i)).loglikelihood(masked) for i in range(12)]
+    assert np.all(np.diff(likelihoods) > -1e-9)
+
+
+def test_finds_the_covariances_that_made_the_centres(rng):
+    motion = learn_motion(walk(rng, frames=1500), iterations=40)
+    assert_allclose(np.diag(motion.observation), 1.5**2, rtol=0.15)
+    assert_allclose(np.diag(motion.process)[2:], 0.5**2, rtol=0.3)
+
+
+@pytest.mark.parametrize(
+    "centres",
+    [np.full((64, 2), 80.0), np.outer(np.arange(64.0), [3, -2])],
+    ids=["motionless", "steady"],
+)
+def test_perfect_motion_gives_small_positive_definite_covariances(centres):
+    motion = learn_motion(centres)
+    for covariance, floor in [(motion.process, PROCESS_FLOOR), (motion.observation, OBSERVATION_FLOOR)]:
+        assert np.linalg.eigvalsh(covariance).min() >= floor * (1 - 1e-9)
+        assert np.linalg.eigvalsh(covariance).max() < 0.5
+
+
+def test_covariances_are_symmetric_to_the_bit(rng):
+    motion = learn_motion(walk(rng))
+    assert_array_equal(motion.process, motion.process.T)
+    assert_array_equal(motion.observation, motion.observation.T)
+
+
+def test_twice_the_scale_gives_four_times_the_covariances(rng):
+    centres = walk(rng)
+    motion, doubled = learn_motion(centres), learn_motion(2 * centres)
+    assert_allclose(doubled.observation, 4 * motion.observation, rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize("count", [0, 1, FEWEST - 1])
+def test_too_few_centres_give_nothing(rng, count):
+    centres = np.full((64, 2), np.nan)
+    centres[3 : 3 + count] = rng.normal(size=(count, 2))
+    assert learn_motion(centres) is None
+
+
+def test_no_frames_give_nothing():
+    assert learn_motion(np.empty((0, 2))) is None
