@@ -1,0 +1,89 @@
+"""Where the object will be: a Kalman filter of its centre (paper, "Classification").
+
+The detector's part. Its covariances are learned by the trainer and come with the model.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from catstream.messages import Motion
+
+__all__ = ["CentreFilter"]
+
+_TRANSITION = np.eye(4) + np.eye(4, k=2)  # (x, y, vx, vy): each position moves on by its velocity
+_COASTING = _TRANSITION @ np.diag([1, 1, 0.8, 0.8])  # out of sight: 0.8 + 0.8**2 + ... = 4 frames' way, then rest
+_OBSERVED = np.eye(2, 4)  # of which x and y are measured
+_JUMP = 6.0  # standard deviations beyond which a measured centre is no motion, but another place
+_UNKNOWN_SPEED = 100.0  # variance of a velocity not seen yet, in pushes of a frame
+
+
+class CentreFilter:
+    """Follows a centre through noise and absence, in constant time a frame.
+
+    While the object is present it moves at constant velocity, but for the pushes that
+    `motion` allows. While it is absent it coasts to a stop and grows less certain: no
+    prediction runs away. A centre that the motion all but rules out, found again
+    elsewhere, is a new start at rest, and no motion to be smoothed.
+
+    Call `predict`, then `update`, once a frame.
+
+    Parameters
+    ----------
+    motion : what the trainer learned
+    centre : x and y in pixels, in the frame before the first that is predicted
+
+    >>> motion = Motion(np.eye(4), np.eye(2))
+    >>> centre = CentreFilter(motion, (10, 20))
+    >>> for x in range(13, 100, 3):
+    ...     _ = centre.predict()
+    ...     centre.update((x, 20))
+    >>> [round(value, 3) for value in centre.predict()]
+    [100.0, 20.0]
+    """
+
+    def __init__(self, motion: Motion, centre: tuple[float, float]) -> None:
+        from filterpy.kalman import KalmanFilter  # a second to import: not before there is a motion to use
+
+        self._kalman = KalmanFilter(dim_x=4, dim_z=2)
+        self._kalman.H = _OBSERVED
+        self.adopt(motion)
+        self._start(centre)
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Best estimate of x and y, in pixels."""
+        return float(self._kalman.x[0]), float(self._kalman.x[1])
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """Best estimate of the way along x and y, in pixels a frame."""
+        return float(self._kalman.x[2]), float(self._kalman.x[3])
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the centre along its less certain direction, in pixels."""
+        return float(np.sqrt(np.linalg.eigvalsh(self._kalman.P[:2, :2])[-1]))
+
+    def predict(self) -> tuple[float, float]:
+        """Go on by a frame: the centre to expect in it."""
+        self._kalman.predict(F=_TRANSITION if self._seen else _COASTING)
+        return self.centre
+
+    def update(self, centre: tuple[float, float] | None) -> None:
+        """Take in the centre that was measured in this frame, None where the object is absent."""
+        self._seen = centre is not None
+        self._kalman.update(centre)
+        if centre is not None and self._kalman.mahalanobis > _JUMP:
+            self._start(centre)
+
+    def adopt(self, motion: Motion) -> None:
+        """Go on from here with other covariances."""
+        self._kalman.Q, self._kalman.R = motion.process, motion.observation
+
+    def _start(self, centre: tuple[float, float]) -> None:
+        self._seen = True
+        self._kalman.x = np.array([*centre, 0.0, 0.0])
+        self._kalman.P = np.zeros((4, 4))
+        self._kalman.P[:2, :2] = self._kalman.R
+        self._kalman.P[2:, 2:] = _UNKNOWN_SPEED * self._kalman.Q[2:, 2:]
