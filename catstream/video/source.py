@@ -1,0 +1,275 @@
+"""Sources: where frames come from, by one text that a person types.
+
+    with open_source("walk.mp4") as source:
+        for frame in source:
+            print(frame.number, frame.time, frame.image.shape)
+
+What the text may be:
+
+    a video file        all that FFmpeg reads; every frame once, in order
+    a folder            its images in natural order (2.png before 10.png), or those of its `img`, `color` or `rgb`
+                        folder, or its one video: so the sequence folders of the benchmarks open as they are
+    a pattern           images/%05d.png or images/*.png
+
+A source is read to its last frame and none is skipped. Where it breaks, its
+good frames come first and the `VideoError` after them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+
+from catstream.errors import VideoError
+
+__all__ = ["Frame", "Source", "image_files", "open_source"]
+
+#: Frames a second of a source that does not say: images have no clock.
+RATE = 25.0
+
+_IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
+_VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
+_FOLDERS = ("img", "imgs", "color", "rgb")
+_HELP = "give a video file, a folder of images, or a pattern like images/%05d.png"
+
+#: A video that ends this much before its container says was cut off: rounding and audio explain less.
+_SHORT_SECONDS = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image of a source.
+
+    number  0, 1, 2 ... from the start of the source
+    time    seconds since the first frame
+    image   uint8 (h, w, 3), blue green red; grey is expanded
+    """
+
+    number: int
+    time: float
+    image: np.ndarray
+
+
+class Source:
+    """Frames in order, once, and what is known of them before they are read.
+
+    name    what results are called: the stem of a file, the name of a folder
+    frames  how many the source says it has, or None
+    rate    frames a second
+    size    (width, height) of the first frame in pixels
+    live    whether frames pass by whether they are read or not
+
+    Opening decodes the first frame. Close it, or use it in a `with`.
+
+    Raises
+    ------
+    VideoError
+        From the constructor where there is no first frame, from the iterator
+        where the source breaks, after its good frames.
+    """
+
+    def __init__(
+        self, name: str, stream: Iterator[Frame], *, frames: int | None, rate: float, live: bool = False
+    ) -> None:
+        self.name, self.frames, self.rate, self.live = name, frames, rate, live
+        self._stream = stream
+        self._first: Frame | None = next(stream, None)
+        if self._first is None:
+            raise VideoError(f"{name} has no frame to start with: check the source and the first frame asked for")
+        height, width = self._first.image.shape[:2]
+        self.size = (width, height)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self
+
+    def __next__(self) -> Frame:
+        if self._first is not None:
+            frame, self._first = self._first, None
+            return frame
+        return next(self._stream)
+
+    def close(self) -> None:
+        """Let the file go. Iterating afterwards ends at once."""
+        self._first = None
+        close: Callable[[], None] | None = getattr(self._stream, "close", None)
+        if close is not None:
+            close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_source(text: str | Path, start: int = 0) -> Source:
+    """Open a video file, a folder or a pattern of images.
+
+    Parameters
+    ----------
+    text : what and where, see the module
+    start : number of the first frame wanted; those before it are decoded, never guessed at
+
+    Raises
+    ------
+    VideoError
+        Where there is nothing, or nothing readable; says what was expected.
+    """
+    path = Path(text)
+    if path.is_dir():
+        return _folder(path, start)
+    if path.is_file():
+        return _video(path, start)
+    if re.search(r"%0?\d*d|[*?\[]", path.name):
+        return _images(path.parent.resolve().name, image_files(path), start)
+    raise VideoError(f"there is no video or folder {str(text)!r}: {_HELP}")
+
+
+def image_files(path: Path) -> list[Path]:
+    """Images in a folder or of a pattern (%05d, *), in natural order.
+
+    Raises
+    ------
+    VideoError
+        Where there is none.
+    """
+    if path.is_dir():
+        found = [file for file in path.iterdir() if file.suffix.lower() in _IMAGES]
+    elif number := re.search(r"%0?(\d*)d", path.name):
+        digits = rf"\d{{{number[1]},}}" if number[1] else r"\d+"
+        name = re.escape(path.name[: number.start()]) + digits + re.escape(path.name[number.end() :])
+        found = [file for file in path.parent.glob("*") if re.fullmatch(name, file.name)]
+    else:
+        found = list(path.parent.glob(path.name))
+    found = [file for file in found if not file.name.startswith(".")]
+    if not found:
+        kinds = ", ".join(sorted(suffix[1:] for suffix in _IMAGES))
+        raise VideoError(f"there are no images at {str(path)!r}: {_HELP} (images are {kinds})")
+    return sorted(found, key=_natural)
+
+
+def _natural(path: Path) -> list[Any]:
+    """Key of an order in which 10 comes after 2."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def _folder(path: Path, start: int) -> Source:
+    name = path.resolve().name
+    for folder in (*(path / inner for inner in _FOLDERS), path):
+        if folder.is_dir() and any(file.suffix.lower() in _IMAGES for file in folder.iterdir()):
+            return _images(name, image_files(folder), start)
+    videos = sorted(file for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
+    if len(videos) == 1:
+        return _video(videos[0], start)
+    held = f"{len(videos)} videos" if videos else "neither images nor a video"
+    raise VideoError(f"the folder {str(path)!r} holds {held}: {_HELP}")
+
+
+def _images(name: str, files: list[Path], start: int) -> Source:
+    return Source(name, _read_images(files, start), frames=len(files), rate=RATE)
+
+
+def _read_images(files: list[Path], start: int) -> Iterator[Frame]:
+    shape: tuple[int, ...] | None = None
+    for number in range(start, len(files)):
+        image = cv2.imread(str(files[number]), cv2.IMREAD_COLOR)
+        if image is None:
+            raise VideoError(f"cannot read the image {str(files[number])!r} (frame {number}): replace or remove it")
+        if shape is not None and image.shape != shape:
+            raise VideoError(
+                f"all images of a source need one size: {str(files[number])!r} (frame {number}) is "
+                f"{image.shape[1]}x{image.shape[0]}, those before it {shape[1]}x{shape[0]}"
+            )
+        shape = image.shape
+        yield Frame(number, number / RATE, image)
+
+
+def _video(path: Path, start: int) -> Source:
+    import av  # here, as it costs 0.1 s and folders do without
+
+    try:
+        container = av.open(str(path.absolute()))
+    except (av.FFmpegError, OSError) as error:
+        raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_HELP}") from None
+    # FFmpeg renders text files as video; nobody means that.
+    if not container.streams.video or container.format.name == "tty":
+        container.close()
+        raise VideoError(f"there is no video in {str(path)!r}: {_HELP}")
+    stream = container.streams.video[0]
+    rate = float(stream.average_rate or stream.guessed_rate or RATE)
+    return Source(path.stem, _read_video(path, container, rate, start), frames=stream.frames or None, rate=rate)
+
+
+def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator[Frame]:
+    stream = container.streams.video[0]
+    stream.thread_type = "NONE"  # the processes are the parallelism
+    number, time, zero, shape = 0, 0.0, None, None
+    with container:
+        for frame in _good_frames(path, container, stream):
+            zero = frame.pts if zero is None else zero
+            time = number / rate if frame.pts is None else float((frame.pts - zero) * stream.time_base)
+            if number >= start:
+                # Phones store upright videos lying down, and the turn beside them.
+                image = np.ascontiguousarray(np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90))
+                if shape is not None and image.shape != shape:
+                    raise VideoError(
+                        f"{str(path)!r} changes from {shape[1]}x{shape[0]} to {image.shape[1]}x{image.shape[0]} "
+                        f"pixels at frame {number}: split it there"
+                    )
+                shape = image.shape
+                yield Frame(number, time, image)
+            number += 1
+        stated = _stated_seconds(container, stream)
+        if number and stated - (time + 1 / rate) > _SHORT_SECONDS:
+            raise VideoError(
+                f"{str(path)!r} breaks off after frame {number - 1}: it says it lasts {stated:.1f} s, "
+                f"and its frames end at {time + 1 / rate:.1f} s; the frames before are good"
+            )
+
+
+def _good_frames(path: Path, container: Any, stream: Any) -> Iterator[Any]:
+    """Decoded frames up to the first that is damaged, then a VideoError if there was one."""
+    import av
+
+    count, problem = 0, ""
+    packets = container.demux(stream)
+    while not problem:
+        frames = []
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                return
+            if packet.is_corrupt:
+                problem = "data is missing"
+            else:
+                frames = packet.decode()
+        except av.FFmpegError as error:
+            problem = error.strerror.lower()
+        if problem:  # the good frames that wait in the decoder for their turn
+            try:
+                frames = stream.codec_context.decode(None)
+            except av.FFmpegError:
+                frames = []
+        for frame in frames:
+            if frame.is_corrupt:
+                problem = "its picture is damaged"
+                break
+            yield frame
+            count += 1
+    raise VideoError(f"{str(path)!r} breaks at frame {count} ({problem}): the frames before are good")
+
+
+def _stated_seconds(container: Any, stream: Any) -> float:
+    """How long the video says it is, 0 where it does not say."""
+    if stream.duration:
+        return float(stream.duration * stream.time_base)
+    if clock := re.fullmatch(r"(\d+):(\d+):([\d.]+)", stream.metadata.get("DURATION", "")):
+        return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3])
+    # Without a duration of its own, only where no sound can outlast the picture.
+    return (container.duration or 0) / 1e6 if len(container.streams) == 1 else 0.0
