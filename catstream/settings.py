@@ -73,7 +73,7 @@ class Settings:
             "of the two trees alone (least-squares), or the paper's one-class linear SVM (one-class)."
         ),
     ] = "joint"
-    ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 2.0
+    ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 1.0
     loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
     motion_frames: Annotated[int, _about("Frames whose centres the Kalman filter's parameters are learned from.", ge=8)] = 64
 
@@ -83,24 +83,31 @@ class Settings:
         _about("Search around the object and the whole frame when unsure (local), or all of every frame (full)."),
     ] = "local"
 
-    object_weight: Annotated[float, _about("object_weight")] = 4.0
-    near_misses: Annotated[int, _about("near_misses")] = 12
-    near_sigma: Annotated[float, _about("near_sigma")] = 0.9
-    negatives: Annotated[int, _about("negatives")] = 12
-    first_negatives: Annotated[int, _about("first_negatives")] = 16
-    sure_score: Annotated[float, _about("sure_score")] = 0.55
-    lost_score: Annotated[float, _about("lost_score")] = 0.3
-    present_score: Annotated[float, _about("present_score")] = 0.3
-    teach_score: Annotated[float, _about("teach_score")] = 0.4
-    global_frames: Annotated[int, _about("global_frames")] = 10
-    jump_margin: Annotated[float, _about("jump_margin")] = 0.1
-    mine_frames: Annotated[int, _about("mine_frames")] = 5
-    mine_score: Annotated[float, _about("mine_score")] = 0.6
-    mine_count: Annotated[int, _about("mine_count")] = 10
-    distance_penalty: Annotated[float, _about("distance_penalty")] = 0.1
-    scale_penalty: Annotated[float, _about("scale_penalty")] = 0.01
-    scale_step: Annotated[float, _about("scale_step")] = 0.03
-    scale_rate: Annotated[float, _about("scale_rate")] = 0.7
+    context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
+    search_area: Annotated[float, _about("Side of the local search as a multiple of the window's.", ge=1.5, le=6)] = 2.5
+    scale_count: Annotated[int, _about("Scales that a search tries.", ge=1, le=15)] = 5
+    scale_step: Annotated[float, _about("Change of size between two scales.", gt=0, le=0.5)] = 0.03
+    scale_rate: Annotated[float, _about("Share of a change of size that is followed at once.", ge=0, le=1)] = 0.7
+    scale_score: Annotated[float, _about("Score below which the size is held.")] = 0.5
+    scale_penalty: Annotated[float, _about("Score that a change of size costs, times the logarithm of its factor.", ge=0)] = 0.3
+    distance_penalty: Annotated[float, _about("Score that a window's width of distance costs in the local search.", ge=0)] = 0.1
+    present_score: Annotated[float, _about("Score below which the object counts as absent.")] = 0.3
+    return_score: Annotated[float, _about("Score at which an absent object counts as present again.")] = 0.5
+    sure_score: Annotated[float, _about("Score below which the whole frame is searched now and then.")] = 0.55
+    lost_score: Annotated[float, _about("Score below which the whole frame is searched in every frame.")] = 0.3
+    jump_margin: Annotated[float, _about("Score by which a window elsewhere must be better than the one near.")] = 0.1
+    whole_frames: Annotated[int, _about("Frames from one whole search to the next while unsure.", ge=1)] = 10
+    teach_score: Annotated[float, _about("Score below which a frame teaches nothing.")] = 0.4
+    copies: Annotated[int, _about("Affine copies of the object a frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)] = 0
+    object_weight: Annotated[float, _about("Ordinary rows that the object's row of a frame counts for in the loss tree.", gt=0)] = 4.0
+    near_misses: Annotated[int, _about("Windows a frame that lie beside the object.", ge=0)] = 12
+    near_sigma: Annotated[float, _about("Distance, in cells, at which a near miss is worth exp(-1/2) of the object.", gt=0)] = 0.9
+    near_scale: Annotated[float, _about("scale near misses")] = 1.0
+    near_scale_sigma: Annotated[float, _about("scale near misses")] = 0.1
+    near_negatives: Annotated[int, _about("Background windows a frame around the object.", ge=1)] = 12
+    far_negatives: Annotated[int, _about("Hard negatives from a whole frame.", ge=0)] = 10
+    mine_frames: Annotated[int, _about("Frames from one search for hard negatives to the next.", ge=1)] = 5
+    mine_score: Annotated[float, _about("Score below which none are searched for.")] = 0.6
 
     @classmethod
     def load(

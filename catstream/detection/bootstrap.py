@@ -1,16 +1,25 @@
+"""What stands in before the first model: ridge regression of the first frame's rows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from catstream import ridge
 from catstream.messages import Model
+from catstream.settings import Settings
+
+if TYPE_CHECKING:
+    from catstream.detection.lessons import Lesson
+
+__all__ = ["stand_in"]
 
 
-def stand_in(rows, labels, s):
-    """Ridge regression of the first frame's rows."""
-    x = rows.astype(np.float64)
-    pos, neg = x[labels == 1], x[labels == 0]
-    mo, mb = pos.mean(0), neg.mean(0)
-    c = (neg - mb) / np.sqrt(len(neg))
-    t = mo - mb
-    inner = np.linalg.solve(c @ c.T + s.ridge * np.eye(len(c)), c @ t)
-    w = t - c.T @ inner
-    w /= w @ t
-    return Model(0, 0, w.astype(np.float32), -float(w @ mb))
+def stand_in(lesson: Lesson, settings: Settings) -> Model:
+    """A model of version 0, from the object's copies against the background of one frame."""
+    background = lesson.rows[lesson.labels == 0]
+    mean, background_mean = lesson.rows[lesson.labels == 1].mean(axis=0), background.mean(axis=0)
+    weights = ridge.between(background, mean - background_mean, settings.ridge)
+    weights /= weights @ (mean - background_mean)
+    return Model(0, 0, weights, -float(weights @ background_mean))

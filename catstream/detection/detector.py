@@ -5,157 +5,114 @@ from __future__ import annotations
 import numpy as np
 
 from catstream.box import Box
-from catstream.detection import affine, bootstrap, windows
-from catstream.detection.hog import WINDOW, row_length
-from catstream.detection.windows import Scored
-from catstream.messages import Features, Model, Track
+from catstream.detection import bootstrap, lessons, search
+from catstream.detection.lessons import Lesson
+from catstream.detection.motion import CentreFilter
+from catstream.errors import BoxError
+from catstream.messages import Features, Model, State, Track
 from catstream.settings import Settings
 
 __all__ = ["Detector"]
 
-_CELLS = 20
+_FACTORS = [1.0, 0.8, 1.25]  # of the object's size, at which a lost object is searched for
 
 
 class Detector:
+    """Finds the object in each frame with the newest model, and cuts out what the frame teaches.
+
+    Costs the same for every frame: a few small images around the object; the whole
+    frame where it is not sure (or always, `detection="full"`).
+
+    Call `init` with the first frame, then `step` for every other; `adopt` models as they come.
+    """
+
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.seq = 0
-        self.box: Box | None = None
-        self.model = None
-        self.rng = np.random.default_rng(settings.seed)
-        self.centre_cell = (_CELLS - WINDOW) // 2
-        self.score = 1.0
-        self.state = 'bootstrapping'
-        self.velocity = np.zeros(2)
+        self.state: State = "bootstrapping"
+        self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
+        self._rng = np.random.default_rng(settings.seed)
+        self._centre: CentreFilter | None = None
 
-    def init(self, image, box, time=0.0):
+    def init(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
+        """Start on a box.
+
+        Parameters
+        ----------
+        image : uint8 (h, w, 3) BGR, or (h, w) grey
+        box : the object, in pixels of the frame
+        time : seconds since the start of the source
+
+        Raises
+        ------
+        BoxError
+            For a box that is not in the frame, has no area, or is not a number.
+        """
         height, width = image.shape[:2]
-        self.box = self.first = Box(*box).inside(width, height)
-        self.size = (width, height)
-        s = self.settings
-        copies = affine.copies(image, self.box, s.coreset_size, self.rng)
-        rows, labels, weights = self._surroundings(image, None)
-        rows = np.vstack([copies, rows[1:]])
-        labels = np.concatenate([np.ones(len(copies), np.float32), labels[1:]])
-        weights = np.concatenate([np.full(len(copies), s.object_weight, np.float32), weights[1:]])
-        # far background of first frame
-        self.model = bootstrap.stand_in(rows, labels, s)
-        far = self._mine(image, s.first_negatives)
-        if len(far):
-            rows = np.vstack([rows, far]); labels = np.concatenate([labels, np.zeros(len(far), np.float32)]); weights = np.concatenate([weights, np.ones(len(far), np.float32)])
-        self.model = bootstrap.stand_in(rows, labels, s)
-        self.seq = 1
-        return self._answer(0, time, rows, labels, weights)
-
-    def _answer(self, frame, time, rows, labels, weights):
-        box = self.box if self.state != 'absent' else None
-        track = Track(self.seq, frame, time, self.state, box, float(self.score), self.model.version)
-        return track, Features(self.seq, frame, time, box, rows, labels, weights)
+        # The window is wider than the object: the edge of an object tells most about where it is.
+        self._box = self._sure_box = Box(*map(float, box)).inside(width, height).scaled(self.settings.context)
+        lesson = lessons.first(image, self._box, self._rng, self.settings)
+        self.model = bootstrap.stand_in(lesson, self.settings)
+        lesson += lessons.far(image, self._box, self.model, self.settings)
+        self.model = bootstrap.stand_in(lesson, self.settings)
+        self.seq, self.state = 1, "bootstrapping"
+        return self._answer(time, 1.0, lesson)
 
     def adopt(self, model: Model) -> None:
+        """Go on with a model, unless it is older than the one in use."""
         if model.version > self.model.version:
             self.model = model
 
-    def step(self, image, time=0.0):
-        s = self.settings
+    def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
+        """Find the object in the next frame."""
+        settings = self.settings
+        if not self.seq:
+            raise BoxError("there is no box to follow yet: call init with a frame and a box first")
         self.seq += 1
-        frame = self.seq - 1
-        score, box = self._local(image)
-        if score < s.sure_score and (score < s.lost_score or frame % s.global_frames == 0):
-            g_score, g_box = self._global(image)
-            if g_score > score + (s.jump_margin if score > s.lost_score else 0):
-                # refine
-                b2, sc2 = self.box, self.score
-                self.box = g_box
-                score2, box2 = self._local(image)
-                if score2 > score: 
-                    score, box = score2, box2
-                else: self.box = b2
-        self.score = score
-        if score >= s.present_score:
-            self.state = 'present' if self.model.version else 'bootstrapping'
-            self.box = box
+        found = self._find(image)
+        keep = settings.present_score if self.state != "absent" else settings.return_score
+        if found.score < keep:
+            self.state = "absent"
+            return self._answer(time, found.score, Lesson.of([], 0))
+        self.state = "present" if self.model.version else "bootstrapping"
+        height, width = image.shape[:2]
+        x, y = found.box.centre
+        box = found.box.centred(min(max(x, 0), width - 1), min(max(y, 0), height - 1))
+        growth = np.sqrt(box.area / self._box.area)
+        if found.score < settings.scale_score and 0.85 < growth < 1.2:
+            box = box.scaled(1 / growth)
         else:
-            self.state = 'absent'
-        none = np.empty((0, row_length()), np.float32), np.empty(0, np.float32), np.empty(0, np.float32)
-        if score < s.teach_score:
-            return self._answer(frame, time, *none)
-        rows, labels, weights = self._surroundings(image, frame)
-        if frame % s.mine_frames == 0 and score > s.mine_score:
-            far = self._mine(image, s.mine_count)
-            if len(far):
-                rows = np.vstack([rows, far]); labels = np.concatenate([labels, np.zeros(len(far), np.float32)]); weights = np.concatenate([weights, np.ones(len(far), np.float32)])
-        return self._answer(frame, time, rows, labels, weights)
+            box = box.scaled(growth ** (settings.scale_rate - 1)) if 0.85 < growth < 1.2 else box
+        self._box = box
+        if found.score >= settings.sure_score:
+            self._sure_box = box
+        return self._answer(time, found.score, self._lesson(image, found.score))
 
-    def _local(self, image):
-        s = self.settings
-        best = (-9, None, None)
-        for scale in s_scales(s):
-            scored = self._scored(windows.around(image, self.box.scaled(scale), _CELLS))
-            n = scored.scores.shape[0]
-            off = (np.arange(n) - self.centre_cell) * scale
-            dist = (off[:, None] ** 2 + off[None] ** 2) / WINDOW**2
-            adj = scored.scores - s.distance_penalty * dist - s.scale_penalty * abs(np.log(scale)) / 0.03
-            i = int(adj.argmax()); r, c = divmod(i, n)
-            if adj[r, c] > best[0]:
-                best = (adj[r, c], scored, (r, c), scale)
-        _, scored, (r, c), scale = best
-        fr, fc = scored.refined(r, c)
-        box = scored.box(fr, fc)
-        # damp the scale
-        damp = scale ** (s.scale_rate - 1)
-        box = box.scaled(damp)
-        x, y = box.centre
-        x = min(max(x, 0), self.size[0] - 1); y = min(max(y, 0), self.size[1] - 1)
-        return float(scored.scores[r, c]), box.centred(x, y)
+    def _find(self, image: np.ndarray) -> search.Found:
+        settings = self.settings
+        if settings.detection == "full":
+            return search.whole(image, self._box, self.model, search.scales(settings), settings)
+        found = search.local(image, self._box, self.model, settings)
+        lost = found.score < settings.lost_score
+        if lost or (found.score < settings.sure_score and self.seq % settings.whole_frames == 0):
+            other = search.whole(image, self._sure_box.centred(*self._box.centre), self.model, _FACTORS, settings)
+            if other.score > settings.return_score and other.score > found.score + settings.jump_margin:
+                other = search.local(image, other.box, self.model, settings)
+                if other.score > found.score:
+                    return other
+        return found
 
-    def _scored(self, around):
-        cells, origin, step = around
-        return Scored(cells, windows.respond(cells, self.model.weights, self.model.bias), origin, step)
+    def _lesson(self, image: np.ndarray, score: float) -> Lesson:
+        settings = self.settings
+        if score < settings.teach_score:
+            return Lesson.of([], 0)
+        lesson = lessons.near(image, self._box, self.model, self._rng, settings)
+        if score > settings.mine_score and self.seq % settings.mine_frames == 0:
+            lesson += lessons.far(image, self._box, self.model, settings)
+        return lesson
 
-    def _global(self, image):
-        s = self.settings
-        best = (-9, None)
-        for scale in (0.8, 1.0, 1.25):
-            box = self.box.scaled(scale)
-            if box.w * box.h < 100: continue
-            scored = self._scored(windows.whole(image, box))
-            r, c = divmod(int(scored.scores.argmax()), scored.scores.shape[1])
-            if scored.scores[r, c] > best[0]:
-                best = (float(scored.scores[r, c]), scored.box(*scored.refined(r, c)))
-        return best
-
-    def _mine(self, image, count):
-        scored = self._scored(windows.whole(image, self.box))
-        found = windows.peaks(scored.scores, count + 1, 4)
-        rows = [scored.row(*p) for p in found if scored.box(*p).overlap(self.box) < 0.2]
-        return np.array(rows[:count], np.float32)
-
-    def _surroundings(self, image, frame):
-        s = self.settings
-        cells, origin, step = windows.around(image, self.box, _CELLS)
-        k = self.centre_cell
-        n = _CELLS - WINDOW + 1
-        at = [(k, k)]
-        near = self.rng.integers(-2, 3, size=(s.near_misses, 2))
-        at += [(k + a, k + b) for a, b in near if a or b]
-        labels = [1.0] + [float(np.exp(-(a * a + b * b) / (2 * s.near_sigma**2))) for a, b in near if a or b]
-        weights = [s.object_weight] + [1.0] * (len(at) - 1)
-        neg = []
-        if self.model is not None:
-            scores = windows.respond(cells, self.model.weights, self.model.bias)
-            scores[k - 2 : k + 3, k - 2 : k + 3] = -np.inf
-            neg = windows.peaks(scores, s.negatives // 2, 2, -1e9)
-        while len(neg) < s.negatives:
-            p = tuple(self.rng.integers(0, n, 2))
-            if max(abs(p[0] - k), abs(p[1] - k)) > 2:
-                neg.append(p)
-        at += neg
-        labels += [0.0] * len(neg)
-        weights += [1.0] * len(neg)
-        rows = np.array([cells[r : r + WINDOW, c : c + WINDOW].reshape(-1) for r, c in at], np.float32)
-        return rows, np.array(labels, np.float32), np.array(weights, np.float32)
-
-
-def s_scales(s):
-    return [1 + s.scale_step * k for k in (0, -2, -1, 1, 2)]
+    def _answer(self, time: float, score: float, lesson: Lesson) -> tuple[Track, Features]:
+        frame = self.seq - 1
+        box = None if self.state == "absent" else self._box.scaled(1 / self.settings.context)
+        track = Track(self.seq, frame, time, self.state, box, float(score), self.model.version)
+        return track, Features(self.seq, frame, time, box, lesson.rows, lesson.labels, lesson.weights)

@@ -15,7 +15,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.detection.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
 
-__all__ = ["Scored", "around", "cut", "peaks", "respond", "whole"]
+__all__ = ["Scored", "around", "cut", "peaks", "respond", "row_at", "whole"]
 
 _WINDOW_PIXELS = WINDOW * CELL
 
@@ -42,7 +42,7 @@ class Scored:
 
     def row(self, row: int, column: int) -> np.ndarray:
         """Feature row of the window at (row, column), float32 (d,)."""
-        return self.cells[row : row + WINDOW, column : column + WINDOW].reshape(-1)
+        return row_at(self.cells, row, column)
 
     def refined(self, row: int, column: int) -> tuple[float, float]:
         """The peak at (row, column) between the cells, by a parabola in each direction."""
@@ -50,6 +50,11 @@ class Scored:
         down = _vertex(scores[:, column], row)
         across = _vertex(scores[row], column)
         return row + down, column + across
+
+
+def row_at(cells: np.ndarray, row: int, column: int) -> np.ndarray:
+    """Feature row of the window whose first cell is (row, column), float32 (d,)."""
+    return cells[row : row + WINDOW, column : column + WINDOW].reshape(-1)
 
 
 def around(image: np.ndarray, box: Box, cells: int) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:

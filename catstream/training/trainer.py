@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from catstream import ridge
 from catstream.errors import ProtocolError
 from catstream.messages import Model, Motion, Sample
 from catstream.settings import Settings
-from catstream.training import least_squares
 from catstream.training.one_class import one_class
 
 __all__ = ["Trainer"]
@@ -48,9 +48,7 @@ class Trainer:
         settings = self.settings
         if settings.classifier == "one-class":
             return [one_class(sample.object.rows, sample.background.mean)]
-        of_means = least_squares.of_means(
-            sample.background.rows, sample.background.mean, sample.object.mean, settings.ridge
-        )
+        means = ridge.between(sample.background.rows, sample.object.mean - sample.background.mean, settings.ridge)
         if settings.classifier == "least-squares":
-            return [of_means]
-        return [of_means, least_squares.of_loss(sample.loss.rows, settings.loss_ridge)]
+            return [means]
+        return [means, ridge.fit(sample.loss.rows, settings.loss_ridge)]

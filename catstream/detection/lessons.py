@@ -1,0 +1,94 @@
+"""Lessons: the rows that a frame teaches, cut around the place where the object is.
+
+label 1, the object; 0, background; between them a near miss, which is worth
+exp(-distance^2 / 2 sigma^2), so that the score falls smoothly beside the object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from catstream.box import Box
+from catstream.detection import affine, search, windows
+from catstream.detection.hog import WINDOW, row_length
+from catstream.messages import Model
+from catstream.settings import Settings
+
+__all__ = ["Lesson", "far", "first", "near"]
+
+_NEAR = 2  # cells around the object whose windows are near misses, not background
+_CELLS = 20  # cells around the object that background is taken from
+_MIDDLE = (_CELLS - WINDOW) // 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lesson:
+    """Rows with their labels and weights, as in `Features`."""
+
+    rows: np.ndarray
+    labels: np.ndarray
+    weights: np.ndarray
+
+    @classmethod
+    def of(cls, rows: list[np.ndarray], label: float, weight: float = 1.0) -> Lesson:
+        """Rows of one kind."""
+        k = len(rows)
+        array = np.array(rows, np.float32).reshape(k, row_length())
+        return cls(array, np.full(k, label, np.float32), np.full(k, weight, np.float32))
+
+    def __add__(self, other: Lesson) -> Lesson:
+        return Lesson(
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.labels, other.labels]),
+            np.concatenate([self.weights, other.weights]),
+        )
+
+
+def first(image: np.ndarray, box: Box, rng: np.random.Generator, settings: Settings) -> Lesson:
+    """What the first frame teaches: n affine copies of the box, and what lies around it."""
+    copies = affine.copies(image, box, settings.coreset_size, rng)
+    return Lesson.of(list(copies), 1, settings.object_weight) + _around(image, box, None, rng, settings)
+
+
+def near(image: np.ndarray, box: Box, model: Model, rng: np.random.Generator, settings: Settings) -> Lesson:
+    """What a later frame teaches: the object, affine copies of it, near misses, and the background around."""
+    own = list(affine.copies(image, box, 1 + settings.copies, rng))
+    return Lesson.of(own, 1, settings.object_weight / len(own)) + _around(image, box, model, rng, settings)
+
+
+def far(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Lesson:
+    """Hard negatives: the windows of the whole frame that look most like the object and are not it."""
+    scored = search.scored_whole(image, box, model)
+    places = windows.peaks(scored.scores, settings.far_negatives + 1, WINDOW // 2)
+    rows = [scored.row(*place) for place in places if scored.box(*place).overlap(box) < 0.2]
+    return Lesson.of(rows[: settings.far_negatives], 0)
+
+
+def _around(
+    image: np.ndarray, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings
+) -> Lesson:
+    """Near misses, and background: half of it the highest scoring windows, half of it anywhere."""
+    cells, origin, step = windows.around(image, box, _CELLS)
+    lesson = Lesson.of([], 0)
+    for down, across in rng.integers(-_NEAR, _NEAR + 1, size=(settings.near_misses, 2)):
+        distance = down * down + across * across
+        if distance:
+            label = float(np.exp(-distance / (2 * settings.near_sigma**2)))
+            lesson += Lesson.of([windows.row_at(cells, _MIDDLE + down, _MIDDLE + across)], label)
+    for power in (-2, -1, 1, 2) if settings.near_scale > 1 else ():
+        factor = settings.near_scale**power
+        label = float(np.exp(-(np.log(factor) ** 2) / (2 * settings.near_scale_sigma**2)))
+        features, _, _ = windows.around(image, box.scaled(factor), WINDOW)
+        lesson += Lesson.of([features.reshape(-1)], label)
+    places = []
+    if model is not None:
+        scores = windows.respond(cells, model.weights, model.bias)
+        scores[_MIDDLE - _NEAR : _MIDDLE + _NEAR + 1, _MIDDLE - _NEAR : _MIDDLE + _NEAR + 1] = -np.inf
+        places = windows.peaks(scores, settings.near_negatives // 2, _NEAR)
+    while len(places) < settings.near_negatives:
+        row, column = (int(value) for value in rng.integers(0, _CELLS - WINDOW + 1, 2))
+        if max(abs(row - _MIDDLE), abs(column - _MIDDLE)) > _NEAR:
+            places.append((row, column))
+    return lesson + Lesson.of([windows.row_at(cells, *place) for place in places], 0)

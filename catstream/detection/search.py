@@ -1,0 +1,103 @@
+"""Search: where in a frame the model scores highest.
+
+Near the place where the object is expected, or in the whole frame. A search at
+several scales resizes the frame, not the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from catstream.box import Box
+from catstream.detection import windows
+from catstream.detection.hog import CELL, WINDOW
+from catstream.detection.windows import Scored
+from catstream.messages import Model
+from catstream.settings import Settings
+
+__all__ = ["Found", "local", "scales", "scored_around", "scored_whole", "whole"]
+
+_FINE_CELLS = WINDOW + 4  # cells searched at each other scale, around the peak of the first
+_MOST_PIXELS = 4_000_000  # of a resized frame: what a whole search may cost for a tiny object in a large frame
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A window and its score."""
+
+    score: float
+    box: Box
+
+
+def scales(settings: Settings) -> list[float]:
+    """Factors of the box's size to search at, 1 first.
+
+    >>> [round(scale, 3) for scale in scales(Settings(scale_step=0.03))]
+    [1, 0.971, 1.03, 0.943, 1.061]
+    """
+    step = 1 + settings.scale_step
+    return [1, *(step**power for k in range(1, settings.scale_count // 2 + 1) for power in (-k, k))]
+
+
+def local(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
+    """The best window near a box: first at its own scale, then at the others around the peak.
+
+    Distance and change of scale cost a little of the score, so that of two equal windows the nearer wins.
+    """
+    cells = WINDOW + 2 * round((settings.search_area - 1) * WINDOW / 2)
+    scored = scored_around(image, box, cells, model)
+    middle = (cells - WINDOW) // 2
+    away = (np.arange(cells - WINDOW + 1) - middle) / WINDOW
+    penalty = settings.distance_penalty * (away[:, None] ** 2 + away**2)
+    row, column = np.unravel_index((scored.scores - penalty).argmax(), scored.scores.shape)
+    best = Found(float(scored.scores[row, column]), scored.box(*scored.refined(int(row), int(column))))
+    least = best.score
+    at = best.box.centre
+    for scale in scales(settings)[1:]:
+        scored = scored_around(image, box.centred(*at).scaled(scale), _FINE_CELLS, model)
+        row, column = np.unravel_index(scored.scores.argmax(), scored.scores.shape)
+        score = float(scored.scores[row, column])
+        if score - settings.scale_penalty * abs(np.log(scale)) > least:
+            least = score - settings.scale_penalty * abs(np.log(scale))
+            best = Found(score, scored.box(*scored.refined(int(row), int(column))))
+    return best
+
+
+def whole(image: np.ndarray, box: Box, model: Model, factors: list[float], settings: Settings) -> Found:
+    """The best window of a whole frame, at each factor of a box's size."""
+    best, least = Found(-np.inf, box), -np.inf
+    for factor in factors:
+        scored = scored_whole(image, box.scaled(factor), model)
+        row, column = np.unravel_index(scored.scores.argmax(), scored.scores.shape)
+        score = float(scored.scores[row, column])
+        if score - settings.scale_penalty * abs(np.log(factor)) > least:
+            least = score - settings.scale_penalty * abs(np.log(factor))
+            best = Found(score, scored.box(*scored.refined(int(row), int(column))))
+    return best
+
+
+def scored_around(image: np.ndarray, box: Box, cells: int, model: Model) -> Scored:
+    """Scores of all windows in `cells` x `cells` cells around a box."""
+    features, origin, step = windows.around(image, box, cells)
+    return Scored(features, windows.respond(features, model.weights, model.bias), origin, step)
+
+
+def scored_whole(image: np.ndarray, box: Box, model: Model) -> Scored:
+    """Scores of all windows of the size of a box in a frame.
+
+    Where the frame, resized so that the box is a window, would be too large to search in time, it is the part around the box.
+    """
+    height, width = image.shape[:2]
+    window = WINDOW * CELL
+    reach = np.sqrt(_MOST_PIXELS / (width * window / box.w * height * window / box.h))
+    left, top = 0, 0
+    if reach < 1:
+        x, y = box.centre
+        w, h = int(width * reach), int(height * reach)
+        left, top = int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))
+        image = image[top : top + h, left : left + w]
+    features, origin, step = windows.whole(image, box)
+    origin = origin[0] + left, origin[1] + top
+    return Scored(features, windows.respond(features, model.weights, model.bias), origin, step)
