@@ -250,7 +250,7 @@ def _good_frames(path: Path, container: Any, stream: Any) -> Iterator[Any]:
             else:
                 frames = packet.decode()
         except av.FFmpegError as error:
-            problem = error.strerror.lower()
+            problem = (error.strerror or str(error)).lower()
         if problem:  # the good frames that wait in the decoder for their turn
             try:
                 frames = stream.codec_context.decode(None)

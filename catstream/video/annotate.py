@@ -1,0 +1,155 @@
+"""Tracks drawn over their frames, for people to look at."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+
+from catstream.errors import VideoError
+from catstream.messages import Track
+
+__all__ = ["AnnotatedVideo", "draw"]
+
+#: Blue, green, red.
+_COLOURS = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
+_WHITE, _GREY = (245, 245, 245), (110, 110, 110)
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+#: Images narrower than this are enlarged by a whole factor, so that the text can be read.
+_READABLE = 320
+
+
+def draw(image: np.ndarray, track: Track) -> np.ndarray:
+    """Draw box, state, score and model version over a copy of a frame.
+
+    Parameters
+    ----------
+    image : uint8 (h, w, 3), blue green red
+    track : what was found in it
+
+    Returns
+    -------
+    uint8 (k h, k w, 3), where k is 1 unless the image is narrower than 320 pixels
+    """
+    zoom = _zoom(image.shape[1])
+    canvas = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC) if zoom > 1 else image.copy()
+    unit = canvas.shape[1] / 640  # lengths below are pixels of an image 640 wide
+    colour = _COLOURS[track.state]
+    if track.box is not None:
+        x, y, w, h = (value * zoom for value in track.box)
+        _frame(canvas, (x, y), (x + w, y + h), colour, unit)
+    _strip(canvas, track, colour, max(unit, 0.75))
+    return canvas
+
+
+def _zoom(width: int) -> int:
+    return max(1, -(-_READABLE // width))
+
+
+def _frame(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float) -> None:
+    """A thin rectangle with strong corners, over a dark one, so that it shows on any background."""
+    (left, top), (right, bottom) = (tuple(round(value) for value in corner) for corner in (start, end))
+    thin, arm = max(1, round(1.2 * unit)), min(right - left, bottom - top) // 4
+    cv2.rectangle(canvas, (left, top), (right, bottom), (0, 0, 0), thin + 2, cv2.LINE_AA)
+    cv2.rectangle(canvas, (left, top), (right, bottom), colour, thin, cv2.LINE_AA)
+    for x, way in ((left, 1), (right, -1)):
+        for y, down in ((top, 1), (bottom, -1)):
+            corner = np.array([(x + way * arm, y), (x, y), (x, y + down * arm)], np.int32)
+            cv2.polylines(canvas, [corner], False, colour, max(2, round(3 * unit)), cv2.LINE_AA)
+
+
+def _strip(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> None:
+    """A dark line of text along the bottom: state, score as bar and number, model and frame."""
+    height, width = canvas.shape[:2]
+    tall = round(26 * unit)
+    canvas[-tall:] = canvas[-tall:] // 4
+    middle, line = height - tall // 2, height - round(9 * unit)
+
+    def write(text: str, left: int, shade: Any) -> None:
+        cv2.putText(canvas, text, (left, line), _FONT, 0.45 * unit, shade, max(1, round(unit)), cv2.LINE_AA)
+
+    cv2.circle(canvas, (round(14 * unit), middle), round(5 * unit), colour, cv2.FILLED, cv2.LINE_AA)
+    write(track.state, round(26 * unit), _WHITE)
+    left, long, half = round(132 * unit), round(90 * unit), max(2, round(3 * unit))
+    full = round(long * min(max(track.score, 0.0), 1.0))
+    cv2.rectangle(canvas, (left, middle - half), (left + long, middle + half), _GREY, cv2.FILLED)
+    cv2.rectangle(canvas, (left, middle - half), (left + full, middle + half), colour, cv2.FILLED)
+    write(f"{track.score:.2f}", left + long + round(8 * unit), _WHITE)
+    end = f"model {track.model_version}   frame {track.frame}"
+    (wide, _), _ = cv2.getTextSize(end, _FONT, 0.45 * unit, max(1, round(unit)))
+    write(end, width - wide - round(10 * unit), _WHITE)
+
+
+class AnnotatedVideo:
+    """An MP4 of frames with their tracks drawn in; a context manager.
+
+    H.264 where this FFmpeg can, else MPEG-4. The file gets its name when it is
+    closed and whole; until then it is NAME.part, and a run that wrote no frame
+    leaves nothing.
+
+    Parameters
+    ----------
+    path : of the video to write
+    rate : frames a second
+    size : (width, height) of the frames that will come
+
+    Raises
+    ------
+    VideoError
+        Where the file cannot be written, before any work is done.
+    """
+
+    def __init__(self, path: str | Path, rate: float, size: tuple[int, int]) -> None:
+        import av  # here, as only those who ask for a video pay for it
+
+        self.path = Path(path)
+        self._part = self.path.with_name(self.path.name + ".part")
+        self.frames = 0
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._container = av.open(str(self._part.absolute()), "w", format="mp4")
+        except (OSError, av.FFmpegError) as error:
+            raise VideoError(
+                f"cannot write the video {str(path)!r} ({error.strerror}): give a place that you may write to"
+            ) from None
+        h264 = "libx264" in av.codecs_available
+        self._stream: Any = self._container.add_stream(
+            "libx264" if h264 else "mpeg4",
+            rate=Fraction(rate).limit_denominator(60000),
+            options={"preset": "veryfast", "crf": "20"} if h264 else {"qscale": "3"},
+        )
+        self._stream.thread_count = 1  # the processes are the parallelism
+        self._stream.pix_fmt = "yuv420p"
+        zoom = _zoom(size[0])
+        # Both encoders share colour between 2x2 pixels, so an odd side grows by one.
+        self._stream.width, self._stream.height = (side * zoom + side * zoom % 2 for side in size)
+
+    def write(self, image: np.ndarray, track: Track) -> None:
+        """Add a frame, uint8 (h, w, 3) of the size announced, with its track."""
+        import av
+
+        canvas: Any = draw(image, track)
+        down, across = self._stream.height - canvas.shape[0], self._stream.width - canvas.shape[1]
+        canvas = cv2.copyMakeBorder(canvas, 0, down, 0, across, cv2.BORDER_REPLICATE)
+        self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(canvas, format="bgr24")))
+        self.frames += 1
+
+    def close(self) -> None:
+        """Finish the file and give it its name."""
+        if self.frames:
+            self._container.mux(self._stream.encode(None))
+        self._container.close()
+        if self.frames:
+            self._part.replace(self.path)
+        else:
+            self._part.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
