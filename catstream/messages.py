@@ -92,7 +92,7 @@ class Sample:
     object      rows of the object (d columns)
     background  rows of everything else (d columns)
     loss        rows [x, 1, y] times the root of their weight (d + 2 columns)
-    centres     float64 (m, 2), object's centre in the last frames in pixels, NaN where absent
+    centres     float64 (m, 2), object's centre in the last whole block of frames, pixels, NaN where absent
     """
 
     version: int

@@ -75,7 +75,7 @@ class Settings:
     ] = "joint"
     ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 1.0
     loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
-    motion_frames: Annotated[int, _about("Frames whose centres the Kalman filter's parameters are learned from.", ge=8)] = 64
+    motion_frames: Annotated[int, _about("Frames in a block of centres, from which the Kalman filter's parameters are learned.", ge=8)] = 64
 
     # --- detection ---------------------------------------------------------------------------------
     detection: Annotated[
@@ -102,6 +102,7 @@ class Settings:
     object_weight: Annotated[float, _about("Ordinary rows that the object's row of a frame counts for in the loss tree.", gt=0)] = 4.0
     near_misses: Annotated[int, _about("Windows a frame that lie beside the object.", ge=0)] = 12
     near_sigma: Annotated[float, _about("Distance, in cells, at which a near miss is worth exp(-1/2) of the object.", gt=0)] = 0.9
+    kalman: Annotated[int, _about("k")] = 1
     near_scale: Annotated[float, _about("scale near misses")] = 1.0
     near_scale_sigma: Annotated[float, _about("scale near misses")] = 0.1
     near_negatives: Annotated[int, _about("Background windows a frame around the object.", ge=1)] = 12

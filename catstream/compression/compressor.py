@@ -8,7 +8,6 @@ their weight make `||A [w; b; -1]||^2` the squared error of any linear model.
 from __future__ import annotations
 
 import os
-from collections import deque
 
 import numpy as np
 
@@ -34,7 +33,8 @@ class Compressor:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.trees = {name: CoresetTree(settings.coreset_size) for name in _TREES}
-        self.centres: deque[tuple[float, float]] = deque(maxlen=settings.motion_frames)
+        self.centres = np.empty((0, 2))
+        self._path: list[tuple[float, float]] = []
         self.seq = 0
         self.frame = -1
         self.box: Box | None = None
@@ -69,7 +69,7 @@ class Compressor:
         self.seq, self.frame = features.seq, features.frame
         if features.box is not None:
             self.box = features.box
-        self.centres.append(features.box.centre if features.box else (np.nan, np.nan))
+        self._follow(features.box)
         return self._sample() if self._due() else None
 
     @property
@@ -95,7 +95,7 @@ class Compressor:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one file, whole or not at all."""
-        arrays: dict[str, np.ndarray] = {"centres": np.array(self.centres, np.float64).reshape(-1, 2)}
+        arrays: dict[str, np.ndarray] = {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
         facts: dict[str, object] = {
             "seq": self.seq,
             "frame": self.frame,
@@ -124,7 +124,7 @@ class Compressor:
             self.seq, self.frame, self.version = int(facts["seq"]), int(facts["frame"]), int(facts["version"])  # type: ignore[call-overload]
             self.box = Box(*facts["box"]) if facts["box"] else None  # type: ignore[misc]
             self._sampled_leaves, self._sampled_frame = facts["sampled"]  # type: ignore[misc]
-            self.centres.extend(map(tuple, arrays["centres"].tolist()))
+            self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]
             for name, tree_facts in facts["trees"].items():  # type: ignore[attr-defined]
                 own = {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
                 self.trees[name] = CoresetTree.from_state(own, tree_facts)
@@ -137,6 +137,13 @@ class Compressor:
                 "go on with the same settings"
             )
         return self
+
+    def _follow(self, box: Box | None) -> None:
+        """Centres go out in whole blocks, so that the trainer learns the motion once a block."""
+        self._path.append(box.centre if box else (np.nan, np.nan))
+        if len(self._path) == self.settings.motion_frames:
+            self.centres = np.array(self._path)
+            self._path = []
 
     def _due(self) -> bool:
         """Trees that can teach, a leaf more than last time, and not right after the last sample."""
@@ -152,7 +159,7 @@ class Compressor:
 
     def _made(self) -> Sample:
         summaries = {name: tree.sample() for name, tree in self.trees.items()}
-        return Sample(self.version, self.frame, centres=np.array(self.centres, np.float64), **summaries)
+        return Sample(self.version, self.frame, centres=self.centres, **summaries)
 
 
 def _loss_rows(rows: np.ndarray, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:

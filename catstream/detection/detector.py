@@ -31,7 +31,6 @@ class Detector:
         self.seq = 0
         self.state: State = "bootstrapping"
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
-        self._rng = np.random.default_rng(settings.seed)
         self._centre: CentreFilter | None = None
 
     def init(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
@@ -51,7 +50,7 @@ class Detector:
         height, width = image.shape[:2]
         # The window is wider than the object: the edge of an object tells most about where it is.
         self._box = self._sure_box = Box(*map(float, box)).inside(width, height).scaled(self.settings.context)
-        lesson = lessons.first(image, self._box, self._rng, self.settings)
+        lesson = lessons.first(image, self._box, self._random(), self.settings)
         self.model = bootstrap.stand_in(lesson, self.settings)
         lesson += lessons.far(image, self._box, self.model, self.settings)
         self.model = bootstrap.stand_in(lesson, self.settings)
@@ -60,8 +59,27 @@ class Detector:
 
     def adopt(self, model: Model) -> None:
         """Go on with a model, unless it is older than the one in use."""
-        if model.version > self.model.version:
-            self.model = model
+        if model.version <= self.model.version:
+            return
+        self.model = model
+        if model.motion is not None and self.seq:
+            if self._centre is None:
+                self._centre = CentreFilter(model.motion, self._box.centre)
+            else:
+                self._centre.adopt(model.motion)
+
+    def resume(self, seq: int, box: Box, model: Model) -> None:
+        """Go on after message `seq` of a stream that another detector began.
+
+        Parameters
+        ----------
+        seq : the last Features that is stored
+        box : where the object was last, in pixels
+        model : the newest there is
+        """
+        self.seq, self.state = seq, "present"
+        self._box = self._sure_box = box.scaled(self.settings.context)
+        self.adopt(model)
 
     def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
         """Find the object in the next frame."""
@@ -69,10 +87,13 @@ class Detector:
         if not self.seq:
             raise BoxError("there is no box to follow yet: call init with a frame and a box first")
         self.seq += 1
+        if self._centre is not None and settings.kalman:
+            self._box = self._box.centred(*self._centre.predict())
         found = self._find(image)
         keep = settings.present_score if self.state != "absent" else settings.return_score
         if found.score < keep:
             self.state = "absent"
+            if self._centre: self._centre.update(None)
             return self._answer(time, found.score, Lesson.of([], 0))
         self.state = "present" if self.model.version else "bootstrapping"
         height, width = image.shape[:2]
@@ -83,6 +104,9 @@ class Detector:
             box = box.scaled(1 / growth)
         else:
             box = box.scaled(growth ** (settings.scale_rate - 1)) if 0.85 < growth < 1.2 else box
+        if self._centre:
+            self._centre.update(box.centre)
+            if settings.kalman == 2: box = box.centred(*self._centre.centre)
         self._box = box
         if found.score >= settings.sure_score:
             self._sure_box = box
@@ -106,10 +130,14 @@ class Detector:
         settings = self.settings
         if score < settings.teach_score:
             return Lesson.of([], 0)
-        lesson = lessons.near(image, self._box, self.model, self._rng, settings)
+        lesson = lessons.near(image, self._box, self.model, self._random(), settings)
         if score > settings.mine_score and self.seq % settings.mine_frames == 0:
             lesson += lessons.far(image, self._box, self.model, settings)
         return lesson
+
+    def _random(self) -> np.random.Generator:
+        """A fresh generator for each frame: what a frame teaches does not depend on the ones before."""
+        return np.random.default_rng((self.settings.seed, self.seq))
 
     def _answer(self, time: float, score: float, lesson: Lesson) -> tuple[Track, Features]:
         frame = self.seq - 1

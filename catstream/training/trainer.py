@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from catstream import ridge
 from catstream.errors import ProtocolError
 from catstream.messages import Model, Motion, Sample
 from catstream.settings import Settings
+from catstream.training.motion_em import learn_motion
 from catstream.training.one_class import one_class
 
 __all__ = ["Trainer"]
@@ -18,8 +21,6 @@ class Trainer:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._motion: Motion | None = None
-        self._motion_frame = -1
 
     def train(self, sample: Sample) -> Model:
         """Learn from a sample, in time that depends on n only.
@@ -42,7 +43,8 @@ class Trainer:
                 )
             weights += direction / np.float32(contrast)
         weights /= np.float32(weights @ (mean - background_mean))
-        return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), self._motion)
+        motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
+        return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), motion)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
@@ -52,3 +54,8 @@ class Trainer:
         if settings.classifier == "least-squares":
             return [means]
         return [means, ridge.fit(sample.loss.rows, settings.loss_ridge)]
+
+
+@lru_cache(maxsize=1)  # the same centres come with every sample of a block
+def _motion(centres: bytes) -> Motion | None:
+    return learn_motion(np.frombuffer(centres, np.float64).reshape(-1, 2))
