@@ -1,0 +1,1 @@
+"""How well a tracker follows: annotated sequences in, measures and a report out."""

@@ -28,7 +28,7 @@ import numpy as np
 
 from catstream.errors import VideoError
 
-__all__ = ["Frame", "Source", "image_files", "open_source"]
+__all__ = ["Frame", "Source", "image_files", "natural_order", "open_source"]
 
 #: Frames a second of a source that does not say: images have no clock.
 RATE = 25.0
@@ -151,10 +151,10 @@ def image_files(path: Path) -> list[Path]:
     if not found:
         kinds = ", ".join(sorted(suffix[1:] for suffix in _IMAGES))
         raise VideoError(f"there are no images at {str(path)!r}: {_HELP} (images are {kinds})")
-    return sorted(found, key=_natural)
+    return sorted(found, key=natural_order)
 
 
-def _natural(path: Path) -> list[Any]:
+def natural_order(path: Path) -> list[Any]:
     """Key of an order in which 10 comes after 2."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 

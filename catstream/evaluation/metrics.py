@@ -1,0 +1,152 @@
+"""Measures of one-pass evaluation, as the benchmarks define them.
+
+From the boxes of a run and the truth, a row a frame, NaN where absent:
+
+    success plot  share of frames whose overlap exceeds each of 21 thresholds 0, 0.05 ... 1; its mean is the AUC
+    success       its value at 0.5
+    precision     share of frames whose centre is at most 20 pixels off
+    normalised precision  mean of that share over 51 thresholds 0 ... 0.5, distances as parts of the object's size
+
+Frames without the object do not count in these; frames where the tracker finds
+nothing count as missed. They agree with the got10k toolkit. Where the object
+is absent in some frames, the measures of VOT's long-term challenge say whether
+the tracker knows it: see `long_term`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = [
+    "OVERLAPS",
+    "PIXELS",
+    "LongTerm",
+    "Score",
+    "distances",
+    "long_term",
+    "overlaps",
+    "precision_plot",
+    "score",
+    "success_plot",
+]
+
+#: Thresholds of the success plot (overlap) and of the precision plot (pixels).
+OVERLAPS = np.linspace(0, 1, 21)
+PIXELS = np.arange(51)
+_SHARES = np.linspace(0, 0.5, 51)
+
+
+@dataclass(frozen=True, slots=True)
+class LongTerm:
+    """Precision and recall of VOT-LT at the confidence where their F-score is highest."""
+
+    precision: float
+    recall: float
+    f_score: float
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """What one run is worth: shares, 0 to 1; `long_term` is None where the object never leaves."""
+
+    auc: float
+    success: float
+    precision: float
+    normalised_precision: float
+    long_term: LongTerm | None
+
+
+def overlaps(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Intersection over union of boxes a row, float64 (frames, 4) both; 0 where either is NaN.
+
+    >>> overlaps(np.array([[0., 0, 10, 10]]), np.array([[5., 0, 10, 10]]))
+    array([0.33333333])
+    """
+    low = np.maximum(boxes[:, :2], truth[:, :2])
+    high = np.minimum(boxes[:, :2] + boxes[:, 2:], truth[:, :2] + truth[:, 2:])
+    shared = np.prod(np.maximum(high - low, 0), axis=1)
+    union = np.prod(boxes[:, 2:], axis=1) + np.prod(truth[:, 2:], axis=1) - shared
+    ratios = np.divide(shared, union, out=np.zeros(len(boxes)), where=union > 0)
+    return np.minimum(np.nan_to_num(ratios), 1.0)  # rounding may go past 1
+
+
+def distances(boxes: np.ndarray, truth: np.ndarray, *, normalised: bool = False) -> np.ndarray:
+    """Between the centres, in pixels or in parts of the true width and height; infinite where either is NaN."""
+    apart = (boxes[:, :2] + boxes[:, 2:] / 2) - (truth[:, :2] + truth[:, 2:] / 2)
+    if normalised:
+        apart = apart / np.maximum(truth[:, 2:], 1)
+    return np.nan_to_num(np.hypot(apart[:, 0], apart[:, 1]), nan=np.inf)
+
+
+def success_plot(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Share of the frames with the object whose overlap exceeds each of `OVERLAPS`, float64 (21,)."""
+    return (overlaps(boxes, truth)[_present(truth), None] > OVERLAPS).mean(axis=0)
+
+
+def precision_plot(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Share of the frames with the object whose centre is within each of `PIXELS`, float64 (51,)."""
+    return (distances(boxes, truth)[_present(truth), None] <= PIXELS).mean(axis=0)
+
+
+def long_term(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray) -> LongTerm:
+    """Precision, recall and F-score of VOT-LT (Lukezic et al. 2020).
+
+    A box counts as an answer where the confidence reaches a threshold;
+    precision is the mean overlap over the answers (0 where the object is
+    absent), recall over the frames with the object. Every threshold is tried,
+    the one with the best F-score counts.
+
+    Parameters
+    ----------
+    boxes, truth : float64 (frames, 4), NaN where absent
+    confidence : float64 (frames,), of any range; NaN counts as none
+    """
+    answered = np.flatnonzero(_present(boxes))
+    answered = answered[np.argsort(-np.nan_to_num(confidence[answered], nan=-np.inf), kind="stable")]
+    if not len(answered):
+        return LongTerm(0.0, 0.0, 0.0)
+    shared = np.cumsum(overlaps(boxes, truth)[answered])
+    sure = confidence[answered]
+    ends = np.append(sure[1:] != sure[:-1], True)  # equal confidences pass a threshold together
+    precision = (shared / np.arange(1, len(answered) + 1))[ends]
+    recall = (shared / _present(truth).sum())[ends]
+    f_score = 2 * precision * recall / np.maximum(precision + recall, np.finfo(float).tiny)
+    best = int(f_score.argmax())
+    return LongTerm(float(precision[best]), float(recall[best]), float(f_score[best]))
+
+
+def score(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray | None = None) -> Score:
+    """All measures of one run.
+
+    Parameters
+    ----------
+    boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN where absent
+    confidence : float64 (frames,), or None for a tracker that has none
+
+    Raises
+    ------
+    ValueError
+        Where the two have different numbers of frames, or the object is never there.
+    """
+    if boxes.shape != truth.shape or boxes.shape[1:] != (4,):
+        raise ValueError(f"boxes and truth need the same shape (frames, 4), got {boxes.shape} and {truth.shape}")
+    present = _present(truth)
+    if not present.any():
+        raise ValueError("the truth has no box: there is nothing to measure")
+    success = success_plot(boxes, truth)
+    off = distances(boxes, truth, normalised=True)[present]
+    return Score(
+        auc=float(success.mean()),
+        success=float(success[10]),
+        precision=float(precision_plot(boxes, truth)[20]),
+        normalised_precision=float((off[:, None] <= _SHARES).mean()),
+        long_term=None
+        if present.all()
+        else long_term(boxes, truth, np.ones(len(boxes)) if confidence is None else confidence),
+    )
+
+
+def _present(boxes: np.ndarray) -> np.ndarray:
+    return np.isfinite(boxes).all(axis=1)
