@@ -140,6 +140,8 @@ class CoresetTree:
                 f"a tree of rows of length {self.width} cannot take in rows of length {other.width}: "
                 "build both from the same features"
             )
+        if not self.width:
+            self.pending = np.empty((0, other.width), np.float32)
         # As in adding two binary numbers: equal levels merge, from the lowest up.
         carried = sorted([*self.nodes, *other.nodes], key=lambda node: -node.level)
         self.nodes = []
