@@ -1,0 +1,235 @@
+"""Laws of the coreset tree.
+
+A node's error, ||C Y||^2 + c - ||A Y||^2, is the sum of its two children's and that of their
+reduction, which `test_reduce.py` bounds by epsilon ||A Y||^2, epsilon = k / (n - k + 1). Leaves
+have none, so that at level q, with all errors adding up and none negative,
+
+    ||A Y||^2 <= ||C Y||^2 + c <= (1 + q epsilon) ||A Y||^2   and   ||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2.
+
+The first is sharper than the (1 + epsilon)^q of the paper (section "Coreset Tree").
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from catstream.compression.reduce import energy
+from catstream.compression.tree import CoresetTree
+from catstream.errors import ProtocolError
+
+SIZE = 16
+ROUNDING = 1e-5  # of float32, relative to ||A||^2
+
+counts = st.integers(0, 90)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def grown(rows: np.ndarray, size: int = SIZE) -> CoresetTree:
+    tree = CoresetTree(size)
+    tree.insert(rows)
+    return tree
+
+
+def whole_numbers(count: int, seed: int) -> np.ndarray:
+    """Rows whose sums are exact in any order."""
+    return np.random.default_rng(seed).integers(-9, 10, (count, 6)).astype(np.float32)
+
+
+def summary(tree: CoresetTree) -> np.ndarray:
+    """All rows in memory, C."""
+    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
+
+
+def bits(tree: CoresetTree) -> dict[str, bytes]:
+    arrays, facts = tree.state()
+    return {"facts": repr(facts).encode()} | {name: array.tobytes() for name, array in arrays.items()}
+
+
+def assert_within_the_bound(tree, rows, subspaces, squared_distance):
+    levels, dropped, slack = tree.nodes[0].level, tree.dropped_energy, ROUNDING * energy(rows)
+    for basis in subspaces:
+        k = basis.shape[1]
+        truth, approximation = squared_distance(rows, basis), squared_distance(summary(tree), basis)
+        assert truth - dropped - slack <= approximation <= truth + slack
+        assert truth - slack <= approximation + dropped <= (1 + levels * k / (SIZE - k + 1)) * truth + slack
+
+
+# --- what it keeps ---------------------------------------------------------------------------------
+
+
+def test_distances_to_subspaces_stay_within_the_bound(stream, subspaces, squared_distance):
+    assert_within_the_bound(grown(stream), stream, subspaces, squared_distance)
+
+
+def test_kept_and_dropped_energy_add_up_to_all_of_it(stream):
+    tree = grown(stream)
+    assert_allclose(energy(summary(tree)) + tree.dropped_energy, energy(stream), rtol=1e-12)
+
+
+@settings(deadline=None)
+@given(counts, seeds)
+def test_sums_and_counts_are_exact(count, seed):
+    rows = whole_numbers(count, seed)
+    tree = grown(rows, size=4)
+    assert tree.rows_seen == count
+    assert_array_equal(tree.sum, rows.sum(axis=0, dtype=np.float64) if count else 0)
+
+
+@settings(deadline=None)
+@given(counts, seeds)
+def test_a_node_stands_for_consecutive_rows(count, seed):
+    rows = whole_numbers(count, seed)
+    start = 0
+    for node in grown(rows, size=4).nodes:
+        assert_array_equal(node.sum, rows[start : start + node.count].sum(axis=0, dtype=np.float64))
+        start += node.count
+
+
+# --- what it costs ---------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(st.integers(0, 300), seeds)
+def test_levels_strictly_fall_from_oldest_to_newest(count, seed):
+    levels = [node.level for node in grown(whole_numbers(count, seed), size=4).nodes]
+    assert levels == sorted(set(levels), reverse=True)
+    assert sum(4 << level for level in levels) == count - count % 4
+
+
+def test_memory_grows_with_the_logarithm_of_the_rows(rng):
+    n, d = 4, 7
+    tree = CoresetTree(n)
+    for p in range(1, 1500):
+        tree.insert(rng.normal(size=(1, d)))
+        nodes = math.log2(p / n) + 1 if p >= n else 0
+        assert len(tree.nodes) <= nodes
+        assert tree.nbytes <= nodes * (4 * n * d + 8 * d) + 4 * n * d
+
+
+# --- the same, however it comes ------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 20), max_size=12), seeds)
+def test_same_rows_same_bits_however_they_are_cut(cuts, seed):
+    rows = np.random.default_rng(seed).normal(size=(sum(cuts), 33)).astype(np.float32)
+    tree = CoresetTree(4)
+    for part in np.split(rows, np.cumsum(cuts)):
+        tree.insert(part)
+    assert bits(tree) == bits(grown(rows, size=4))
+
+
+def test_rows_inserted_are_not_held_on_to(stream):
+    rows = stream.copy()
+    tree, other = grown(rows[:50]), grown(stream[:50])
+    rows[:] = 0
+    assert bits(tree) == bits(other)
+
+
+def test_two_trees_merged_are_one_tree_within_the_bound(stream, subspaces, squared_distance):
+    tree, other = grown(stream[:75]), grown(stream[75:])
+    tree.merge(other)
+    assert tree.rows_seen == len(stream)
+    assert_allclose(energy(summary(tree)) + tree.dropped_energy, energy(stream), rtol=1e-12)
+    assert_within_the_bound(tree, stream, subspaces, squared_distance)
+
+
+@settings(deadline=None)
+@given(counts, counts, seeds)
+def test_merging_keeps_the_form_of_a_tree(count, other_count, seed):
+    rows, others = whole_numbers(count, seed), whole_numbers(other_count, seed + 1)
+    tree, other = grown(rows, size=4), grown(others, size=4)
+    before = bits(other)
+    tree.merge(other)
+    levels = [node.level for node in tree.nodes]
+    assert levels == [node.level for node in grown(np.vstack([rows, others]), size=4).nodes]
+    assert_array_equal(tree.sum, np.vstack([rows, others]).sum(axis=0) if count + other_count else 0)
+    assert bits(other) == before
+
+
+def test_a_tree_goes_on_after_a_merge(stream):
+    tree = grown(stream[:50])
+    tree.merge(grown(stream[50:90]))
+    tree.insert(stream[90:])
+    assert tree.rows_seen == len(stream)
+    assert_allclose(energy(summary(tree)) + tree.dropped_energy, energy(stream), rtol=1e-12)
+
+
+# --- on disk --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [0, 3, 64, 103])
+def test_a_saved_tree_goes_on_bit_for_bit(stream, count, tmp_path):
+    tree = grown(stream[:count])
+    tree.save(tmp_path / "tree")
+    loaded = CoresetTree.load(tmp_path / "tree")
+    tree.insert(stream[count:])
+    loaded.insert(stream[count:])
+    assert bits(loaded) == bits(tree)
+
+
+def test_the_same_tree_makes_the_same_file(stream, tmp_path):
+    for name in ("one", "two"):
+        grown(stream).save(tmp_path / name)
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+@pytest.mark.parametrize("share", [0, 0.01, 0.3, 0.99])
+def test_a_torn_file_is_refused(stream, share, tmp_path):
+    path = tmp_path / "tree"
+    grown(stream).save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ProtocolError, match="take an older copy"):
+        CoresetTree.load(path)
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4))
+def test_a_damaged_file_is_refused_unless_nothing_of_the_tree_is_hurt(tmp_path_factory, damage):
+    path, tree = tmp_path_factory.mktemp("damaged") / "tree", grown(whole_numbers(14, seed=0), size=4)
+    tree.save(path)
+    content = bytearray(path.read_bytes())
+    for place, byte in damage:
+        content[int(place * len(content))] = byte
+    path.write_bytes(content)
+    try:
+        loaded = CoresetTree.load(path)
+    except ProtocolError:
+        return
+    assert bits(loaded) == bits(tree)
+
+
+# --- what it refuses ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [np.ones((3, 5)), np.ones(6), np.full((2, 6), np.nan), np.full((2, 6), np.inf)],
+    ids=["longer", "flat", "nan", "inf"],
+)
+def test_rows_it_cannot_hold_are_refused_and_leave_it_as_it_was(rows):
+    tree = grown(whole_numbers(14, seed=1), size=4)
+    before = bits(tree)
+    with pytest.raises(ProtocolError):
+        tree.insert(rows)
+    assert bits(tree) == before
+
+
+def test_trees_of_other_sizes_or_rows_are_refused():
+    tree = grown(np.ones((9, 6)), size=4)
+    with pytest.raises(ProtocolError, match="size 4 .* size 5"):
+        tree.merge(grown(np.ones((9, 6)), size=5))
+    with pytest.raises(ProtocolError, match="length 6 .* length 7"):
+        tree.merge(grown(np.ones((9, 7)), size=4))
+
+
+def test_a_size_below_one_is_refused():
+    with pytest.raises(ValueError, match="size=0"):
+        CoresetTree(0)
