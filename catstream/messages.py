@@ -23,6 +23,7 @@ __all__ = [
     "Health",
     "Model",
     "Motion",
+    "Position",
     "Sample",
     "State",
     "Stored",
@@ -57,14 +58,32 @@ class Features:
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """The compressor's acknowledgement, compressor -> detector.
+    """Acknowledges messages of an acknowledged channel, receiver -> sender.
 
-    seq      every Features up to and with this one is stored
+    seq      every message up to and with this one survives the receiver's death: forget it
+    taken    every message up to and with this one has been taken
     version  the newest Sample made so far, 0 before the first
     """
 
     seq: int
-    version: int
+    taken: int
+    version: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where a stream goes on: a receiver's answer to each new connection.
+
+    seq      the last message stored, 0 in a new stream: send from the next one on
+    frame    its frame
+    box      where the object was last found, None in a new stream
+    version  the newest Sample made so far, 0 before the first
+    """
+
+    seq: int = 0
+    frame: int = 0
+    box: Box | None = None
+    version: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,9 +192,13 @@ class Health:
 class End:
     """The last message of a stream: nothing follows.
 
+    seq     one after the last message before it
     reason  why it ended, for a person to read
     failed  whether that was an error
+    totals  what was counted: name -> number
     """
 
+    seq: int
     reason: str
     failed: bool = False
+    totals: dict[str, float] = field(default_factory=dict)
