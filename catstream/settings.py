@@ -61,9 +61,7 @@ class Settings:
     # --- the coreset trees (paper, "Coreset Tree") -----------------------------------------------
     coreset_size: Annotated[int, _about("n: rows of a node of a coreset tree.", ge=2, le=4096)] = 64
 
-    train_frames: Annotated[
-        int, _about("Frames at least between two samples that the trainer learns from.", ge=1)
-    ] = 5
+    train_frames: Annotated[int, _about("Frames at least between two samples that the trainer learns from.", ge=1)] = 5
 
     # --- training --------------------------------------------------------------------------------
     classifier: Annotated[
@@ -75,7 +73,9 @@ class Settings:
     ] = "joint"
     ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 1.0
     loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
-    motion_frames: Annotated[int, _about("Frames in a block of centres, from which the Kalman filter's parameters are learned.", ge=8)] = 64
+    motion_frames: Annotated[
+        int, _about("Frames in a block of centres, from which the Kalman filter's parameters are learned.", ge=8)
+    ] = 64
 
     # --- detection ---------------------------------------------------------------------------------
     detection: Annotated[
@@ -89,8 +89,12 @@ class Settings:
     scale_step: Annotated[float, _about("Change of size between two scales.", gt=0, le=0.5)] = 0.03
     scale_rate: Annotated[float, _about("Share of a change of size that is followed at once.", ge=0, le=1)] = 0.7
     scale_score: Annotated[float, _about("Score below which the size is held.")] = 0.5
-    scale_penalty: Annotated[float, _about("Score that a change of size costs, times the logarithm of its factor.", ge=0)] = 0.3
-    distance_penalty: Annotated[float, _about("Score that a window's width of distance costs in the local search.", ge=0)] = 0.1
+    scale_penalty: Annotated[
+        float, _about("Score that a change of size costs, times the logarithm of its factor.", ge=0)
+    ] = 0.3
+    distance_penalty: Annotated[
+        float, _about("Score that a window's width of distance costs in the local search.", ge=0)
+    ] = 0.1
     present_score: Annotated[float, _about("Score below which the object counts as absent.")] = 0.3
     return_score: Annotated[float, _about("Score at which an absent object counts as present again.")] = 0.5
     sure_score: Annotated[float, _about("Score below which the whole frame is searched now and then.")] = 0.55
@@ -98,10 +102,16 @@ class Settings:
     jump_margin: Annotated[float, _about("Score by which a window elsewhere must be better than the one near.")] = 0.1
     whole_frames: Annotated[int, _about("Frames from one whole search to the next while unsure.", ge=1)] = 10
     teach_score: Annotated[float, _about("Score below which a frame teaches nothing.")] = 0.4
-    copies: Annotated[int, _about("Affine copies of the object a frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)] = 0
-    object_weight: Annotated[float, _about("Ordinary rows that the object's row of a frame counts for in the loss tree.", gt=0)] = 4.0
+    copies: Annotated[
+        int, _about("Affine copies of the object a frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)
+    ] = 0
+    object_weight: Annotated[
+        float, _about("Ordinary rows that the object's row of a frame counts for in the loss tree.", gt=0)
+    ] = 4.0
     near_misses: Annotated[int, _about("Windows a frame that lie beside the object.", ge=0)] = 12
-    near_sigma: Annotated[float, _about("Distance, in cells, at which a near miss is worth exp(-1/2) of the object.", gt=0)] = 0.9
+    near_sigma: Annotated[
+        float, _about("Distance, in cells, at which a near miss is worth exp(-1/2) of the object.", gt=0)
+    ] = 0.9
     kalman: Annotated[int, _about("k")] = 1
     near_scale: Annotated[float, _about("scale near misses")] = 1.0
     near_scale_sigma: Annotated[float, _about("scale near misses")] = 0.1

@@ -93,7 +93,8 @@ class Detector:
         keep = settings.present_score if self.state != "absent" else settings.return_score
         if found.score < keep:
             self.state = "absent"
-            if self._centre: self._centre.update(None)
+            if self._centre:
+                self._centre.update(None)
             return self._answer(time, found.score, Lesson.of([], 0))
         self.state = "present" if self.model.version else "bootstrapping"
         height, width = image.shape[:2]
@@ -106,7 +107,8 @@ class Detector:
             box = box.scaled(growth ** (settings.scale_rate - 1)) if 0.85 < growth < 1.2 else box
         if self._centre:
             self._centre.update(box.centre)
-            if settings.kalman == 2: box = box.centred(*self._centre.centre)
+            if settings.kalman == 2:
+                box = box.centred(*self._centre.centre)
         self._box = box
         if found.score >= settings.sure_score:
             self._sure_box = box

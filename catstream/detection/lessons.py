@@ -47,15 +47,18 @@ class Lesson:
 
 
 def first(image: np.ndarray, box: Box, rng: np.random.Generator, settings: Settings) -> Lesson:
-    """What the first frame teaches: n affine copies of the box, and what lies around it."""
+    """What the first frame teaches: n affine copies of the box and n windows around it, a leaf of each tree."""
     copies = affine.copies(image, box, settings.coreset_size, rng)
-    return Lesson.of(list(copies), 1, settings.object_weight) + _around(image, box, None, rng, settings)
+    lesson = Lesson.of(list(copies), 1, settings.object_weight)
+    return lesson + _around(image, box, None, settings.coreset_size, rng, settings)
 
 
 def near(image: np.ndarray, box: Box, model: Model, rng: np.random.Generator, settings: Settings) -> Lesson:
     """What a later frame teaches: the object, affine copies of it, near misses, and the background around."""
     own = list(affine.copies(image, box, 1 + settings.copies, rng))
-    return Lesson.of(own, 1, settings.object_weight / len(own)) + _around(image, box, model, rng, settings)
+    return Lesson.of(own, 1, settings.object_weight / len(own)) + _around(
+        image, box, model, settings.near_negatives, rng, settings
+    )
 
 
 def far(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Lesson:
@@ -67,9 +70,9 @@ def far(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Lesson
 
 
 def _around(
-    image: np.ndarray, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings
+    image: np.ndarray, box: Box, model: Model | None, negatives: int, rng: np.random.Generator, settings: Settings
 ) -> Lesson:
-    """Near misses, and background: half of it the highest scoring windows, half of it anywhere."""
+    """Near misses, and background: with a model half of it the highest scoring windows, the rest anywhere."""
     cells, origin, step = windows.around(image, box, _CELLS)
     lesson = Lesson.of([], 0)
     for down, across in rng.integers(-_NEAR, _NEAR + 1, size=(settings.near_misses, 2)):
@@ -82,13 +85,14 @@ def _around(
         label = float(np.exp(-(np.log(factor) ** 2) / (2 * settings.near_scale_sigma**2)))
         features, _, _ = windows.around(image, box.scaled(factor), WINDOW)
         lesson += Lesson.of([features.reshape(-1)], label)
+    outside = np.ones((_CELLS - WINDOW + 1,) * 2, bool)
+    outside[_MIDDLE - _NEAR : _MIDDLE + _NEAR + 1, _MIDDLE - _NEAR : _MIDDLE + _NEAR + 1] = False
     places = []
     if model is not None:
-        scores = windows.respond(cells, model.weights, model.bias)
-        scores[_MIDDLE - _NEAR : _MIDDLE + _NEAR + 1, _MIDDLE - _NEAR : _MIDDLE + _NEAR + 1] = -np.inf
-        places = windows.peaks(scores, settings.near_negatives // 2, _NEAR)
-    while len(places) < settings.near_negatives:
-        row, column = (int(value) for value in rng.integers(0, _CELLS - WINDOW + 1, 2))
-        if max(abs(row - _MIDDLE), abs(column - _MIDDLE)) > _NEAR:
-            places.append((row, column))
+        scores = np.where(outside, windows.respond(cells, model.weights, model.bias), -np.inf)
+        places = windows.peaks(scores, negatives // 2, _NEAR)
+    anywhere = np.argwhere(outside)
+    places += [
+        tuple(place) for place in rng.choice(anywhere, negatives - len(places), replace=negatives > len(anywhere))
+    ]
     return lesson + Lesson.of([windows.row_at(cells, *place) for place in places], 0)

@@ -1,0 +1,147 @@
+"""The detector alone: no trees, no trainer, only the stand-in of the first frame."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from catstream.box import Box
+from catstream.detection.detector import Detector
+from catstream.detection.hog import row_length
+from catstream.errors import BoxError
+from catstream.settings import Settings
+
+START = Box(60, 50, 48, 40)
+
+
+@pytest.fixture
+def scene():
+    """A function that draws a frame with the object at (x, y), or without it."""
+    rng = np.random.default_rng(11)
+
+    def texture(height, width, cell):
+        coarse = rng.integers(0, 256, (height // cell + 1, width // cell + 1, 3), np.uint8)
+        return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+    background, thing = texture(240, 320, 20), texture(40, 48, 8)
+
+    def draw(at=None):
+        frame = background.copy()
+        if at is not None:
+            frame[at[1] : at[1] + 40, at[0] : at[0] + 48] = thing
+        return frame
+
+    return draw
+
+
+def started(scene, **settings):
+    detector = Detector(Settings(**settings))
+    detector.init(scene((60, 50)), START)
+    return detector
+
+
+def test_the_first_frame_teaches_a_leaf_of_each_tree(scene):
+    settings = Settings()
+    track, features = Detector(settings).init(scene((60, 50)), START, time=2.5)
+    assert (track.seq, track.frame, track.state, track.time) == (1, 0, "bootstrapping", 2.5)
+    assert track.box == pytest.approx(START)
+    assert features.rows.shape[1] == row_length()
+    assert (features.labels == 1).sum() == settings.coreset_size
+    assert (features.labels == 0).sum() >= settings.coreset_size
+
+
+@pytest.mark.parametrize("detection", ["local", "full"])
+def test_a_moving_object_is_followed(scene, detection):
+    detector = started(scene, detection=detection)
+    for i in range(1, 15):
+        at = (60 + 6 * i, 50 + 4 * i)
+        track, _ = detector.step(scene(at))
+        assert track.box.overlap(Box(*at, 48, 40)) > 0.8
+
+
+def test_a_growing_object_grows_the_box(scene):
+    detector, frame = started(scene), scene((60, 50))
+    for zoom in np.linspace(1.02, 1.3, 15):
+        matrix = np.array([[zoom, 0, 84 * (1 - zoom)], [0, zoom, 70 * (1 - zoom)]])
+        track, _ = detector.step(cv2.warpAffine(frame, matrix, (320, 240)))
+    assert track.box.overlap(START.scaled(1.3)) > 0.75
+
+
+def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
+    detector = started(scene)
+    for _ in range(3):
+        track, features = detector.step(scene())
+    assert (track.state, track.box, features.box) == ("absent", None, None)
+    assert features.rows.shape == (0, row_length())
+
+
+def test_an_object_that_comes_back_elsewhere_is_found_in_the_whole_frame(scene):
+    detector = started(scene)
+    detector.step(scene())
+    track, _ = detector.step(scene((250, 180)))
+    assert track.box.overlap(Box(250, 180, 48, 40)) > 0.6
+
+
+def test_seq_counts_every_frame(scene):
+    detector = started(scene)
+    answers = [detector.step(scene((60, 50)) if i % 2 else scene()) for i in range(4)]
+    assert [(track.seq, features.seq, track.frame) for track, features in answers] == [
+        (i + 2, i + 2, i + 1) for i in range(4)
+    ]
+
+
+def test_older_models_are_ignored(scene):
+    detector = started(scene)
+    new = dataclasses.replace(detector.model, version=2)
+    detector.adopt(new)
+    detector.adopt(dataclasses.replace(detector.model, version=1))
+    assert detector.model is new
+
+
+def test_another_detector_goes_on_where_one_stopped(scene):
+    detector, other = started(scene), Detector(Settings())
+    model = dataclasses.replace(detector.model, version=1)
+    detector.adopt(model)
+    track, features = detector.step(scene((64, 52)))
+    other.resume(features.seq, track.box, model)
+    track, _ = other.step(scene((68, 54)))
+    assert (track.seq, track.state) == (3, "present")
+    assert track.box.overlap(Box(68, 54, 48, 40)) > 0.8
+
+
+def test_a_frame_teaches_the_same_whatever_came_before(scene):
+    detector, other = started(scene), Detector(Settings())
+    model = dataclasses.replace(detector.model, version=1)
+    detector.adopt(model)
+    other.resume(1, START, model)
+    one, two = (stage.step(scene((60, 50)))[1] for stage in (detector, other))
+    np.testing.assert_allclose(one.rows, two.rows, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "box", [(400, 10, 20, 20), (-50, 10, 20, 20), (10, 10, 0, 20), (10, 10, 20, -3), (np.nan, 1, 20, 20)]
+)
+def test_a_box_that_is_none_is_refused(scene, box):
+    with pytest.raises(BoxError):
+        Detector(Settings()).init(scene(), Box(*box))
+
+
+def test_a_step_before_a_start_is_refused(scene):
+    with pytest.raises(BoxError, match="call init"):
+        Detector(Settings()).step(scene())
+
+
+def test_grey_frames_are_followed(scene):
+    detector = Detector(Settings())
+    detector.init(scene((60, 50))[:, :, 1], START)
+    track, _ = detector.step(scene((66, 53))[:, :, 1])
+    assert track.box.overlap(Box(66, 53, 48, 40)) > 0.8
+
+
+def test_an_object_at_the_edge_stays_a_box_in_the_frame(scene):
+    detector = started(scene)
+    for x in range(60, -24, -6):
+        frame = np.roll(scene((60, 50)), x - 60, axis=1)
+        track, _ = detector.step(frame)
+        assert track.box is None or 0 <= track.box.centre[0] < 320

@@ -1,0 +1,63 @@
+"""The three stages in one process."""
+
+import numpy as np
+import pytest
+
+from catstream.errors import BoxError
+from catstream.settings import PRESETS, Settings
+from catstream.tracker import Tracker
+
+
+@pytest.fixture(scope="module")
+def video():
+    """Twenty frames of a textured patch that drifts over noise, and where it is."""
+    rng = np.random.default_rng(4)
+    background = np.kron(rng.integers(60, 200, (24, 32, 3), np.uint8), np.ones((10, 10, 1), np.uint8))
+    patch = np.kron(rng.integers(0, 256, (6, 6, 3), np.uint8), np.ones((8, 8, 1), np.uint8))
+    frames, boxes = [], []
+    for i in range(20):
+        x, y = 80 + 5 * i, 60 + 3 * i
+        frame = background.copy()
+        frame[y : y + 48, x : x + 48] = patch
+        frames.append(frame)
+        boxes.append((x, y, 48, 48))
+    return frames, boxes
+
+
+def follow(video, settings):
+    frames, boxes = video
+    tracker = Tracker(settings)
+    tracker.init(frames[0], boxes[0])
+    return [tracker.update(frame)[1] for frame in frames[1:]], tracker
+
+
+@pytest.mark.parametrize("preset", [None, *PRESETS])
+def test_a_patch_is_followed(video, preset):
+    found, tracker = follow(video, Settings.load(preset=preset, environment={}))
+    assert tracker.track.model_version >= 1
+    assert tracker.compressor.seq == len(found) + 1
+    assert (
+        np.mean(
+            [
+                box is not None and box.overlap(type(box)(*truth)) > 0.5
+                for box, truth in zip(found, video[1][1:], strict=True)
+            ]
+        )
+        > 0.9
+    )
+
+
+def test_the_same_frames_give_the_same_boxes(video):
+    assert follow(video, Settings())[0] == follow(video, Settings())[0]
+
+
+def test_init_forgets_all_before(video):
+    found, tracker = follow(video, Settings())
+    frames, boxes = video
+    tracker.init(frames[0], boxes[0])
+    assert [tracker.update(frame)[1] for frame in frames[1:]] == found
+
+
+def test_update_before_init_is_refused(video):
+    with pytest.raises(BoxError, match="call init"):
+        Tracker().update(video[0][0])

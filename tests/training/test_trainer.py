@@ -1,0 +1,46 @@
+"""The trainer: scores that mean the same in every model."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from catstream.compression.compressor import Compressor
+from catstream.detection.detector import Detector
+from catstream.errors import ProtocolError
+from catstream.settings import Settings
+from catstream.training.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def sample():
+    image = np.random.default_rng(3).integers(0, 256, (160, 200, 3), np.uint8)
+    settings = Settings()
+    _, features = Detector(settings).init(image, (60, 40, 50, 60))
+    return Compressor(settings).take(features)
+
+
+@pytest.mark.parametrize("classifier", ["joint", "least-squares", "one-class"])
+def test_the_score_is_0_at_the_backgrounds_mean_and_1_at_the_objects(sample, classifier):
+    model = Trainer(Settings(classifier=classifier)).train(sample)
+    assert model.weights @ sample.background.mean + model.bias == pytest.approx(0, abs=1e-4)
+    assert model.weights @ sample.object.mean + model.bias == pytest.approx(1, abs=1e-4)
+    assert (model.version, model.frame, model.weights.dtype) == (sample.version, sample.frame, np.float32)
+
+
+def test_the_same_sample_gives_the_same_bits(sample):
+    one, two = (Trainer(Settings()).train(sample) for _ in range(2))
+    assert one.weights.tobytes() == two.weights.tobytes()
+    assert one.bias == two.bias
+
+
+def test_centres_give_a_motion(sample):
+    centres = np.cumsum(np.random.default_rng(0).normal(size=(64, 2)), axis=0)
+    assert Trainer(Settings()).train(dataclasses.replace(sample, centres=centres)).motion is not None
+    assert Trainer(Settings()).train(sample).motion is None
+
+
+def test_an_object_like_the_background_is_refused(sample):
+    same = dataclasses.replace(sample, object=sample.background)
+    with pytest.raises(ProtocolError, match="give another box"):
+        Trainer(Settings()).train(same)
