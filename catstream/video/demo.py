@@ -1,0 +1,193 @@
+"""A video with known truth, rendered from two photographs that scikit-learn ships.
+
+A dahlia drifts through the air over a Chinese lake while the camera pans. It
+turns, grows and shrinks, clouds change the light, a look-alike of another
+colour crosses it; a pagoda covers it, later it flies before that pagoda, leaves
+the picture and comes back elsewhere. The same arguments give the same pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from catstream.box import Box
+
+__all__ = ["FRAMES", "RATE", "SIZE", "render"]
+
+#: Frames of the whole story, frames a second, and pixels (width, height) of the full size.
+FRAMES, RATE, SIZE = 600, 30.0, (640, 480)
+
+_ZOOM = 1.5  # of the photograph of the lake: the rest of this file is in its enlarged pixels
+_BEHIND = 280  # the last frame in which the dahlia is behind the pagoda
+_VISIBLE = 0.1  # with less of it to see than this share, the dahlia counts as absent
+_NOISE = 4.0  # standard deviation of the camera's noise, in grey levels
+
+#: Frame, dahlia's centre x and y, diameter, angle in degrees.
+_FLIGHT = np.array(
+    [
+        (0, 800, 190, 104, 0),
+        (60, 700, 300, 120, 25),
+        (110, 610, 330, 112, 60),
+        (160, 560, 250, 96, 110),
+        (225, 330, 270, 92, 170),
+        (265, 70, 250, 92, 200),
+        (285, 62, 190, 96, 200),
+        (330, 250, 215, 116, 160),
+        (375, 330, 350, 140, 120),
+        (415, 480, 400, 124, 60),
+        (455, 690, 330, 100, 20),
+        (485, 990, 290, 96, 0),
+        (520, 990, 420, 100, -40),
+        (550, 790, 430, 108, -60),
+        (600, 640, 250, 120, -120),
+    ]
+)
+
+#: The same of the look-alike.
+_DECOY = np.array([(0, 400, 60, 96, 0), (40, 560, 110, 92, 60), (110, 760, 420, 88, 200), (180, 1100, 520, 90, 300)])
+
+#: Frame, left and top of the picture, light: 1 is the photograph's.
+_CAMERA = np.array(
+    [
+        (0, 316, 20, 1.0),
+        (90, 250, 90, 1.1),
+        (160, 170, 70, 0.75),
+        (240, 10, 30, 1.0),
+        (300, 4, 10, 1.15),
+        (380, 60, 110, 0.6),
+        (450, 200, 120, 0.9),
+        (500, 220, 110, 1.0),
+        (600, 300, 60, 0.8),
+    ]
+)
+
+#: Centre of the dahlia, in pixels of its photograph.
+_DAHLIA = (308, 221)
+
+#: Outline of the pagoda, in pixels of the photograph as it is.
+_PAGODA = np.array(
+    [
+        (196, 50), (198, 32), (213, 32), (216, 52), (240, 82), (318, 122), (320, 130), (300, 134), (294, 158),
+        (328, 172), (329, 182), (320, 190), (320, 226), (326, 240), (352, 250), (340, 266), (342, 300), (350, 312),
+        (372, 334), (360, 350), (330, 372), (320, 426), (0, 426), (0, 362), (66, 346), (80, 326), (80, 284), (64, 270),
+        (98, 246), (98, 196), (84, 184), (88, 168), (118, 160), (120, 138), (96, 132), (98, 112), (150, 92),
+    ]
+)  # fmt: skip
+
+
+def render(
+    frames: int = FRAMES, size: tuple[int, int] = SIZE, seed: int = 0
+) -> Iterator[tuple[np.ndarray, Box | None]]:
+    """Images of the demo in order, each with the dahlia's box.
+
+    After `FRAMES` the story runs backwards, then forwards again, so that a video
+    of any length has no jump in it.
+
+    Parameters
+    ----------
+    frames : how many
+    size : (width, height) of the images; other shapes than 4:3 are stretched
+    seed : of the camera's noise
+
+    Yields
+    ------
+    image : uint8 (height, width, 3), blue green red
+    box : around the whole dahlia, also where a part is covered or outside; None
+        where less than a tenth of it is to be seen
+    """
+    stage = _Stage(seed)
+    width, height = size
+    across, down = width / SIZE[0], height / SIZE[1]
+    for number in range(frames):
+        image, box = stage.shoot(FRAMES - 1 - abs(number % (2 * FRAMES - 2) - (FRAMES - 1)))
+        if (width, height) != SIZE:
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            box = box and Box(box.x * across, box.y * down, box.w * across, box.h * down)
+        yield image, box
+
+
+class _Stage:
+    """The two photographs, cut up and ready: float32 colours of 0 to 255."""
+
+    def __init__(self, seed: int) -> None:
+        from sklearn.datasets import load_sample_images  # here: it takes a second
+
+        lake, flower = (image[..., ::-1].astype(np.float32) for image in load_sample_images().images)
+        self.lake = cv2.resize(lake, None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_CUBIC).clip(0, 255)
+        pagoda = cv2.fillPoly(np.zeros(self.lake.shape[:2], np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
+        self.pagoda = cv2.GaussianBlur(pagoda, (0, 0), 1.2)
+        self.dahlia, self.mask, self.outline = _cut(flower)
+        self.decoy = self.dahlia[..., [2, 0, 1]] * np.float32(0.9)
+        self.flight, self.away, self.camera = (_smooth(keys) for keys in (_FLIGHT, _DECOY, _CAMERA))
+        self.rng = np.random.default_rng(seed)
+        self.noise = self.rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
+
+    def shoot(self, frame: int) -> tuple[np.ndarray, Box | None]:
+        """The image of one frame of the story, full size, and the box."""
+        left, top, light = self.camera[frame]
+        sway = 3 * np.sin(frame / np.array([7.3, 5.1]))  # the camera is held by hand
+        view = np.array([[1, 0, -left - sway[0]], [0, 1, -top - sway[1]]])  # lake -> picture
+        image = cv2.warpAffine(self.lake, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
+        front = cv2.warpAffine(self.pagoda, view, SIZE)
+
+        self._place(image, self.decoy, self._turn(self.away[frame], view), 1 - front)
+        turn = self._turn(self.flight[frame], view)
+        seen = self._place(image, self.dahlia, turn, 1 - front if frame <= _BEHIND else np.ones_like(front))
+        low, high = self._limits(turn)
+
+        y, x = self.rng.integers(SIZE[1]), self.rng.integers(SIZE[0])
+        image = image * np.float32(light) + self.noise[y : y + SIZE[1], x : x + SIZE[0]]
+        box = Box(*map(float, (*low, *(high - low)))) if seen >= _VISIBLE else None
+        return image.clip(0, 255).astype(np.uint8), box
+
+    def _turn(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
+        """The affine map from the cut flower to the picture, float64 (2, 3)."""
+        x, y, diameter, angle = place
+        side = self.mask.shape[0]
+        turn = cv2.getRotationMatrix2D((side / 2, side / 2), angle, diameter / side)
+        turn[:, 2] += np.array([x, y]) + view[:, 2] - side / 2
+        return turn
+
+    def _limits(self, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Left top and right bottom of the flower in the picture."""
+        points = self.outline @ turn[:, :2].T + turn[:, 2]
+        return points.min(axis=0), points.max(axis=0)
+
+    def _place(self, image: np.ndarray, flower: np.ndarray, turn: np.ndarray, free: np.ndarray) -> float:
+        """Lay the flower over the image where that is free; returns the share of it that shows."""
+        low, high = self._limits(turn)
+        left, top = np.maximum(np.floor(low) - 2, 0).astype(int)
+        right, bottom = np.minimum(np.ceil(high) + 2, SIZE).astype(int)
+        if left >= right or top >= bottom:
+            return 0.0
+        patch, size = image[top:bottom, left:right], (int(right - left), int(bottom - top))
+        shift = turn - np.array([[0, 0, left], [0, 0, top]])
+        colours = cv2.warpAffine(flower, shift, size, borderMode=cv2.BORDER_REPLICATE)
+        alpha = cv2.warpAffine(self.mask, shift, size) * free[top:bottom, left:right]
+        patch += alpha[..., None] * (colours - patch)
+        return float(alpha.sum() / (self.mask.sum() * abs(np.linalg.det(turn[:, :2]))))
+
+
+def _cut(photograph: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The large flower in a square: colours (s, s, 3), soft mask (s, s), outline points (k, 2)."""
+    (x, y), reach, side = _DAHLIA, 144, 160
+    window = slice(y - reach, y + reach), slice(x - reach, x + reach)
+    colours = cv2.resize(photograph[window], (side, side), interpolation=cv2.INTER_AREA)
+    disc: np.ndarray = cv2.circle(np.zeros((side, side), np.uint8), (side // 2, side // 2), side // 2, 1, cv2.FILLED)
+    warm = disc * (colours[..., 2] - colours[..., 0] > 40).astype(np.uint8)
+    contours, _ = cv2.findContours(warm, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = max(contours, key=len)
+    filled: np.ndarray = cv2.fillPoly(np.zeros((side, side), np.float32), [outline], 1.0)
+    mask = cv2.GaussianBlur(cv2.erode(filled, np.ones((3, 3))), (0, 0), 1.0)
+    return colours, mask, outline[:, 0].astype(float)
+
+
+def _smooth(keys: np.ndarray) -> np.ndarray:
+    """Key frames drawn out to a row for each of FRAMES frames, their corners rounded."""
+    bend = np.hanning(27)[1:-1]
+    frames = np.arange(FRAMES + len(bend) - 1) - len(bend) // 2
+    lines = (np.interp(frames, keys[:, 0], column) for column in keys[:, 1:].T)
+    return np.stack([np.convolve(line, bend / bend.sum(), mode="valid") for line in lines], axis=1)
