@@ -46,7 +46,8 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     m = len(rows)
     keep = min(size, m)
     gram = rows @ rows.T
-    _, vectors = scipy.linalg.eigh(gram, subset_by_index=(m - keep, m - 1), overwrite_a=True, check_finite=False)
-    kept = vectors[:, ::-1].T @ rows
+    # Divide and conquer: the default driver loses orthogonality, or vectors, where many eigenvalues are equal.
+    _, vectors = scipy.linalg.eigh(gram, driver="evd", overwrite_a=True, check_finite=False)
+    kept = vectors[:, : -keep - 1 : -1].T @ rows
     kept[kept @ (rows.sum(axis=0) if towards is None else towards).astype(np.float32) < 0] *= -1
     return kept
