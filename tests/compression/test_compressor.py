@@ -1,0 +1,196 @@
+"""Laws of the compressor: each message counts once, in order, and a restart changes nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
+from catstream.errors import ProtocolError
+from catstream.messages import Features, Sample
+from catstream.settings import Settings
+
+WIDTH = 20
+
+
+@pytest.fixture
+def settings() -> Settings:
+    return Settings(coreset_size=8, train_frames=4, motion_frames=10)
+
+
+@pytest.fixture
+def messages(rng) -> Iterator[Features]:
+    """Features of frames without end: two rows of the object, three of the background, one near miss."""
+
+    def stream() -> Iterator[Features]:
+        for frame in range(10_000):
+            rows = rng.normal(size=(6, WIDTH)).astype(np.float32)
+            labels = np.array([1, 1, 0, 0, 0, 0.5], np.float32)
+            weights = np.array([4, 4, 1, 1, 1, 1], np.float32)
+            box = Box(frame, 10, 20, 30) if frame % 5 else None
+            yield Features(frame + 1, frame, frame / 25, box, rows, labels, weights)
+
+    return stream()
+
+
+def take(compressor: Compressor, messages: Iterator[Features], count: int) -> list[Sample]:
+    samples = (compressor.take(next(messages)) for _ in range(count))
+    return [sample for sample in samples if sample is not None]
+
+
+def assert_same(sample: Sample, other: Sample) -> None:
+    assert (sample.version, sample.frame) == (other.version, other.frame)
+    assert_array_equal(sample.centres, other.centres)
+    for name in ("object", "background", "loss"):
+        summary, expected = getattr(sample, name), getattr(other, name)
+        assert_array_equal(summary.rows, expected.rows)
+        assert_array_equal(summary.mean, expected.mean)
+        assert (summary.count, summary.levels) == (expected.count, expected.levels)
+
+
+def test_each_row_goes_where_its_label_says(settings, messages):
+    compressor = Compressor(settings)
+    sample = take(compressor, messages, 60)[-1]
+    frames = sample.frame + 1
+    assert (sample.object.count, sample.background.count, sample.loss.count) == (2 * frames, 3 * frames, 6 * frames)
+
+
+def test_rows_of_the_loss_tree_give_the_loss_of_any_model(settings, messages, rng):
+    """||A [w; b; -1]||^2 is the weighted squared error, and C keeps it within the energy dropped."""
+    compressor, seen = Compressor(settings), [next(messages) for _ in range(60)]
+    for message in seen:
+        compressor.take(message)
+    tree = compressor.trees["loss"]
+    kept = np.vstack([*(node.rows for node in tree.nodes), tree.pending]).astype(np.float64)
+    for _ in range(10):
+        model = rng.normal(size=WIDTH + 2)
+        model[-1] = -1
+        loss = sum(float(m.weights @ (m.rows @ model[:-2] + model[-2] - m.labels) ** 2) for m in seen)
+        approximate = float(np.sum((kept @ model) ** 2))
+        assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
+
+
+def test_a_message_stored_already_is_ignored(settings, messages):
+    compressor, message = Compressor(settings), next(messages)
+    compressor.take(message)
+    before = compressor.counters()
+    assert compressor.take(message) is None
+    assert compressor.counters() == before
+
+
+def test_a_missing_message_is_an_error_and_the_late_one_is_still_welcome(settings, messages):
+    compressor, (first, second) = Compressor(settings), (next(messages), next(messages))
+    with pytest.raises(ProtocolError, match="features 2 came after 0: 1 are missing"):
+        compressor.take(second)
+    compressor.take(first)
+    compressor.take(second)
+    assert compressor.seq == 2
+
+
+def test_rows_of_another_length_are_refused_and_nothing_is_stored(settings, messages):
+    compressor, (first, second) = Compressor(settings), (next(messages), next(messages))
+    compressor.take(first)
+    before = compressor.counters()
+    with pytest.raises(ProtocolError, match="same settings"):
+        compressor.take(dataclasses.replace(second, rows=second.rows[:, 1:]))
+    assert compressor.counters() == before
+    compressor.take(second)
+
+
+def test_frames_that_teach_nothing_count_as_seen(settings, messages):
+    compressor, message = Compressor(settings), next(messages)
+    compressor.take(
+        dataclasses.replace(message, rows=message.rows[:0], labels=message.labels[:0], weights=message.weights[:0])
+    )
+    assert (compressor.seq, compressor.frame, compressor.counters()["rows"]) == (1, 0, 0)
+
+
+def test_versions_count_up_and_samples_keep_their_distance(settings, messages):
+    samples = take(Compressor(settings), messages, 200)
+    assert [sample.version for sample in samples] == list(range(1, len(samples) + 1))
+    assert min(np.diff([sample.frame for sample in samples])) >= settings.train_frames
+
+
+def test_a_sample_is_made_only_where_a_leaf_is_new(settings, messages):
+    compressor, idle = Compressor(settings), 0
+    take(compressor, messages, 40)
+    for _ in range(40):
+        message = next(messages)
+        empty = dataclasses.replace(
+            message, rows=message.rows[:0], labels=message.labels[:0], weights=message.weights[:0]
+        )
+        idle += compressor.take(empty) is not None
+    assert idle <= 1
+
+
+def test_centres_come_in_whole_blocks_with_nan_where_absent(settings, messages):
+    samples = take(Compressor(settings), messages, 60)
+    for sample in samples:
+        blocks = (sample.frame + 1) // settings.motion_frames
+        assert sample.centres.shape == ((settings.motion_frames if blocks else 0), 2)
+        for offset, centre in enumerate(sample.centres):
+            frame = (blocks - 1) * settings.motion_frames + offset
+            assert_allclose(centre, (frame + 10, 25) if frame % 5 else (np.nan, np.nan))
+
+
+@pytest.mark.parametrize("count", [0, 1, 37])
+def test_a_saved_compressor_goes_on_bit_for_bit(settings, messages, count, tmp_path):
+    compressor = Compressor(settings)
+    take(compressor, messages, count)
+    compressor.save(tmp_path / "state")
+    loaded = Compressor.load(tmp_path / "state", settings)
+    assert loaded.counters() == compressor.counters()
+    assert loaded.box == compressor.box
+    for _ in range(40):
+        message = next(messages)
+        sample, again = compressor.take(message), loaded.take(message)
+        assert (sample is None) == (again is None)
+        if sample is not None:
+            assert_same(sample, again)
+
+
+def test_the_last_sample_can_be_had_again(settings, messages, tmp_path):
+    compressor, sample = Compressor(settings), None
+    assert compressor.last_sample is None
+    while sample is None:
+        sample = compressor.take(next(messages))
+    compressor.save(tmp_path / "state")
+    assert_same(Compressor.load(tmp_path / "state", settings).last_sample, sample)
+
+
+def test_memory_is_flat_between_doublings(settings, messages):
+    compressor = Compressor(settings)
+    take(compressor, messages, 256)
+    small = compressor.counters()["bytes"]
+    take(compressor, messages, 256 * 15)
+    assert compressor.counters()["bytes"] < 2.5 * small
+
+
+@pytest.mark.parametrize("share", [0, 0.2, 0.9])
+def test_a_torn_state_is_refused(settings, messages, share, tmp_path):
+    compressor, path = Compressor(settings), tmp_path / "state"
+    take(compressor, messages, 37)
+    compressor.save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ProtocolError, match="take an older copy"):
+        Compressor.load(path, settings)
+
+
+def test_a_tree_is_no_compressor(settings, tmp_path):
+    Compressor(settings).trees["object"].save(tmp_path / "tree")
+    with pytest.raises(ProtocolError, match="take an older copy"):
+        Compressor.load(tmp_path / "tree", settings)
+
+
+def test_a_state_of_another_coreset_size_is_refused(settings, messages, tmp_path):
+    compressor = Compressor(settings)
+    take(compressor, messages, 37)
+    compressor.save(tmp_path / "state")
+    with pytest.raises(ProtocolError, match="same settings"):
+        Compressor.load(tmp_path / "state", dataclasses.replace(settings, coreset_size=16))

@@ -1,0 +1,92 @@
+"""Laws of the hierarchical sample (paper, section "Coreset Appearance Model")."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from catstream.compression.reduce import reduce
+from catstream.compression.sampling import sample, share, spread
+from catstream.compression.tree import CoresetTree
+
+SIZE = 16
+
+
+def grown(rows: np.ndarray, size: int = SIZE) -> CoresetTree:
+    tree = CoresetTree(size)
+    tree.insert(rows)
+    return tree
+
+
+@settings(deadline=None)
+@given(st.integers(0, 600), st.sampled_from([1, 2, 5, 16]))
+def test_a_sample_has_at_most_2n_rows(count, size):
+    summary = grown(np.ones((count, 3)), size).sample()
+    assert len(summary.rows) <= 2 * size
+    assert len(summary.rows) >= size or count < size
+
+
+def test_a_node_gives_its_first_n_rows_times_2_to_the_level_below_the_top(stream):
+    tree = grown(stream)
+    rows, start = sample(tree.nodes, SIZE), 0
+    assert [node.level for node in tree.nodes] == [3, 2, 0]
+    for node, taken in zip(tree.nodes, [16, 8, 2], strict=True):
+        part = rows[start : start + taken].astype(np.float64)
+        first = node.rows[:taken].astype(np.float64) * np.sqrt(taken / node.count)
+        # Equal up to a left rotation: the same distances to every subspace.
+        assert_allclose(part.T @ part, first.T @ first, atol=1e-5 * np.sum(first**2))
+        start += taken
+    assert start == len(rows)
+
+
+def test_rows_too_young_for_a_whole_row_are_left_out():
+    assert share(level=0, top=4, size=SIZE) == 1
+    assert share(level=0, top=5, size=SIZE) == 0
+    rows = grown(np.ones((SIZE * 33, 3))).sample().rows
+    assert len(rows) == SIZE
+
+
+def test_each_row_weighs_one_original_row(rng):
+    """A stream of one row again and again is sampled as that row, whatever its age."""
+    row = rng.uniform(size=30).astype(np.float32)
+    rows = grown(np.tile(row, (SIZE * 13, 1))).sample().rows
+    assert_allclose(rows, np.tile(row, (len(rows), 1)), rtol=1e-4)
+
+
+def test_every_row_lies_where_the_data_lies():
+    """Without the spread, all but the first would be variations around zero."""
+    rng = np.random.default_rng(0)
+    stream = (5 + rng.normal(size=(SIZE * 13, 30))).astype(np.float32)
+    rows = grown(stream).sample().rows
+    assert np.all(rows.mean(axis=1) > 3)
+
+
+@settings(deadline=None)
+@given(st.integers(1, 20), st.integers(0, 2**32 - 1))
+def test_spreading_is_a_rotation(count, seed):
+    rows = reduce(np.random.default_rng(seed).normal(size=(count, 12)).astype(np.float32), count)
+    turned = spread(rows)
+    assert_allclose(turned.T @ turned, rows.T @ rows, atol=1e-4)
+    assert_allclose(turned @ rows[0], np.full(count, rows[0] @ rows[0] / np.sqrt(count)), atol=1e-3)
+
+
+def test_means_and_counts_are_those_of_all_rows_pending_ones_too(stream):
+    rows = stream[:205]
+    summary = grown(rows).sample()
+    assert summary.count == 205
+    assert_allclose(summary.mean, rows.mean(axis=0, dtype=np.float64), rtol=1e-6, atol=1e-7)
+    assert summary.levels == (3, 2)
+
+
+def test_same_rows_same_bits(stream):
+    assert_array_equal(grown(stream).sample().rows, grown(stream.copy()).sample().rows)
+
+
+@pytest.mark.parametrize("count", [0, SIZE - 1])
+def test_before_the_first_leaf_there_is_nothing_to_sample(count):
+    summary = grown(np.ones((count, 3))).sample()
+    assert summary.rows.shape[0] == 0
+    assert summary.levels == ()
