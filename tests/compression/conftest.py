@@ -13,11 +13,6 @@ from catstream.detection import hog
 ROWS = 208  #: 13 leaves of 16: levels 3, 2 and 0
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(5)
-
-
 def random_rows(rng: np.random.Generator) -> np.ndarray:
     """Nothing in common: the hardest to summarise."""
     return rng.normal(size=(ROWS, 60)).astype(np.float32)

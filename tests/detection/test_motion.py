@@ -13,11 +13,6 @@ from catstream.messages import Motion
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(11)
-
-
-@pytest.fixture
 def motion() -> Motion:
     """Pushes of a tenth of a pixel a frame, centres measured within two pixels."""
     return Motion(process=0.01 * np.eye(4), observation=4.0 * np.eye(2))

@@ -11,11 +11,6 @@ from catstream.training import motion_em
 from catstream.training.motion_em import FEWEST, OBSERVATION_FLOOR, PROCESS_FLOOR, learn_motion
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
-
-
 def walk(rng: np.random.Generator, frames: int = 64) -> np.ndarray:
     """Centres of an object that is pushed about, measured with an error of 1.5 pixels."""
     velocity = np.cumsum(rng.normal(scale=0.5, size=(frames, 2)), axis=0)

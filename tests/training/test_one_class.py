@@ -11,11 +11,6 @@ from catstream.errors import ProtocolError
 from catstream.training.one_class import one_class
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(3)
-
-
 def rows_around(mean: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     return (mean + rng.normal(scale=0.1, size=(count, len(mean)))).astype(np.float32)
 

@@ -1,0 +1,131 @@
+"""The house, as in `docs/architecture.md`: imports run downward only, and each foreign library has one home."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+#: From the ground up. A module imports from the floors below its own, and from its own folder.
+FLOORS = [
+    {"errors"},
+    {"box"},
+    {"messages", "settings", "ridge"},
+    {"detection", "compression", "training", "wire", "video"},
+    {"tracker"},
+    {"services"},
+    {"pipeline"},
+    {"evaluation"},
+    {"cli"},
+]
+
+#: Who may import a foreign library: files, or folders.
+HOMES = {
+    "numpy": ["catstream", "services"],
+    "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
+    "cv2": ["catstream/detection", "catstream/video"],
+    "numba": ["catstream/detection"],
+    "filterpy": ["catstream/detection/motion.py", "catstream/training/motion_em.py"],
+    "sklearn": ["catstream/training/one_class.py", "catstream/video/demo.py"],
+    "safetensors": ["catstream/compression"],
+    "av": ["catstream/video"],
+    "zmq": ["catstream/wire/sockets.py"],
+    "msgpack": ["catstream/wire/codec.py"],
+    "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
+    "click": ["catstream/cli", "services/__main__.py"],
+    "rich": ["catstream/cli"],
+    "threadpoolctl": ["services/loop.py"],
+}
+
+#: Libraries that take long to import: inside the function that needs them.
+SLOW = {"sklearn", "filterpy", "av"}
+
+#: What a stage does not touch: it could run on a desert island.
+MAINLAND = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
+
+FILES = sorted([*ROOT.glob("catstream/**/*.py"), *ROOT.glob("services/**/*.py")])
+MODULES = pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+
+
+def dotted(path: Path) -> str:
+    """The name a file is imported by: services/ installs as catstream.services."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(part for part in (("catstream", *parts) if parts[0] == "services" else parts) if part != "__init__")
+
+
+NAMES = {dotted(path) for path in FILES}
+
+
+def imports(path: Path, tree: ast.AST | None = None) -> Iterator[str]:
+    """Dotted names of all modules that a file imports, inside functions too."""
+    for node in ast.walk(tree or ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path.name}, line {node.lineno}: write the whole name of what is imported"
+            assert node.module
+            for alias in node.names:
+                module = f"{node.module}.{alias.name}"
+                yield module if module in NAMES else node.module
+
+
+def unit(module: str) -> str:
+    """The folder or file of the house that a module belongs to; empty for the face, `catstream` itself."""
+    return module.partition(".")[2].partition(".")[0]
+
+
+def floor(name: str) -> int:
+    for height, names in enumerate(FLOORS):
+        if name in names:
+            return height
+    raise AssertionError(f"{name} is on no floor: say in FLOORS which ones it may import from")
+
+
+@MODULES
+def test_imports_run_downward_only(path):
+    own = unit(dotted(path))
+    if not own:
+        return  # the face shows what is inside
+    for module in imports(path):
+        if module.partition(".")[0] != "catstream" or unit(module) == own:
+            continue
+        assert unit(module), f"{path.name} imports from the face of the house: import from where the name is at home"
+        assert floor(unit(module)) < floor(own), f"{own} imports {module}, but imports run downward only"
+
+
+@MODULES
+def test_each_foreign_library_has_one_home(path):
+    place = str(path.relative_to(ROOT))
+    for library in {module.partition(".")[0] for module in imports(path)} - sys.stdlib_module_names - {"catstream"}:
+        assert library in HOMES, f"{place} imports {library}, which has no home yet: give it one in HOMES"
+        at_home = any(place == home or place.startswith(f"{home}/") for home in HOMES[library])
+        assert at_home, f"{place} imports {library}, which is at home in {' and '.join(HOMES[library])} only"
+
+
+@MODULES
+def test_slow_libraries_are_imported_where_they_are_used(path):
+    tree = ast.parse(path.read_text())
+    top = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
+    slow = {module.partition(".")[0] for module in imports(path, top)} & SLOW
+    assert not slow, f"{path.name} imports {slow} at its top: others would wait for it, import it in the function"
+
+
+@MODULES
+def test_a_stage_could_run_on_a_desert_island(path):
+    if unit(dotted(path)) in {"detection", "compression", "training"}:
+        touched = set(imports(path)) & MAINLAND
+        assert not touched, f"{path.name} imports {touched}: sockets, threads, clocks and chance are handed to a stage"
+
+
+def test_every_dependency_has_a_home():
+    """What pyproject.toml asks for, and nothing else."""
+    distributions = {"opencv-python-headless": "cv2", "scikit-learn": "sklearn", "pyzmq": "zmq"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = {dependency.partition(">=")[0] for dependency in project["dependencies"]}
+    assert {distributions.get(name, name) for name in names} == set(HOMES)
