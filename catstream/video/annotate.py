@@ -12,11 +12,11 @@ import numpy as np
 from catstream.errors import VideoError
 from catstream.messages import Track
 
-__all__ = ["AnnotatedVideo", "draw"]
+__all__ = ["AnnotatedVideo", "draw", "thumbnail"]
 
 #: Blue, green, red.
 _COLOURS = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
-_WHITE, _GREY = (245, 245, 245), (110, 110, 110)
+_WHITE, _GREY, _ORANGE = (245, 245, 245), (110, 110, 110), (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 #: Images narrower than this are enlarged by a whole factor, so that the text can be read.
@@ -44,6 +44,30 @@ def draw(image: np.ndarray, track: Track) -> np.ndarray:
         _frame(canvas, (x, y), (x + w, y + h), colour, unit)
     _strip(canvas, track, colour, max(unit, 0.75))
     return canvas
+
+
+def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:
+    """A small picture of a frame with two boxes, the true one white, the other orange.
+
+    Parameters
+    ----------
+    image : uint8 (h, w, 3), blue green red
+    truth, box : float64 (4,), x, y, w, h; not drawn where NaN
+    width : of the picture in pixels
+
+    Returns
+    -------
+    JPEG
+    """
+    scale = width / image.shape[1]
+    small = cv2.resize(image, (width, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
+    for rectangle, colour in ((truth, _WHITE), (box, _ORANGE)):
+        if np.isfinite(rectangle).all():
+            x, y, w, h = (float(value) * scale for value in rectangle)
+            corners = (round(x), round(y)), (round(x + w), round(y + h))
+            cv2.rectangle(small, *corners, (0, 0, 0), 3, cv2.LINE_AA)
+            cv2.rectangle(small, *corners, colour, 1, cv2.LINE_AA)
+    return cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
 
 
 def _zoom(width: int) -> int:

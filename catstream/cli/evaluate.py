@@ -1,0 +1,129 @@
+"""`catstream evaluate`: how well trackers follow, on annotated sequences."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from catstream.errors import CatstreamError
+
+__all__ = ["evaluate"]
+
+
+@click.command()
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
+@click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see below.")
+@click.option("--preset", help="A preset of catstream's settings.")
+@click.option("--settings", "file", type=click.Path(path_type=Path), help="A TOML file of settings.")
+@click.option("--set", "overrides", multiple=True, metavar="NAME=VALUE", help="One setting; may be repeated.")
+@click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Frames to start from.")
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Processes at once.")
+@click.option("--output", type=click.Path(path_type=Path), help="Folder for results and report.html.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all numbers.")
+def evaluate(
+    paths: tuple[Path, ...],
+    trackers: str,
+    preset: str | None,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    starts: int,
+    jobs: int,
+    output: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Measure trackers on annotated sequences.
+
+    PATH is a sequence, or a folder of sequences. A sequence is a folder of
+    images, or with one video, and a text file with the object's box in each
+    frame: groundtruth_rect.txt (x,y,w,h; nan where it is absent). The layouts
+    of OTB, TLD, VOT and Princeton are read as they are.
+
+    \b
+    TRACKERS
+      catstream        this one, in one process
+      mil              OpenCV's, always there
+      csrt, kcf, tld   OpenCV's, with pip install "catstream[peers]"
+
+    \b
+    MEASURES, over the frames with the object
+      AUC        area under the success plot: overlap with the truth, all thresholds
+      success    share of frames with an overlap above 0.5
+      precision  share of frames whose centre is at most 20 pixels off
+      norm.      normalised precision: the same in parts of the object's size
+      F          F-score of VOT-LT, where the object leaves: does the tracker know?
+
+    A single run is chaotic on hard clips: --starts 5 follows the object from
+    five different frames and gives mean and spread. With --output, results
+    are kept in the layouts of the got10k and VOT toolkits, finished ones are
+    not run again, and report.html shows plots and the worst failures.
+
+    \b
+    EXAMPLES
+      catstream evaluate sequences/
+      catstream evaluate sequences/ --tracker catstream,csrt --jobs 4 --output results
+      catstream evaluate sequences/walk --starts 5 --set coreset_size=128
+    """
+    # Here, so that --help and the other verbs need not wait for these.
+    from catstream.evaluation.datasets import find_sequences
+    from catstream.evaluation.onepass import evaluate as run_all
+    from catstream.evaluation.report import write_report
+    from catstream.evaluation.runs import Run
+    from catstream.evaluation.summary import rows_of, to_json
+    from catstream.settings import Settings
+
+    names = [name.strip() for name in trackers.split(",") if name.strip()]
+    settings = Settings.load(preset=preset, file=file, overrides=overrides)
+    sequences = [sequence for path in paths for sequence in find_sequences(path)]
+    if json_file is not None and not json_file.absolute().parent.is_dir():
+        raise CatstreamError(f"cannot write {str(json_file)!r}: its folder does not exist, make it first")
+
+    console = Console()
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("frames", total=None)
+
+        def begin(frames: int) -> None:
+            progress.update(task, total=frames)
+
+        def done(run: Run) -> None:
+            progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}")
+
+        runs = run_all(sequences, names, settings, starts=starts, jobs=jobs, output=output, begin=begin, done=done)
+
+    rows = rows_of(runs)
+    numbers = to_json(rows)
+    console.print(_table(numbers))
+    if json_file is not None:
+        json_file.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    if output is not None:
+        console.print(f"report: {write_report(output / 'report.html', runs, settings)}", soft_wrap=True)
+
+
+def _table(numbers: dict) -> Table:
+    """Rows of the sequences, then the means."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("sequence")
+    table.add_column("tracker")
+    for heading in ("frames", "AUC", "success", "precision", "norm.", "F", "frames/s"):
+        table.add_column(heading, justify="right")
+    for row in numbers["sequences"]:
+        table.add_row(row["name"], row["tracker"], str(row["frames"]), *_cells(row))
+    table.add_section()
+    for tracker, mean in numbers["mean"].items():
+        table.add_row("mean", tracker, "", *_cells(mean), style="bold")
+    return table
+
+
+def _cells(row: dict) -> list[str]:
+    def share(measure: str) -> str:
+        value, spread = row[measure], row.get(f"{measure}_spread")
+        if value is None:
+            return "-"
+        return f"{value:.3f}" if row.get("starts", 1) == 1 or spread is None else f"{value:.3f} ±{spread:.3f}"
+
+    return [*map(share, ("auc", "success", "precision", "normalised_precision", "f_score")), f"{row['fps']:.0f}"]

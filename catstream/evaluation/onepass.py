@@ -1,0 +1,161 @@
+"""One-pass evaluation: each tracker follows each sequence once, from a given box."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import cv2
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from catstream.box import Box
+from catstream.errors import ServiceError, SettingsError, VideoError
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.peers import PEERS, Peer
+from catstream.evaluation.runs import Run, claim, label, load, save
+from catstream.settings import Settings
+from catstream.tracker import Tracker
+
+__all__ = ["TRACKERS", "evaluate", "follow", "starts_of"]
+
+#: What can be evaluated.
+TRACKERS = ("catstream", *PEERS)
+
+
+def starts_of(sequence: Sequence, count: int) -> list[int]:
+    """`count` frames to start from, evenly spread; where the object is absent, the next with it.
+
+    This is temporal robustness (OTB): on a hard clip a single run says little.
+    """
+    present = np.flatnonzero(np.isfinite(sequence.boxes).all(axis=1))
+    wanted = np.arange(count) * len(sequence) // count
+    places = np.searchsorted(present, wanted)
+    return sorted({int(present[place]) for place in places if place < len(present)})
+
+
+def follow(tracker: str, settings: Settings, sequence: Sequence, start: int = 0) -> Run:
+    """Run one tracker from one start to the end of a sequence, in this process."""
+    worker = Tracker(settings) if tracker == "catstream" else Peer(tracker)
+    given = Box(*map(float, sequence.boxes[start]))
+    frames = len(sequence) - start
+    boxes, confidence, seconds = np.full((frames, 4), np.nan), np.full(frames, np.nan), np.zeros(frames)
+    for row, image in enumerate(sequence.frames(start)):
+        begin = perf_counter()
+        if row == 0:
+            worker.init(image, given)
+            box: Box | None = given
+        else:
+            _, box = worker.update(image)
+        seconds[row] = perf_counter() - begin
+        if box is not None:
+            boxes[row] = box
+        confidence[row] = worker.track.score if isinstance(worker, Tracker) else float(box is not None)
+    # What is stored and what is measured at once are the same numbers.
+    return Run(tracker, sequence, start, boxes.round(4), confidence.round(6), seconds.round(8))
+
+
+def evaluate(
+    sequences: list[Sequence],
+    trackers: list[str],
+    settings: Settings,
+    *,
+    starts: int = 1,
+    jobs: int = 1,
+    output: Path | None = None,
+    begin: Callable[[int], None] = lambda _: None,
+    done: Callable[[Run], None] = lambda _: None,
+) -> list[Run]:
+    """All trackers on all sequences.
+
+    Parameters
+    ----------
+    sequences, trackers : what to run; names of `TRACKERS`
+    settings : of catstream
+    starts : frames of each sequence to start from
+    jobs : processes at once, one thread each
+    output : where results are kept and found again, or None
+    begin, done : called with the number of frames to come, and with each run when it is there
+
+    Returns
+    -------
+    runs by sequence, tracker and start
+
+    Raises
+    ------
+    CatstreamError
+        Where a tracker or a name is not known, two sequences have one name, a
+        sequence cannot be read, or `output` holds runs made with other settings.
+    """
+    _check(sequences, trackers)
+    if output is not None:
+        claim(output, settings)
+    runs: dict[tuple[str, str], Run] = {}
+
+    def add(run: Run) -> None:
+        runs[run.tracker, run.name] = run
+        done(run)
+
+    wanted = [
+        (tracker, settings, sequence, start)
+        for sequence in sequences
+        for tracker in trackers
+        for start in starts_of(sequence, starts)
+    ]
+    begin(sum(len(sequence) - start for _, _, sequence, start in wanted))
+    missing = []
+    for task in wanted:
+        tracker, _, sequence, start = task
+        run = None if output is None else load(output, tracker, sequence, start)
+        if run is None:
+            missing.append(task)
+        else:
+            add(run)
+    for run in _work(missing, jobs):
+        if output is not None:
+            save(output, run)
+        add(run)
+    return [runs[tracker, label(sequence, start)] for tracker, _, sequence, start in wanted]
+
+
+def _work(tasks: list[Any], jobs: int) -> Iterator[Run]:
+    if jobs == 1:
+        with threadpool_limits(1):
+            yield from (follow(*task) for task in tasks)
+        return
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_alone) as pool:
+        try:
+            # Long ones first, so that none is left running alone at the end.
+            tasks = sorted(tasks, key=lambda task: task[3] - len(task[2]))
+            for future in as_completed([pool.submit(follow, *task) for task in tasks]):
+                yield future.result()
+        except BrokenProcessPool:
+            raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _alone() -> None:
+    """A worker: the processes are the parallelism, and Ctrl-C ends it without a word."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threadpool_limits(1)
+    cv2.setNumThreads(1)
+
+
+def _check(sequences: list[Sequence], trackers: list[str]) -> None:
+    for tracker in trackers:
+        if tracker not in TRACKERS:
+            raise SettingsError(f"there is no tracker {tracker!r}: there are {', '.join(TRACKERS)}")
+        if tracker in PEERS:
+            Peer(tracker)
+    names = [sequence.name for sequence in sequences]
+    for name in names:
+        if names.count(name) > 1:
+            raise VideoError(f"two sequences are called {name!r}, and so would be their results: rename a folder")

@@ -1,0 +1,60 @@
+"""OpenCV's trackers, to run beside catstream on the same frames.
+
+MIL comes with every OpenCV; CSRT, KCF and TLD with the contrib modules of
+OpenCV 4: `pip install "catstream[peers]"`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from catstream.box import Box
+from catstream.errors import SettingsError
+
+__all__ = ["PEERS", "Peer"]
+
+#: Name on the command line -> class in OpenCV.
+PEERS = {"csrt": "TrackerCSRT", "kcf": "TrackerKCF", "mil": "TrackerMIL", "tld": "TrackerTLD"}
+
+
+class Peer:
+    """One of OpenCV's trackers with the manners of `catstream.tracker.Tracker`.
+
+    Raises
+    ------
+    SettingsError
+        Where this OpenCV does not have it; says how to get it.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._create = _find(name)
+        self._tracker: Any = None
+
+    def init(self, frame: np.ndarray, box: Sequence[float]) -> None:
+        """Start on x, y, w, h in pixels; OpenCV takes whole ones."""
+        self._tracker = self._create()
+        x, y, w, h = (round(value) for value in box)
+        self._tracker.init(frame, (x, y, max(w, 1), max(h, 1)))
+
+    def update(self, frame: np.ndarray) -> tuple[bool, Box | None]:
+        """Whether it is found, and where. A tracker that fails inside OpenCV has lost it."""
+        try:
+            found, box = self._tracker.update(frame)
+        except cv2.error:
+            return False, None
+        return (True, Box(*map(float, box))) if found else (False, None)
+
+
+def _find(name: str) -> Callable[[], Any]:
+    for home in (cv2, getattr(cv2, "legacy", None)):
+        create = getattr(home, f"{PEERS[name]}_create", None)
+        if create is not None:
+            return create
+    raise SettingsError(
+        f"OpenCV {cv2.__version__} has no tracker {name!r}: install the contrib modules of OpenCV 4, "
+        'pip install "catstream[peers]"'
+    )
