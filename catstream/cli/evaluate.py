@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import click
@@ -82,7 +83,7 @@ def evaluate(
     if json_file is not None and not json_file.absolute().parent.is_dir():
         raise CatstreamError(f"cannot write {str(json_file)!r}: its folder does not exist, make it first")
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 120)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("frames", total=None)
