@@ -1,0 +1,91 @@
+"""Annotated video: every frame, any size, whole or not there."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages import State, Track
+from catstream.video.annotate import AnnotatedVideo, draw, thumbnail
+from catstream.video.source import open_source
+
+BOX = Box(40, 30, 60, 40)
+
+
+def track(state: State = "present", box: Box | None = BOX, frame: int = 7) -> Track:
+    return Track(frame + 1, frame, 0.0, state, box, 0.8, 3)
+
+
+@pytest.mark.parametrize("state", ["bootstrapping", "present", "absent"])
+@pytest.mark.parametrize("size", [(640, 480), (320, 240), (1921, 1081)])
+def test_drawing_keeps_the_size_and_leaves_the_frame_alone(state, size):
+    image = np.full((size[1], size[0], 3), 128, np.uint8)
+    drawn = draw(image, track(state, None if state == "absent" else BOX))
+    assert drawn.shape == image.shape
+    assert (image == 128).all()
+    assert (drawn[25:35, 35:45] != 128).any() == (state != "absent")
+    assert (drawn[-4:] != 128).any()
+
+
+def test_small_frames_are_enlarged_by_a_whole_factor():
+    assert draw(np.zeros((50, 70, 3), np.uint8), track()).shape == (250, 350, 3)
+
+
+@pytest.mark.parametrize(
+    "box", [Box(-500, -500, 10, 10), Box(-50, 20, 900, 30), Box(630, 470, 40, 40), Box(5, 5, 0, 0)]
+)
+def test_boxes_anywhere_can_be_drawn(box):
+    assert draw(np.zeros((480, 640, 3), np.uint8), track(box=box)).shape == (480, 640, 3)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (321, 241), (99, 77)])
+def test_the_video_has_each_frame_written_at_any_size(tmp_path, size):
+    path = tmp_path / "deep" / "out.mp4"
+    image = np.full((size[1], size[0], 3), 128, np.uint8)
+    with AnnotatedVideo(path, 29.97, size) as video:
+        for frame in range(9):
+            video.write(image, track(frame=frame))
+        assert not path.exists()
+    with open_source(path) as source:
+        assert source.rate == pytest.approx(29.97)
+        width, height = source.size
+        shape = draw(image, track()).shape
+        assert (height - shape[0], width - shape[1]) == (shape[0] % 2, shape[1] % 2)
+        assert sum(1 for _ in source) == 9
+    assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
+
+
+def test_a_video_without_frames_leaves_nothing(tmp_path):
+    with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_run_keeps_its_video(tmp_path):
+    def run():
+        with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)) as video:
+            video.write(np.zeros((64, 64, 3), np.uint8), track())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    with open_source(tmp_path / "out.mp4") as source:
+        assert sum(1 for _ in source) == 1
+
+
+def test_a_place_that_cannot_be_written_is_refused_at_once(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(VideoError, match="cannot write the video"):
+        AnnotatedVideo(tmp_path / "file" / "out.mp4", 25, (64, 64))
+
+
+def test_a_thumbnail_shows_both_boxes():
+    image = np.full((200, 400, 3), 128, np.uint8)
+    data = thumbnail(image, np.array([40.0, 40, 80, 80]), np.full(4, np.nan), 200)
+    small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert small.shape == (100, 200, 3)
+    assert small[40, 20].mean() > 180
+    assert abs(small[80, 150].astype(int) - 128).max() < 10

@@ -1,0 +1,70 @@
+"""The demo video: the same every time, and its truth is where the dahlia is."""
+
+from __future__ import annotations
+
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+
+from catstream.video.demo import FRAMES, render
+
+
+@pytest.fixture(scope="module")
+def film():
+    """The whole story, small."""
+    return list(render(FRAMES, (160, 120)))
+
+
+def warmth(image: np.ndarray, box) -> float:
+    """How much more red than blue there is in the middle of a box."""
+    x, y = (int(value) for value in box.centre)
+    middle = image[max(y - 3, 0) : y + 4, max(x - 3, 0) : x + 4].astype(float)
+    return float((middle[..., 2] - middle[..., 0]).mean())
+
+
+def test_the_same_arguments_give_the_same_pixels(film):
+    for (image, box), (again, other) in zip(film[:5], render(5, (160, 120)), strict=True):
+        np.testing.assert_array_equal(image, again)
+        assert box == other
+
+
+def test_the_seed_changes_the_noise_and_not_the_truth(film):
+    image, box = next(render(1, (160, 120), seed=1))
+    assert (image != film[0][0]).any()
+    assert box == film[0][1]
+
+
+def test_the_dahlia_is_covered_once_and_leaves_once(film):
+    absent = np.array([box is None for _, box in film])
+    edges = np.flatnonzero(np.diff(absent.astype(int)))
+    assert len(edges) == 4
+    assert 90 < absent.sum() < 150
+    assert not absent[0]
+    assert not absent[-1]
+
+
+def test_the_truth_is_where_the_dahlia_is(film):
+    inside = [
+        (image, box) for image, box in film[::10] if box and 0 <= box.x < 160 - box.w and 0 <= box.y < 120 - box.h
+    ]
+    shares = [warmth(image, box) > 40 for image, box in inside]
+    assert len(inside) > 30
+    assert np.mean(shares) > 0.95  # now and then a corner of the pagoda or the look-alike is before it
+
+
+def test_it_moves_a_little_a_frame_and_changes_size_and_light(film):
+    boxes = [box for _, box in film if box]
+    pairs = [(one, two) for (_, one), (_, two) in pairwise(film) if one and two]
+    steps = [np.hypot(*(np.array(one.centre) - two.centre)) for one, two in pairs]
+    assert max(steps) < 6
+    assert max(box.w for box in boxes) > 1.4 * min(box.w for box in boxes)
+    light = [image.mean() for image, _ in film]
+    assert max(light) > 1.4 * min(light)
+
+
+def test_a_longer_video_turns_back_without_a_jump(film):
+    """Frame 600 is frame 598 again, but for the noise."""
+    longer = list(islice(render(FRAMES + 4, (160, 120)), FRAMES, None))
+    for step, (_, box) in enumerate(longer):
+        assert box == film[FRAMES - 2 - step][1]

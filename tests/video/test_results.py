@@ -1,0 +1,75 @@
+"""Results files: a row a frame, kept whatever happens."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages import Track
+from catstream.video.results import ResultsWriter
+
+BOX = Box(1, 2, 3.5, 4.25)
+
+
+def track(frame: int, box: Box | None = BOX) -> Track:
+    return Track(frame + 1, frame, frame / 25, "present" if box else "absent", box, 0.5 if box else 0.125, frame // 2)
+
+
+def rows(path) -> np.ndarray:
+    return np.loadtxt(path, delimiter=",", ndmin=2)
+
+
+def test_each_frame_has_a_row_and_absence_is_nan(tmp_path):
+    with ResultsWriter(tmp_path / "deep" / "out", "walk") as results:
+        for frame in range(5):
+            results.write(track(frame, None if frame == 3 else Box(frame, 2, 3.5, 4.25)), 0.01)
+    out = tmp_path / "deep" / "out"
+    boxes = rows(out / "walk.txt")
+    assert boxes.shape == (5, 4)
+    assert np.isnan(boxes[3]).all()
+    np.testing.assert_array_equal(boxes[4], [4, 2, 3.5, 4.25])
+    np.testing.assert_array_equal(rows(out / "walk_confidence.value")[:, 0], [0.5, 0.5, 0.5, 0.125, 0.5])
+    np.testing.assert_array_equal(rows(out / "walk_time.txt")[:, 0], 5 * [0.01])
+    lines = (out / "tracks.csv").read_text().splitlines()
+    assert lines[0] == "frame,seconds,state,x,y,w,h,score,model_version"
+    assert lines[3] == "2,0.080000,present,2.0000,2.0000,3.5000,4.2500,0.500000,1"
+    assert lines[4] == "3,0.120000,absent,,,,,0.125000,1"
+
+
+def test_what_is_written_can_be_read_before_the_end(tmp_path):
+    results = ResultsWriter(tmp_path, "walk")
+    results.write(track(0), 0.01)
+    for file in ("walk.txt", "walk_confidence.value", "walk_time.txt"):
+        assert len(rows(tmp_path / file)) == 1
+    results.close()
+
+
+def test_frames_without_a_track_get_a_row_of_nan(tmp_path):
+    with ResultsWriter(tmp_path, "walk", start=10) as results:
+        results.write(track(10), 0.01)
+        results.write(track(13), 0.01)
+        results.write(track(13), 0.01)  # a restarted detector may say it again
+        results.write(track(12), 0.01)
+    boxes = rows(tmp_path / "walk.txt")
+    assert np.isnan(boxes).all(axis=1).tolist() == [False, True, True, False]
+    assert len((tmp_path / "tracks.csv").read_text().splitlines()) == 3
+
+
+def test_the_same_tracks_give_the_same_bytes(tmp_path):
+    for folder, seconds in (("a", 0.1), ("b", 0.2)):
+        with ResultsWriter(tmp_path / folder, "walk") as results:
+            for frame in range(20):
+                results.write(track(frame, Box(frame / 3, frame / 7, 10 / 3, 1e-9)), seconds)
+    for file in ("walk.txt", "walk_confidence.value", "tracks.csv"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_a_place_that_cannot_be_written_is_refused_at_once(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(VideoError, match="cannot write results"):
+        ResultsWriter(tmp_path / "file" / "out", "walk")
+    (tmp_path / "out" / "tracks.csv").mkdir(parents=True)
+    with pytest.raises(VideoError, match="cannot write results"):
+        ResultsWriter(tmp_path / "out", "walk")

@@ -1,0 +1,277 @@
+"""Sources: all good frames in order, and an error that says what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from catstream.errors import VideoError
+from catstream.video.source import Source, open_source
+
+CODECS = {".mp4": "libx264", ".mkv": "libx264", ".ts": "libx264", ".avi": "mjpeg", ".mpg": "mpeg2video"}
+
+
+def numbered(number: int, width: int = 160, height: int = 120) -> np.ndarray:
+    """Seven bits of the number as black and white fields, which survive lossy coding, over noise of its own."""
+    image = np.random.default_rng(number).integers(60, 190, (height, width, 3), np.uint8)
+    for bit in range(7):
+        image[4:20, 4 + 20 * bit : 20 + 20 * bit] = 255 if number >> bit & 1 else 0
+    return image
+
+
+def number_of(image: np.ndarray) -> int:
+    """The number that `numbered` wrote."""
+    return sum((int(image[8:16, 8 + 20 * bit : 16 + 20 * bit].mean() > 127) << bit) for bit in range(7))
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a video of numbered frames; the ending of its name says which kind."""
+
+    def write(name: str, frames: int = 100, options: dict[str, str] | None = None, rotation: int = 0) -> Path:
+        path = tmp_path / name
+        codec = CODECS[path.suffix]
+        if codec not in av.codecs_available:
+            pytest.skip(f"this FFmpeg cannot write {codec}")
+        with av.open(str(path), "w", options=options or {}) as container:
+            stream = container.add_stream(codec, rate=25)
+            stream.width, stream.height = 160, 120
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            if rotation:
+                stream.set_display_rotation(rotation)
+            for number in range(frames):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+            container.mux(stream.encode(None))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Callable[..., Path]:
+    """Writes numbered images, by name in the order given, into a folder."""
+
+    def write(folder: str, names: list[str]) -> Path:
+        path = tmp_path / folder
+        path.mkdir(parents=True)
+        for number, name in enumerate(names):
+            cv2.imwrite(str(path / name), numbered(number))
+        return path
+
+    return write
+
+
+KINDS = pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.ts", "a.avi", "a.mpg"])
+
+
+def numbers(source: Source) -> list[int]:
+    with source:
+        return [number_of(frame.image) for frame in source]
+
+
+def broken(path, start: int = 0) -> tuple[list[int], str]:
+    """Numbers of the good frames of a broken source, and the error after them."""
+    source, good = open_source(path, start), []
+    try:
+        for frame in source:
+            good.append(number_of(frame.image))
+    except VideoError as error:
+        return good, str(error)
+    pytest.fail(f"no error after {len(good)} frames")
+
+
+# --- videos ------------------------------------------------------------------------------------------
+
+
+@KINDS
+def test_every_frame_of_a_video_comes_once_and_in_order(video, name):
+    source = open_source(video(name))
+    assert (source.name, source.size, source.rate, source.live) == ("a", (160, 120), 25.0, False)
+    assert source.frames in (100, None)
+    assert numbers(source) == list(range(100))
+
+
+@KINDS
+def test_frames_carry_their_number_and_the_time_since_the_first(video, name):
+    with open_source(video(name)) as source:
+        for number, frame in enumerate(source):
+            assert frame.number == number
+            assert frame.time == pytest.approx(number / 25, abs=0.002)
+
+
+@KINDS
+def test_a_later_start_gives_the_same_frames_as_reading_up_to_it(video, name):
+    path = video(name)
+    with open_source(path) as source:
+        wanted = [frame for frame in source if frame.number >= 37]
+    with open_source(path, start=37) as source:
+        for frame, other in zip(source, wanted, strict=True):
+            assert (frame.number, frame.time) == (other.number, other.time)
+            np.testing.assert_array_equal(frame.image, other.image)
+
+
+@KINDS
+@pytest.mark.parametrize("share", [0.31, 0.6, 0.83])
+def test_a_truncated_video_gives_its_good_frames_and_then_says_where_it_breaks(video, name, share):
+    path = video(name, options={"movflags": "faststart"} if name.endswith("mp4") else None)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    good, message = broken(path)
+    assert good == list(range(len(good)))
+    assert 40 * share < len(good) < 100  # later frames take fewer bytes, or more
+    assert f"frame {len(good)} " in message or f"after frame {len(good) - 1}:" in message
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.mpg"])
+def test_damage_in_the_middle_ends_a_video_there(video, name):
+    path = video(name)
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 3000] = np.random.default_rng(1).integers(0, 256, 3000, np.uint8).tobytes()
+    path.write_bytes(data)
+    good, message = broken(path)
+    assert good == list(range(len(good)))
+    assert 20 < len(good) < 80
+    assert "breaks at frame" in message
+
+
+def test_a_video_without_its_index_says_that_it_cannot_be_read(video):
+    path = video("a.mp4")
+    path.write_bytes(path.read_bytes()[:-3000])
+    with pytest.raises(VideoError, match="not a video that can be read"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("rotation", [90, 180, 270])
+def test_videos_of_phones_stand_upright(video, rotation):
+    with open_source(video("a.mp4", frames=1, rotation=rotation)) as source:
+        frame = next(source)
+    assert number_of(np.rot90(frame.image, -rotation // 90)) == 0
+    assert frame.image.flags.c_contiguous
+    assert source.size == ((160, 120) if rotation == 180 else (120, 160))
+
+
+@pytest.mark.parametrize("text", ["not a video at all\n" * 50, ""])
+@pytest.mark.parametrize("name", ["notes.txt", "notes.mp4"])
+def test_text_is_not_a_video(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(VideoError, match="give a video file, a folder of images"):
+        open_source(tmp_path / name)
+
+
+def test_a_start_after_the_end_is_refused(video):
+    with pytest.raises(VideoError, match="no frame to start with"):
+        open_source(video("a.avi", frames=5), start=5)
+
+
+def test_a_closed_source_has_no_frames(video):
+    source = open_source(video("a.avi", frames=5))
+    next(source)
+    source.close()
+    assert list(source) == []
+    source.close()
+
+
+# --- images ------------------------------------------------------------------------------------------
+
+
+def test_images_of_a_folder_come_in_natural_order(images):
+    folder = images("walk", [f"{number}.png" for number in range(12)])
+    source = open_source(folder)
+    assert (source.name, source.frames, source.size) == ("walk", 12, (160, 120))
+    assert numbers(source) == list(range(12))
+
+
+@pytest.mark.parametrize("pattern", ["%05d.png", "%d.png", "*.png", "000??.png", "0000[0-9].png"])
+def test_patterns_of_both_kinds(images, pattern):
+    folder = images("walk", [f"{number:05d}.png" for number in range(7)])
+    (folder / "note.txt").write_text("not an image")
+    source = open_source(folder / pattern)
+    assert source.name == "walk"
+    assert numbers(source) == list(range(7))
+
+
+def test_a_pattern_takes_only_the_names_it_fits(images):
+    folder = images("walk", ["left1.png", "left2.png", "right1.png", "right2.png"])
+    assert numbers(open_source(folder / "right%d.png")) == [2, 3]
+
+
+@pytest.mark.parametrize("inner", ["img", "imgs", "color", "rgb"])
+def test_a_sequence_folder_opens_by_its_images(images, inner):
+    images(f"walk/{inner}", ["0001.jpg", "0002.jpg"])
+    source = open_source(images("walk/else", []).parent)
+    assert source.name == "walk"
+    assert numbers(source) == [0, 1]
+
+
+def test_a_sequence_folder_opens_by_its_one_video(video, tmp_path):
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    video("a.avi", frames=3).rename(folder / "a.avi")
+    (folder / "groundtruth_rect.txt").write_text("1,2,3,4\n" * 3)
+    assert numbers(open_source(folder)) == [0, 1, 2]
+
+
+def test_hidden_files_are_not_frames(images):
+    folder = images("walk", [".0000.png", "0001.png"])
+    assert numbers(open_source(folder)) == [1]
+
+
+def test_a_later_start_in_a_folder(images):
+    source = open_source(images("walk", [f"{number}.png" for number in range(9)]), start=4)
+    with source:
+        assert [(frame.number, number_of(frame.image)) for frame in source] == [(n, n) for n in range(4, 9)]
+
+
+def test_grey_images_are_expanded(tmp_path):
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((20, 30), 77, np.uint8))
+    with open_source(tmp_path) as source:
+        image = next(source).image
+    assert image.shape == (20, 30, 3)
+    assert image.dtype == np.uint8
+    assert (image == 77).all()
+
+
+def test_the_first_image_of_another_size_is_named(images):
+    folder = images("walk", [f"{number}.png" for number in range(5)])
+    cv2.imwrite(str(folder / "3.png"), numbered(3, width=150))
+    good, message = broken(folder)
+    assert good == [0, 1, 2]
+    assert "3.png" in message
+    assert "150x120" in message
+    assert "160x120" in message
+
+
+def test_an_image_that_cannot_be_read_is_named(images):
+    folder = images("walk", [f"{number}.png" for number in range(4)])
+    (folder / "2.png").write_bytes(b"nothing")
+    good, message = broken(folder)
+    assert good == [0, 1]
+    assert "2.png" in message
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("empty", "neither images nor a video"),
+        ("missing.mp4", "no video or folder"),
+        ("empty/%05d.png", "no images at"),
+        ("empty/*.png", "no images at"),
+    ],
+)
+def test_nothing_there_is_said(tmp_path, place, message):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(VideoError, match=message):
+        open_source(tmp_path / place)
+
+
+def test_two_videos_in_a_folder_are_not_guessed_between(video, tmp_path):
+    video("a.avi", frames=1)
+    video("b.avi", frames=1)
+    with pytest.raises(VideoError, match="2 videos"):
+        open_source(tmp_path)
