@@ -198,10 +198,11 @@ def _video(path: Path, start: int) -> Source:
     except (av.FFmpegError, OSError) as error:
         raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_HELP}") from None
     # FFmpeg renders text files as video; nobody means that.
-    if not container.streams.video or container.format.name == "tty":
+    streams = container.streams.video
+    if not streams or streams[0].codec_context is None or container.format.name == "tty":
         container.close()
         raise VideoError(f"there is no video in {str(path)!r}: {_HELP}")
-    stream = container.streams.video[0]
+    stream = streams[0]
     rate = float(stream.average_rate or stream.guessed_rate or RATE)
     return Source(path.stem, _read_video(path, container, rate, start), frames=stream.frames or None, rate=rate)
 
@@ -211,7 +212,7 @@ def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator
     stream.thread_type = "NONE"  # the processes are the parallelism
     number, time, zero, shape = 0, 0.0, None, None
     with container:
-        for frame in _good_frames(path, container, stream):
+        for frame in _good_frames(path, container, stream, rate):
             zero = frame.pts if zero is None else zero
             time = number / rate if frame.pts is None else float((frame.pts - zero) * stream.time_base)
             if number >= start:
@@ -225,44 +226,54 @@ def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator
                 shape = image.shape
                 yield Frame(number, time, image)
             number += 1
-        stated = _stated_seconds(container, stream)
-        if number and stated - (time + 1 / rate) > _SHORT_SECONDS:
-            raise VideoError(
-                f"{str(path)!r} breaks off after frame {number - 1}: it says it lasts {stated:.1f} s, "
-                f"and its frames end at {time + 1 / rate:.1f} s; the frames before are good"
-            )
 
 
-def _good_frames(path: Path, container: Any, stream: Any) -> Iterator[Any]:
-    """Decoded frames up to the first that is damaged, then a VideoError if there was one."""
+def _good_frames(path: Path, container: Any, stream: Any, rate: float) -> Iterator[Any]:
+    """Decoded frames up to the first that is damaged or missing, then a VideoError if there was one."""
     import av
 
-    count, problem = 0, ""
-    packets = container.demux(stream)
-    while not problem:
-        frames = []
+    count, last, problem = 0, None, ""
+    for packet, problem in _packets(container, stream):
         try:
-            packet = next(packets, None)
-            if packet is None:
-                return
-            if packet.is_corrupt:
-                problem = "data is missing"
-            else:
-                frames = packet.decode()
+            # After a break, the good frames that wait in the decoder for their turn.
+            frames = stream.codec_context.decode(None if problem else packet)
         except av.FFmpegError as error:
-            problem = (error.strerror or str(error)).lower()
-        if problem:  # the good frames that wait in the decoder for their turn
-            try:
-                frames = stream.codec_context.decode(None)
-            except av.FFmpegError:
-                frames = []
+            frames, problem = [], problem or _reason(error)
         for frame in frames:
-            if frame.is_corrupt:
-                problem = "its picture is damaged"
+            late = last is not None and frame.pts is not None and (frame.pts - last) * stream.time_base * rate > 1.5
+            if frame.is_corrupt or (problem and late):
+                problem = problem or "its picture is damaged"
                 break
+            last = frame.pts
             yield frame
             count += 1
-    raise VideoError(f"{str(path)!r} breaks at frame {count} ({problem}): the frames before are good")
+        if problem:
+            raise VideoError(f"{str(path)!r} breaks at frame {count} ({problem}): the frames before are good")
+
+
+def _packets(container: Any, stream: Any) -> Iterator[tuple[Any, str]]:
+    """Packets up to and with the empty one at the end, and what is wrong, the empty text for nothing."""
+    import av
+
+    end, stated = 0.0, _stated_seconds(container, stream)
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets)
+        except av.FFmpegError as error:
+            yield None, _reason(error)
+            return
+        if packet.dts is None and not packet.size:
+            short = stated - end > _SHORT_SECONDS
+            yield packet, f"it says it lasts {stated:.1f} s, and ends at {end:.1f} s" if short else ""
+            return
+        if packet.pts is not None:
+            end = max(end, float((packet.pts + (packet.duration or 0) - (stream.start_time or 0)) * stream.time_base))
+        yield packet, "data is missing" if packet.is_corrupt else ""
+
+
+def _reason(error: Any) -> str:
+    return (error.strerror or str(error)).lower()
 
 
 def _stated_seconds(container: Any, stream: Any) -> float:

@@ -86,6 +86,7 @@ def test_a_thumbnail_shows_both_boxes():
     image = np.full((200, 400, 3), 128, np.uint8)
     data = thumbnail(image, np.array([40.0, 40, 80, 80]), np.full(4, np.nan), 200)
     small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert small is not None
     assert small.shape == (100, 200, 3)
     assert small[40, 20].mean() > 180
     assert abs(small[80, 150].astype(int) - 128).max() < 10
