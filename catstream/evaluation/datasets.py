@@ -26,8 +26,8 @@ from catstream.video.source import natural_order, open_source
 
 __all__ = ["Sequence", "find_sequences"]
 
-#: Sequences of OTB whose truth does not begin with their first image.
-_BEGIN = {"david": 299}
+#: Sequences of OTB whose truth does not begin with their first image, by name and number of boxes.
+_BEGIN = {("david", 471): 299}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,10 +95,7 @@ def _sequences(folder: Path) -> list[Sequence]:
     rects = sorted(folder.glob("groundtruth_rect*.txt"), key=natural_order)
     if rects:
         ends = [file.name.removeprefix("groundtruth_rect").removesuffix(".txt") for file in rects]
-        return [
-            _sequence(name + end, folder, file, _rectangles, _BEGIN.get(name.lower(), 0))
-            for file, end in zip(rects, ends, strict=True)
-        ]
+        return [_sequence(name + end, folder, file, _rectangles) for file, end in zip(rects, ends, strict=True)]
     for file, reader in (
         (folder / "gt.txt", _corners),
         (folder / "groundtruth.txt", _polygons),
@@ -109,14 +106,12 @@ def _sequences(folder: Path) -> list[Sequence]:
     return []
 
 
-def _sequence(
-    name: str, folder: Path, file: Path, reader: Callable[[np.ndarray], np.ndarray], begin: int = 0
-) -> Sequence:
+def _sequence(name: str, folder: Path, file: Path, reader: Callable[[np.ndarray], np.ndarray]) -> Sequence:
     boxes = reader(_numbers(file))
     boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
     if np.isnan(boxes).all():
         raise VideoError(f"{str(file)!r} has no box at all: the object must be somewhere")
-    return Sequence(name, folder, boxes, begin)
+    return Sequence(name, folder, boxes, _BEGIN.get((name.lower(), len(boxes)), 0))
 
 
 def _numbers(file: Path) -> np.ndarray:

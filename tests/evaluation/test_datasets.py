@@ -1,0 +1,145 @@
+"""Readers: the same truth in every layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from catstream.errors import VideoError
+from catstream.evaluation.datasets import find_sequences
+
+TRUTH = np.array([[10, 20, 30, 40], [12.5, 21, 30, 40], [np.nan] * 4, [15, 22, 31, 41.5]])
+
+
+def folder(place: Path, name: str, images: str, text: str, frames: int = 4, file: str = "%05d.png") -> Path:
+    """A sequence: so many frames, and a file of truth."""
+    (place / images).mkdir(parents=True)
+    for number in range(1, frames + 1):
+        cv2.imwrite(str(place / images / (file % number)), np.full((8, 8, 3), number, np.uint8))
+    (place / name).write_text(text)
+    return place
+
+
+def lines(rows: np.ndarray, sign: str = ",") -> str:
+    return "".join(sign.join(f"{value:g}" for value in row) + "\n" for row in rows)
+
+
+def corners(rows: np.ndarray) -> np.ndarray:
+    return np.hstack([rows[:, :2], rows[:, :2] + rows[:, 2:]])
+
+
+def polygons(rows: np.ndarray) -> np.ndarray:
+    x, y, w, h = rows.T
+    return np.stack([x, y + h, x, y, x + w, y, x + w, y + h], axis=1)
+
+
+def check(place: Path, name: str = "walk") -> None:
+    (sequence,) = find_sequences(place)
+    assert sequence.name == name
+    np.testing.assert_allclose(sequence.boxes, TRUTH)
+    assert [int(image[0, 0, 0]) for image in sequence.frames()] == [1, 2, 3, 4]
+    assert [int(image[0, 0, 0]) for image in sequence.frames(2)] == [3, 4]
+
+
+@pytest.mark.parametrize("sign", [",", "\t", " ", "  ", ", "])
+def test_otb_with_commas_tabs_and_blanks(tmp_path, sign):
+    check(folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH, sign), file="%04d.jpg"))
+
+
+def test_otb_with_two_objects_is_two_sequences(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.1.txt", "img", lines(TRUTH))
+    (place / "groundtruth_rect.2.txt").write_text(lines(TRUTH + 1))
+    assert [sequence.name for sequence in find_sequences(place)] == ["walk.1", "walk.2"]
+    np.testing.assert_allclose(find_sequences(place)[1].boxes, TRUTH + 1)
+
+
+def test_the_truth_of_one_sequence_of_otb_begins_at_its_300th_image(tmp_path):
+    boxes = np.tile(TRUTH[:1], (471, 1))
+    (tmp_path / "David").mkdir()
+    (tmp_path / "David" / "groundtruth_rect.txt").write_text(lines(boxes))
+    assert find_sequences(tmp_path)[0].begin == 299
+    check(folder(tmp_path / "mine" / "david", "groundtruth_rect.txt", "img", lines(TRUTH)), "david")
+
+
+def test_tld_with_corners(tmp_path):
+    check(folder(tmp_path / "walk", "gt.txt", ".", lines(corners(TRUTH))))
+
+
+def test_vot_with_polygons(tmp_path):
+    check(folder(tmp_path / "walk", "groundtruth.txt", ".", lines(polygons(TRUTH)), file="%08d.jpg"))
+
+
+def test_vot_with_a_folder_of_colours_and_rectangles(tmp_path):
+    check(folder(tmp_path / "walk", "groundtruth.txt", "color", lines(TRUTH)))
+
+
+def test_a_turned_polygon_counts_by_its_bounding_box(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth.txt", ".", "10,5,15,10,10,15,5,10\n", frames=1)
+    np.testing.assert_allclose(find_sequences(place)[0].boxes, [[5, 5, 10, 10]])
+
+
+def test_princeton_with_colour_images_and_a_column_for_occlusion(tmp_path):
+    rows = np.hstack([TRUTH, [[0], [0], [1], [0]]])
+    place = folder(tmp_path / "walk", "walk.txt", "rgb", lines(rows), file="r-%d-1.png")
+    (place / "depth").mkdir()
+    cv2.imwrite(str(place / "depth" / "d-1-1.png"), np.zeros((8, 8), np.uint16))
+    check(place)
+
+
+def test_a_video_in_the_folder_is_read(tmp_path, walk):
+    av = pytest.importorskip("av")
+    (sequence,) = find_sequences(walk)
+    with av.open(str(tmp_path / "film.avi"), "w") as container:
+        stream = container.add_stream("mjpeg", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuvj420p"
+        for image in sequence.frames():
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode(None))
+    (tmp_path / "groundtruth_rect.txt").write_text((walk / "groundtruth_rect.txt").read_text())
+    (other,) = find_sequences(tmp_path)
+    assert len(list(other.frames())) == len(other) == 12
+
+
+@pytest.mark.parametrize("row", ["0,0,0,0", "10,10,0,5", "NaN,NaN,NaN,NaN", "10,10,nan,5", "10,10,-3,5"])
+def test_a_box_without_area_is_an_absent_object(tmp_path, row):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", f"1,2,3,4\n{row}\n", frames=2)
+    assert np.isnan(find_sequences(place)[0].boxes).all(axis=1).tolist() == [False, True]
+
+
+def test_a_folder_of_sequences_in_natural_order(tmp_path):
+    for name in ("10_car", "9_dog", "img"):
+        folder(tmp_path / name, "groundtruth_rect.txt", "img", lines(TRUTH))
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.txt").write_text("not a sequence")
+    assert [sequence.name for sequence in find_sequences(tmp_path)] == ["9_dog", "10_car", "img"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("1,2,3\n", "line 1: expected four or more numbers"),
+        ("1,2,3,4\n1,2,3,4,5\n", "line 2: expected 4 numbers"),
+        ("1,2,3,4\na,b,c,d\n", "line 2"),
+        ("nan,nan,nan,nan\n", "no box at all"),
+    ],
+)
+def test_a_truth_that_cannot_be_read_says_where(tmp_path, text, message):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", text)
+    with pytest.raises(VideoError, match=message):
+        find_sequences(place)
+
+
+def test_nothing_there_says_what_was_expected(tmp_path):
+    for place in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(VideoError, match="groundtruth_rect"):
+            find_sequences(place)
+
+
+def test_fewer_frames_than_boxes_are_an_error(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH), frames=3)
+    with pytest.raises(VideoError, match="1 frames too few"):
+        list(find_sequences(place)[0].frames())

@@ -1,0 +1,205 @@
+"""One-pass evaluation: what is run, kept, found again, and refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from catstream.errors import CatstreamError, SettingsError, VideoError
+from catstream.evaluation import onepass
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.onepass import evaluate, follow, starts_of
+from catstream.evaluation.peers import PEERS, Peer
+from catstream.evaluation.runs import Run, load, save
+from catstream.evaluation.summary import MEASURES, mean_of, rows_of, to_json
+from catstream.settings import Settings
+
+SETTINGS = Settings()
+
+
+@pytest.fixture
+def run(sequence, found) -> Run:
+    frames = len(sequence)
+    found[9] = np.nan
+    return Run("catstream", sequence, 0, found.round(4), np.linspace(1, 0.5, frames).round(6), np.full(frames, 0.02))
+
+
+@pytest.fixture
+def counted(monkeypatch, found):
+    """`follow`, without following: counts its calls."""
+    calls = []
+
+    def instead(tracker, _, sequence, start=0):
+        calls.append((tracker, sequence.name, start))
+        frames = len(sequence) - start
+        return Run(tracker, sequence, start, found[start:].round(4), np.ones(frames), np.full(frames, 0.01))
+
+    monkeypatch.setattr(onepass, "follow", instead)
+    return calls
+
+
+# --- running -----------------------------------------------------------------------------------------
+
+
+def test_each_tracker_starts_on_the_given_box_and_answers_every_frame(sequence):
+    for tracker in ("catstream", "mil"):
+        run = follow(tracker, SETTINGS, sequence)
+        assert run.boxes.shape == (12, 4)
+        np.testing.assert_allclose(run.boxes[0], sequence.boxes[0], atol=1)
+        assert np.isfinite(run.confidence).all()
+        assert (run.seconds > 0).all()
+        assert run.score().success > 0.7
+        assert run.fps > 1
+
+
+def test_a_later_start_is_a_run_of_its_own(sequence):
+    run = follow("catstream", SETTINGS, sequence, start=8)
+    assert run.name == "walk@8"
+    assert run.boxes.shape == run.truth.shape == (4, 4)
+    np.testing.assert_allclose(run.boxes[0], sequence.boxes[8], atol=1e-3)
+
+
+def test_starts_are_spread_over_the_frames_with_the_object(sequence):
+    assert starts_of(sequence, 1) == [0]
+    assert starts_of(sequence, 2) == [0, 8]  # the object is absent in 5, 6 and 7
+    assert starts_of(sequence, 4) == [0, 3, 8, 9]
+    late = Sequence("late", sequence.path, np.vstack([np.full((3, 4), np.nan), sequence.boxes]))
+    assert starts_of(late, 1) == [3]
+
+
+def test_processes_give_the_same_runs_as_one(sequence, tmp_path):
+    alone = evaluate([sequence], ["catstream"], SETTINGS, starts=2)
+    pooled = evaluate([sequence], ["catstream"], SETTINGS, starts=2, jobs=2, output=tmp_path)
+    for one, other in zip(alone, pooled, strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.boxes, other.boxes)
+        np.testing.assert_array_equal(one.confidence, other.confidence)
+
+
+# --- keeping -----------------------------------------------------------------------------------------
+
+
+def test_a_run_that_was_kept_is_the_same_run(tmp_path, run):
+    save(tmp_path, run)
+    again = load(tmp_path, "catstream", run.sequence, 0)
+    assert again is not None
+    for field in ("boxes", "confidence", "seconds"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(run, field))
+    assert again.score() == run.score()
+
+
+def test_results_lie_where_the_toolkits_look(tmp_path, run):
+    """got10k's ExperimentOTB loads TRACKER/NAME.txt with np.loadtxt; the VOT toolkit parses lines of NAME_001.txt."""
+    save(tmp_path, run)
+    home = tmp_path / "catstream"
+    assert np.loadtxt(home / "walk.txt", delimiter=",").shape == (12, 4)
+    assert np.loadtxt(home / "times" / "walk_time.txt").shape == (12,)
+    vot = home / "longterm" / "walk"
+    assert (vot / "walk_001.txt").read_text().splitlines()[9] == "nan,nan,nan,nan"
+    assert len((vot / "walk_001_confidence.value").read_text().splitlines()) == 12
+    assert len((vot / "walk_001_time.value").read_text().splitlines()) == 12
+    assert len(list(vot.parent.iterdir())) == 1
+
+
+def test_finished_runs_are_not_made_again(tmp_path, sequence, counted):
+    first = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=2, output=tmp_path)
+    assert len(counted) == len(first) == 4
+    again = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=4, output=tmp_path)
+    assert len(again) == 8
+    assert counted[4:] == [("catstream", "walk", 3), ("catstream", "walk", 9), ("mil", "walk", 3), ("mil", "walk", 9)]
+
+
+def test_a_run_that_was_cut_off_is_made_again(tmp_path, sequence, run, counted):
+    save(tmp_path, run)
+    folder = tmp_path / "catstream" / "longterm" / "walk"
+    folder.rename(folder.with_name("walk.part"))
+    evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
+    assert len(counted) == 1
+    assert not folder.with_name("walk.part").exists()
+
+
+def test_runs_of_another_truth_are_made_again(tmp_path, sequence, run, counted):
+    save(tmp_path, run)
+    shorter = Sequence(sequence.name, sequence.path, sequence.boxes[:-1])
+    evaluate([shorter], ["catstream"], SETTINGS, output=tmp_path)
+    assert len(counted) == 1
+
+
+def test_runs_made_with_other_settings_are_not_mixed_in(tmp_path, sequence, counted):
+    evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
+    with pytest.raises(SettingsError, match="coreset_size"):
+        evaluate([sequence], ["catstream"], Settings(coreset_size=32), output=tmp_path)
+    assert len(counted) == 1
+
+
+@pytest.mark.usefixtures("counted")
+def test_begin_and_done_tell_how_far_it_is(sequence):
+    said: list[int] = []
+    evaluate(
+        [sequence],
+        ["catstream"],
+        SETTINGS,
+        starts=2,
+        begin=lambda frames: said.append(-frames),
+        done=lambda run: said.append(len(run.boxes)),
+    )
+    assert said == [-16, 12, 4]
+
+
+# --- refusing ----------------------------------------------------------------------------------------
+
+
+def test_unknown_trackers_and_equal_names_are_refused_before_anything_runs(sequence, counted):
+    with pytest.raises(SettingsError, match="no tracker 'kfc'"):
+        evaluate([sequence], ["catstream", "kfc"], SETTINGS)
+    with pytest.raises(VideoError, match="two sequences are called 'walk'"):
+        evaluate([sequence, sequence], ["catstream"], SETTINGS)
+    assert not counted
+
+
+def test_a_tracker_that_this_opencv_has_not_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(PEERS, "csrt", "TrackerThatIsNot")
+    with pytest.raises(SettingsError, match=r"catstream\[peers\]"):
+        Peer("csrt")
+
+
+def test_a_damaged_run_is_named(tmp_path, sequence, run):
+    save(tmp_path, run)
+    (tmp_path / "catstream" / "longterm" / "walk" / "walk_001.txt").write_text("rubbish\n")
+    with pytest.raises(CatstreamError, match="longterm/walk"):
+        load(tmp_path, "catstream", sequence, 0)
+
+
+# --- summing up --------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("counted")
+def test_rows_are_means_over_the_starts_with_their_spread(sequence):
+    runs = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=2)
+    rows = rows_of(runs)
+    assert [(row.name, row.tracker, row.frames, row.starts) for row in rows] == [
+        ("walk", "catstream", 12, 2),
+        ("walk", "mil", 12, 2),
+    ]
+    scores = [run.score().auc for run in runs[:2]]
+    assert rows[0].auc == pytest.approx(np.mean(scores))
+    assert rows[0].auc_spread == pytest.approx(np.std(scores))
+
+
+def test_the_mean_f_score_is_over_the_sequences_that_have_one(sequence, run):
+    whole = Sequence("whole", sequence.path, np.nan_to_num(sequence.boxes, nan=30.0))
+    other = Run("catstream", whole, 0, run.boxes, run.confidence, run.seconds)
+    rows = rows_of([run, other])
+    assert rows[1].f_score is None
+    assert mean_of(rows)["catstream"]["f_score"] == rows[0].f_score
+    assert mean_of(rows[1:])["catstream"]["f_score"] is None
+
+
+def test_the_json_holds_every_row_and_the_means(run):
+    numbers = json.loads(json.dumps(to_json(rows_of([run])), allow_nan=False))
+    (row,) = numbers["sequences"]
+    assert {"name", "frames", "auc", "success", "precision", "f_score", "fps", "tracker"} <= row.keys()
+    assert numbers["mean"].keys() == {"catstream"}
+    assert numbers["mean"]["catstream"].keys() == set(MEASURES)

@@ -1,0 +1,97 @@
+"""The report and the command: one file with all in it, and a table."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from catstream.cli.evaluate import evaluate
+from catstream.errors import VideoError
+from catstream.evaluation.films import film_of, worst
+from catstream.evaluation.plots import plot
+from catstream.evaluation.report import write_report
+from catstream.evaluation.runs import Run
+from catstream.settings import Settings
+
+
+def run_of(sequence, boxes, tracker: str = "catstream") -> Run:
+    return Run(tracker, sequence, 0, boxes, np.ones(len(boxes)), np.full(len(boxes), 0.01))
+
+
+@pytest.fixture
+def lost(sequence, found) -> Run:
+    """Lost from frame 3 on."""
+    boxes = found.copy()
+    boxes[3:, :2] += 60
+    return run_of(sequence, boxes)
+
+
+def test_a_plot_is_one_svg_with_a_line_a_curve():
+    curves = {"a & b": np.linspace(1, 0, 21), "<c>": np.linspace(0.5, 0, 21)}
+    tree = ElementTree.fromstring(plot("Success", "threshold", np.linspace(0, 1, 21), curves))
+    lines = [line for line in tree.iter() if line.tag.endswith("polyline")]
+    assert len(lines) == 2
+    first = [tuple(map(float, point.split(","))) for point in lines[0].get("points", "").split()]
+    assert len(first) == 21
+    assert first[0][0] < first[-1][0]
+    assert first[0][1] < first[-1][1]  # down the page
+    assert "a & b" in [text.text for text in tree.iter() if text.tag.endswith("text")]
+
+
+def test_a_film_shows_the_frames_around_the_loss(lost):
+    film = film_of(lost)
+    assert film.first == 3
+    assert film.length == 9
+    rows = [row for row, _ in film.pictures]
+    assert rows == [0, 3, 8, 11]
+    assert all(jpeg.startswith(b"\xff\xd8") for _, jpeg in film.pictures)
+
+
+def test_only_failures_are_shown_and_the_worst_first(sequence, found, lost):
+    good = run_of(sequence, np.where(np.isnan(sequence.boxes), np.nan, found))
+    half = run_of(sequence, np.where(np.arange(12)[:, None] < 9, good.boxes, lost.boxes))
+    assert worst([good, half, lost], 5) == [lost, half]
+    assert worst([half, lost], 1) == [lost]
+
+
+def test_the_report_needs_nothing_else(tmp_path, sequence, found, lost):
+    path = write_report(tmp_path / "report.html", [run_of(sequence, found, "mil"), lost], Settings(coreset_size=32))
+    page = path.read_text()
+    assert page.count("<svg") == 2
+    assert "data:image/jpeg;base64," in page
+    assert not re.search(r"(src|href)=\"(?!data:)|<script|@import|url\(", page)
+    assert "coreset_size = 32" in page
+    assert page.count("<tr") == 1 + 2 + 2
+
+
+def test_a_report_that_cannot_be_written_says_so(tmp_path, lost):
+    with pytest.raises(VideoError, match="cannot write the report"):
+        write_report(tmp_path / "missing" / "report.html", [lost], Settings())
+
+
+def test_the_command_prints_a_table_and_writes_all(tmp_path, walk):
+    out, file = tmp_path / "out", tmp_path / "numbers.json"
+    arguments = [str(walk), "--output", str(out), "--json", str(file), "--set", "coreset_size=32"]
+    result = CliRunner().invoke(evaluate, arguments, catch_exceptions=False)
+    assert result.exit_code == 0
+    assert re.search(r"walk +catstream +12 +0\.\d{3}", result.output)
+    assert "report.html" in result.output
+    assert json.loads(file.read_text())["mean"]["catstream"]["success"] > 0.7
+    assert (out / "report.html").exists()
+    assert (out / "catstream" / "walk.txt").exists()
+
+
+def test_the_command_shows_the_spread_over_several_starts(walk):
+    result = CliRunner().invoke(evaluate, [str(walk), "--starts", "2", "--tracker", "mil"], catch_exceptions=False)
+    assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", result.output)
+
+
+def test_the_help_names_every_tracker_and_measure():
+    text = CliRunner().invoke(evaluate, ["--help"]).output
+    for word in ("csrt", "kcf", "mil", "tld", "AUC", "success", "precision", "norm.", "F-score", "--starts 5"):
+        assert word in text
