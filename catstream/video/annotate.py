@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
 import cv2
 import numpy as np
 
-from catstream.errors import VideoError
 from catstream.messages import Track
+from catstream.video.writer import VideoWriter
 
 __all__ = ["AnnotatedVideo", "draw", "thumbnail"]
 
@@ -111,9 +110,7 @@ def _strip(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> None:
 class AnnotatedVideo:
     """An MP4 of frames with their tracks drawn in; a context manager.
 
-    H.264 where this FFmpeg can, else MPEG-4. The file gets its name when it is
-    closed and whole; until then it is NAME.part, and a run that wrote no frame
-    leaves nothing.
+    See `catstream.video.writer.VideoWriter`, which it writes with.
 
     Parameters
     ----------
@@ -128,49 +125,16 @@ class AnnotatedVideo:
     """
 
     def __init__(self, path: str | Path, rate: float, size: tuple[int, int]) -> None:
-        import av  # here, as only those who ask for a video pay for it
-
-        self.path = Path(path)
-        self._part = self.path.with_name(self.path.name + ".part")
-        self.frames = 0
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._container = av.open(str(self._part.absolute()), "w", format="mp4")
-        except (OSError, av.FFmpegError) as error:
-            raise VideoError(
-                f"cannot write the video {str(path)!r} ({error.strerror}): give a place that you may write to"
-            ) from None
-        h264 = "libx264" in av.codecs_available
-        self._stream: Any = self._container.add_stream(
-            "libx264" if h264 else "mpeg4",
-            rate=Fraction(rate).limit_denominator(60000),
-            options={"preset": "veryfast", "crf": "20"} if h264 else {"qscale": "3"},
-        )
-        self._stream.thread_count = 1  # the processes are the parallelism
-        self._stream.pix_fmt = "yuv420p"
         zoom = _zoom(size[0])
-        # Both encoders share colour between 2x2 pixels, so an odd side grows by one.
-        self._stream.width, self._stream.height = (side * zoom + side * zoom % 2 for side in size)
+        self._writer = VideoWriter(path, rate, (size[0] * zoom, size[1] * zoom))
 
     def write(self, image: np.ndarray, track: Track) -> None:
         """Add a frame, uint8 (h, w, 3) of the size announced, with its track."""
-        import av
-
-        canvas: Any = draw(image, track)
-        down, across = self._stream.height - canvas.shape[0], self._stream.width - canvas.shape[1]
-        canvas = cv2.copyMakeBorder(canvas, 0, down, 0, across, cv2.BORDER_REPLICATE)
-        self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(canvas, format="bgr24")))
-        self.frames += 1
+        self._writer.write(draw(image, track))
 
     def close(self) -> None:
         """Finish the file and give it its name."""
-        if self.frames:
-            self._container.mux(self._stream.encode(None))
-        self._container.close()
-        if self.frames:
-            self._part.replace(self.path)
-        else:
-            self._part.unlink(missing_ok=True)
+        self._writer.close()
 
     def __enter__(self) -> Self:
         return self
