@@ -8,14 +8,16 @@ the picture and comes back elsewhere. The same arguments give the same pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from catstream.box import Box
+from catstream.video.writer import VideoWriter
 
-__all__ = ["FRAMES", "RATE", "SIZE", "render"]
+__all__ = ["FRAMES", "RATE", "SIZE", "render", "write"]
 
 #: Frames of the whole story, frames a second, and pixels (width, height) of the full size.
 FRAMES, RATE, SIZE = 600, 30.0, (640, 480)
@@ -107,6 +109,40 @@ def render(
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
             box = box and Box(box.x * across, box.y * down, box.w * across, box.h * down)
         yield image, box
+
+
+def write(
+    folder: Path,
+    frames: int = FRAMES,
+    size: tuple[int, int] = SIZE,
+    done: Callable[[int], None] = lambda _: None,
+) -> tuple[Path, list[Box | None]]:
+    """Render into a folder: demo.mp4 and groundtruth_rect.txt, as `catstream evaluate` reads them.
+
+    Parameters
+    ----------
+    folder : where; made if it is not there
+    frames, size : see `render`
+    done : called with the number of frames written so far
+
+    Returns
+    -------
+    the video, and the object's box in each frame, None where it is absent
+
+    Raises
+    ------
+    VideoError
+        Where the folder cannot be written to.
+    """
+    path, truth = folder / "demo.mp4", []
+    with VideoWriter(path, RATE, size) as video:
+        for image, box in render(frames, size):
+            video.write(image)
+            truth.append(box)
+            done(len(truth))
+    lines = ("nan,nan,nan,nan" if box is None else ",".join(f"{value:.3f}" for value in box) for box in truth)
+    (folder / "groundtruth_rect.txt").write_text("\n".join(lines) + "\n", encoding="ascii")
+    return path, truth
 
 
 class _Stage:

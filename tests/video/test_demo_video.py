@@ -7,7 +7,8 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from catstream.video.demo import FRAMES, render
+from catstream.video.demo import FRAMES, render, write
+from catstream.video.source import open_source
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +69,14 @@ def test_a_longer_video_turns_back_without_a_jump(film):
     longer = list(islice(render(FRAMES + 4, (160, 120)), FRAMES, None))
     for step, (_, box) in enumerate(longer):
         assert box == film[FRAMES - 2 - step][1]
+
+
+def test_the_video_lies_beside_its_truth(tmp_path):
+    steps: list[int] = []
+    path, truth = write(tmp_path / "demo", 4, (160, 120), done=steps.append)
+    assert steps == [1, 2, 3, 4]
+    with open_source(tmp_path / "demo") as source:
+        assert (source.name, source.size, source.rate) == ("demo", (160, 120), 30)
+        assert sum(1 for _ in source) == len(truth) == 4
+    rows = np.loadtxt(path.with_name("groundtruth_rect.txt"), delimiter=",")
+    np.testing.assert_allclose(rows, np.array(truth, float), atol=1e-3)
