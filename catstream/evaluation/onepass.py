@@ -11,14 +11,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from catstream.box import Box
 from catstream.errors import ServiceError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.peers import PEERS, Peer
+from catstream.evaluation.peers import PEERS, Peer, one_thread
 from catstream.evaluation.runs import Run, claim, label, load, save
 from catstream.settings import Settings
 from catstream.tracker import Tracker
@@ -126,15 +125,14 @@ def evaluate(
 
 def _work(tasks: list[Any], jobs: int) -> Iterator[Run]:
     if jobs == 1:
-        with threadpool_limits(1):
-            yield from (follow(*task) for task in tasks)
+        yield from (_follow(*task) for task in tasks)
         return
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_alone) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_end_quietly) as pool:
         try:
             # Long ones first, so that none is left running alone at the end.
             tasks = sorted(tasks, key=lambda task: task[3] - len(task[2]))
-            for future in as_completed([pool.submit(follow, *task) for task in tasks]):
+            for future in as_completed([pool.submit(_follow, *task) for task in tasks]):
                 yield future.result()
         except BrokenProcessPool:
             raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
@@ -142,11 +140,15 @@ def _work(tasks: list[Any], jobs: int) -> Iterator[Run]:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _alone() -> None:
-    """A worker: the processes are the parallelism, and Ctrl-C ends it without a word."""
+def _follow(*task: Any) -> Run:
+    """`follow` on one core: all trackers run under the same conditions, and the jobs are the parallelism."""
+    with threadpool_limits(1), one_thread():
+        return follow(*task)
+
+
+def _end_quietly() -> None:
+    """Ctrl-C reaches the workers too; the parent is the one that speaks."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threadpool_limits(1)
-    cv2.setNumThreads(1)
 
 
 def _check(sequences: list[Sequence], trackers: list[str]) -> None:

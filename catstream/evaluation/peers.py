@@ -6,7 +6,8 @@ OpenCV 4: `pip install "catstream[peers]"`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import cv2
@@ -15,7 +16,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.errors import SettingsError
 
-__all__ = ["PEERS", "Peer"]
+__all__ = ["PEERS", "Peer", "one_thread"]
 
 #: Name on the command line -> class in OpenCV.
 PEERS = {"csrt": "TrackerCSRT", "kcf": "TrackerKCF", "mil": "TrackerMIL", "tld": "TrackerTLD"}
@@ -58,3 +59,14 @@ def _find(name: str) -> Callable[[], Any]:
         f"OpenCV {cv2.__version__} has no tracker {name!r}: install the contrib modules of OpenCV 4, "
         'pip install "catstream[peers]"'
     )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold OpenCV to one thread inside a `with`."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
