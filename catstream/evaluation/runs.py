@@ -101,8 +101,8 @@ def claim(output: Path, settings: Settings) -> None:
 
 def _files(output: Path, tracker: str, name: str) -> tuple[Path, Path, Path]:
     """Boxes, confidence and times of a run, in the VOT toolkit's layout."""
-    stem = output / tracker / "longterm" / name / f"{name}_001"
-    return tuple(stem.with_name(stem.name + end) for end in (".txt", "_confidence.value", "_time.value"))  # type: ignore[return-value]
+    folder, stem = output / tracker / "longterm" / name, f"{name}_001"
+    return folder / f"{stem}.txt", folder / f"{stem}_confidence.value", folder / f"{stem}_time.value"
 
 
 def save(output: Path, run: Run) -> None:

@@ -17,6 +17,7 @@ good frames come first and the `VideoError` after them.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -122,12 +123,15 @@ def open_source(text: str | Path, start: int = 0) -> Source:
         Where there is nothing, or nothing readable; says what was expected.
     """
     path = Path(text)
-    if path.is_dir():
-        return _folder(path, start)
-    if path.is_file():
-        return _video(path, start)
-    if re.search(r"%0?\d*d|[*?\[]", path.name):
-        return _images(path.parent.resolve().name, image_files(path), start)
+    try:
+        if path.is_dir():
+            return _folder(path, start)
+        if path.is_file():
+            return _video(path, start)
+        if re.search(r"%0?\d*d|[*?\[]", path.name):
+            return _images(path.parent.resolve().name, image_files(path), start)
+    except OSError as error:
+        raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {_HELP}") from None
     raise VideoError(f"there is no video or folder {str(text)!r}: {_HELP}")
 
 
@@ -233,12 +237,16 @@ def _good_frames(path: Path, container: Any, stream: Any, rate: float) -> Iterat
     import av
 
     count, last, problem = 0, None, ""
-    for packet, problem in _packets(container, stream):
-        try:
-            # After a break, the good frames that wait in the decoder for their turn.
-            frames = stream.codec_context.decode(None if problem else packet)
-        except av.FFmpegError as error:
-            frames, problem = [], problem or _reason(error)
+    for packet, problem in _packets(container, stream, rate):
+        frames: list[Any] = []
+        if not problem:
+            try:
+                frames = stream.codec_context.decode(packet)
+            except av.FFmpegError as error:
+                problem = _reason(error)
+        if problem:  # the good frames that wait in the decoder for their turn
+            with contextlib.suppress(av.FFmpegError):
+                frames = stream.codec_context.decode(None)
         for frame in frames:
             late = last is not None and frame.pts is not None and (frame.pts - last) * stream.time_base * rate > 1.5
             if frame.is_corrupt or (problem and late):
@@ -251,7 +259,7 @@ def _good_frames(path: Path, container: Any, stream: Any, rate: float) -> Iterat
             raise VideoError(f"{str(path)!r} breaks at frame {count} ({problem}): the frames before are good")
 
 
-def _packets(container: Any, stream: Any) -> Iterator[tuple[Any, str]]:
+def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, str]]:
     """Packets up to and with the empty one at the end, and what is wrong, the empty text for nothing."""
     import av
 
@@ -264,7 +272,7 @@ def _packets(container: Any, stream: Any) -> Iterator[tuple[Any, str]]:
             yield None, _reason(error)
             return
         if packet.dts is None and not packet.size:
-            short = stated - end > _SHORT_SECONDS
+            short = stated - end > max(_SHORT_SECONDS, 2 / rate)
             yield packet, f"it says it lasts {stated:.1f} s, and ends at {end:.1f} s" if short else ""
             return
         if packet.pts is not None:
