@@ -1,0 +1,43 @@
+"""catstream learns to follow one object in a video stream, from a single box, on a CPU.
+
+    import catstream
+
+    with catstream.Pipeline("walk.mp4", (120, 80, 64, 48)) as pipeline:
+        for track in pipeline:
+            print(track.frame, track.state, track.box, track.score)
+
+In one process, frame by frame: `catstream.Tracker`, used like a `cv2.Tracker`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from catstream.box import Box
+    from catstream.errors import CatstreamError
+    from catstream.messages import Track
+    from catstream.pipeline import Pipeline
+    from catstream.settings import Settings
+    from catstream.tracker import Tracker
+
+__all__ = ["Box", "CatstreamError", "Pipeline", "Settings", "Track", "Tracker", "__version__"]
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Box": "box",
+    "CatstreamError": "errors",
+    "Pipeline": "pipeline",
+    "Settings": "settings",
+    "Track": "messages",
+    "Tracker": "tracker",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name when it is first used: a process loads only what it needs."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'catstream' has no attribute {name!r}")
+    return getattr(import_module(f"catstream.{_HOMES[name]}"), name)

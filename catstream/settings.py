@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import os
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -181,6 +182,16 @@ class Settings:
     def values(self) -> dict[str, Any]:
         """All of them, by name."""
         return dataclasses.asdict(self)
+
+    def changed(self) -> list[str]:
+        """Those that differ from their default, as `load` takes them.
+
+        >>> Settings(lockstep=True, coreset_size=32).changed()
+        ['lockstep=true', 'coreset_size=32']
+        """
+        pairs = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
+        texts = ((field, value if isinstance(value, str) else json.dumps(value)) for field, value in pairs)
+        return [f"{field.name}={text}" for field, text in texts if getattr(self, field.name) != field.default]
 
 
 #: What the paper set, and other points of departure, by name.

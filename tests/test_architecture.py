@@ -38,9 +38,8 @@ HOMES = {
     "zmq": ["catstream/wire/sockets.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
-    "click": ["catstream/cli", "services/__main__.py"],
+    "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "rich": ["catstream/cli"],
-    "threadpoolctl": ["services/loop.py"],
 }
 
 #: Libraries that take long to import: inside the function that needs them.

@@ -1,0 +1,53 @@
+"""The command line: a file a verb. Arguments and printing, no algorithm."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+import click
+
+from catstream import __version__
+from catstream.errors import CatstreamError
+
+__all__ = ["main"]
+
+#: Verb -> what it does. Its module is imported only when it is called: some take long.
+VERBS = {
+    "track": "Follow an object through a video.",
+    "demo": "See it work, on a video that is rendered for it.",
+    "evaluate": "Measure accuracy on annotated sequences, beside other trackers.",
+    "settings": "List all settings, with their defaults and meaning.",
+}
+
+
+class _Verbs(click.Group):
+    def list_commands(self, _: click.Context) -> list[str]:
+        return list(VERBS)
+
+    def get_command(self, _: click.Context, name: str) -> click.Command | None:
+        return getattr(import_module(f"catstream.cli.{name}"), name) if name in VERBS else None
+
+    def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Verbs"):
+            formatter.write_dl(list(VERBS.items()))
+
+
+@click.command(cls=_Verbs, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="catstream")
+def group() -> None:
+    """Learn to follow one object in a video stream, from a single box, on a CPU.
+
+    \b
+      catstream demo
+      catstream track walk.mp4 --box 120,80,64,48 --output out --video
+    """
+
+
+def main() -> None:
+    """Run the command line: one line for an error, and exit code 1."""
+    try:
+        group(prog_name="catstream")
+    except CatstreamError as error:
+        click.echo(f"catstream: {error}", err=True)
+        sys.exit(1)

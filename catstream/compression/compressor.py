@@ -126,7 +126,9 @@ class Compressor:
             self._sampled_leaves, self._sampled_frame = facts["sampled"]  # type: ignore[misc]
             self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]
             for name, tree_facts in facts["trees"].items():  # type: ignore[attr-defined]
-                own = {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
+                own = {
+                    key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")
+                }
                 self.trees[name] = CoresetTree.from_state(own, tree_facts)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): take an older copy") from None

@@ -199,7 +199,9 @@ class CoresetTree:
             tree.pending = arrays["pending"]
             tree._check()
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ProtocolError(f"not the state of a coreset tree ({error!r}): take an older copy of the file") from None
+            raise ProtocolError(
+                f"not the state of a coreset tree ({error!r}): take an older copy of the file"
+            ) from None
         return tree
 
     def _push(self, node: Node) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from catstream import ridge
 from catstream.messages import Model
 from catstream.settings import Settings

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from catstream.box import Box
@@ -100,7 +102,7 @@ class Detector:
         height, width = image.shape[:2]
         x, y = found.box.centre
         box = found.box.centred(min(max(x, 0), width - 1), min(max(y, 0), height - 1))
-        growth = np.sqrt(box.area / self._box.area)
+        growth = math.sqrt(box.area / self._box.area)
         if found.score < settings.scale_score and 0.85 < growth < 1.2:
             box = box.scaled(1 / growth)
         else:

@@ -1,0 +1,1 @@
+"""The wire: what flows between the processes, in which bytes, over which sockets."""

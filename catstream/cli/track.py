@@ -1,0 +1,169 @@
+"""`catstream track`: follow an object through a video."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from catstream.box import Box
+from catstream.messages import Track
+from catstream.pipeline import Pipeline
+from catstream.services.options import with_settings
+from catstream.settings import Settings
+from catstream.video.results import ResultsWriter
+
+__all__ = ["track"]
+
+_INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
+
+
+@click.command()
+@click.argument("source")
+@click.option("--box", required=True, metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
+@click.option("--output", type=click.Path(path_type=Path), help="Folder for the results.")
+@click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
+@click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
+@with_settings
+def track(
+    settings: Settings,
+    source: str,
+    box: str,
+    output: Path | None,
+    video: bool,
+    lockstep: bool,
+) -> None:
+    """Follow an object through a video, from its box in the first frame.
+
+    SOURCE is a video file, a folder of images, or a pattern like
+    images/%05d.png. A detector, a compressor and a trainer run as processes
+    of their own; Ctrl-C ends them, and the results so far are kept.
+
+    \b
+    Writes
+      OUTPUT/NAME.txt               x,y,w,h a frame, nan where the object is absent
+      OUTPUT/NAME_confidence.value  the score a frame
+      OUTPUT/NAME_time.txt          seconds a frame
+      OUTPUT/tracks.csv             frame, seconds, state, box, score, model version
+      OUTPUT/NAME.mp4               with --video
+
+    \b
+    EXAMPLES
+      catstream track walk.mp4 --box 120,80,64,48 --output out --video
+      catstream track frames/ --box 120,80,64,48 --output out --set coreset_size=128
+      catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
+    """
+    if video and output is None:
+        raise click.UsageError("--video needs --output, the folder to write it to")
+    if lockstep:
+        settings = Settings.of({**settings.values(), "lockstep": True})
+    pipeline = Pipeline(source, Box.parse(box), settings)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    console = Console(stderr=True, soft_wrap=True)
+    run = _Run(pipeline)
+    interrupted = False
+    try:
+        with ExitStack() as stack:
+            stack.enter_context(pipeline)
+            progress = stack.enter_context(run.progress(console))
+            sinks = None
+            for found in pipeline:
+                # Not before there is something to write: a run that cannot start leaves older results alone.
+                sinks = sinks or _Sinks(stack, pipeline, source, output, video)
+                sinks.write(found)
+                run.show(progress, found)
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        if run.frames:
+            console.print(run.summary(output), highlight=False)
+    if interrupted:
+        console.print("stopped: the results so far are kept")
+        sys.exit(_INTERRUPTED)
+
+
+class _Sinks:
+    """Where tracks go: results files, and a video of the same frames read once more."""
+
+    def __init__(self, stack: ExitStack, pipeline: Pipeline, source: str, output: Path | None, video: bool) -> None:
+        self._results = stack.enter_context(ResultsWriter(output, pipeline.name)) if output is not None else None
+        self._video: Any = None
+        self._moment = time.perf_counter()
+        if video and output is not None:
+            from catstream.video.annotate import AnnotatedVideo
+            from catstream.video.source import open_source
+
+            self._frames = stack.enter_context(open_source(source))
+            path = output / f"{pipeline.name}.mp4"
+            self._video = stack.enter_context(AnnotatedVideo(path, pipeline.rate, pipeline.size))
+
+    def write(self, found: Track) -> None:
+        moment = time.perf_counter()
+        if self._results is not None:
+            self._results.write(found, moment - self._moment)
+        self._moment = moment
+        if self._video is not None:
+            self._video.write(next(self._frames).image, found)
+
+
+class _Run:
+    """What a person wants to see of a run, while it goes on and afterwards."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline = pipeline
+        self._started = time.perf_counter()
+        self._first = 0.0
+        self._shown = 0.0
+        self.frames = self.present = 0
+        self.version = 0
+
+    def progress(self, console: Console) -> Progress:
+        columns = (
+            TextColumn("{task.fields[state]:13}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[line]}"),
+        )
+        progress = Progress(*columns, console=console, transient=True, refresh_per_second=8)
+        self._task = progress.add_task("", total=self._pipeline.frames, state="starting", line="")
+        return progress
+
+    def show(self, progress: Progress, found: Track) -> None:
+        now = time.perf_counter()
+        if not self.frames:
+            self._first = now - self._started
+        self.frames += 1
+        self.present += found.box is not None
+        self.version = found.model_version
+        if now - self._shown < 0.1:
+            return
+        self._shown = now
+        leaves = self._pipeline.health.get("compressor", {}).get("leaves", 0)
+        line = (
+            f"{self._rate(now):.0f} frames/s   score {found.score:+.2f}   "
+            f"model {found.model_version}   {leaves:.0f} leaves in the trees"
+        )
+        progress.update(self._task, completed=self.frames, state=found.state, line=line)
+
+    def summary(self, output: Path | None) -> str:
+        lines = [
+            f"{self.frames} frames, present in {self.present}, {self._rate(time.perf_counter()):.0f} frames/s, "
+            f"first track after {self._first:.2f} s, model version {self.version}"
+        ]
+        if totals := self._pipeline.totals:
+            lines.append(f"features: {totals['sent']} messages sent, {totals['stored']} stored in the coreset trees")
+        if self._pipeline.restarts:
+            lines.append(f"processes restarted: {self._pipeline.restarts}")
+        if output is not None:
+            lines.append(f"results: {output}")
+        return "\n".join(lines)
+
+    def _rate(self, now: float) -> float:
+        return (self.frames - 1) / max(now - self._started - self._first, 1e-9)

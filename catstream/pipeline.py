@@ -1,0 +1,138 @@
+"""The pipeline: detector, compressor and trainer as processes of this machine, and their tracks in order.
+
+with catstream.Pipeline("walk.mp4", (120, 80, 64, 48)) as pipeline:
+    for track in pipeline:
+        print(track.frame, track.state, track.box)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Self
+
+from catstream.box import Box
+from catstream.errors import ServiceError, VideoError
+from catstream.messages import End, Health, Position, Track
+from catstream.services.supervisor import Supervisor
+from catstream.settings import Settings
+from catstream.video.source import open_source
+from catstream.wire.endpoint import meeting_place, private_folder
+from catstream.wire.sockets import Receiver, Subscriber
+
+__all__ = ["Pipeline"]
+
+_CHECK_SECONDS = 0.1
+_FAREWELL_SECONDS = 12.0
+
+
+class Pipeline:
+    """Runs the processes while it is open; iterate it for one `Track` a frame, none missing.
+
+    A process that dies is restarted, and the run goes on. Who takes tracks slowly slows a
+    file down: the detector waits.
+
+    Parameters
+    ----------
+    source : a video file, a folder of images, a pattern: see `catstream.video.source`
+    box : x, y, w, h of the object in the first frame, in pixels
+    settings : all defaults where None
+
+    Attributes
+    ----------
+    name, frames, rate, size : of the source, as `catstream.video.source.Source` has them
+
+    Raises
+    ------
+    BoxError, VideoError
+        From the constructor, for a box that is not in the frame or a source that cannot be read.
+    ServiceError
+        On entering, where the endpoint is in use. While iterating, where a process cannot be kept alive.
+    VideoError
+        While iterating, where the source breaks, after its last good frame.
+    """
+
+    def __init__(self, source: str, box: Sequence[float], settings: Settings | None = None) -> None:
+        self.settings = settings or Settings()
+        self._source, self._box = str(source), Box(*map(float, box))
+        self._end: End | None = None
+        self._health: dict[str, Health] = {}
+        with open_source(self._source) as first:
+            self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
+        self._box.inside(*self.size)
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            folder = stack.enter_context(private_folder())
+            endpoint = stack.enter_context(meeting_place(self.settings.endpoint, folder))
+            self.endpoint = str(endpoint)
+            self._results = stack.enter_context(Receiver("results", endpoint, Position(), self.settings.window))
+            self._reports = stack.enter_context(Subscriber("health", endpoint))
+            settings = replace(self.settings, endpoint=self.endpoint)
+            self._supervisor = Supervisor(self._source, self._box, settings, folder, owned=True)
+            stack.callback(self._supervisor.stop)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def __iter__(self) -> Iterator[Track]:
+        checked = 0.0
+        while self._end is None:
+            message = self._results.receive(_CHECK_SECONDS)
+            if isinstance(message, Track):
+                self._results.acknowledge(Position(message.seq, message.frame, message.box or self._box))
+                self._box = message.box or self._box
+                yield message
+            elif isinstance(message, End):
+                self._results.acknowledge(Position(message.seq))
+                self._end = message
+            if time.monotonic() - checked > _CHECK_SECONDS:
+                checked = time.monotonic()
+                self._watch()
+        self._wait()
+        if self._end.failed:
+            raise VideoError(self._end.reason)
+
+    @property
+    def totals(self) -> dict[str, int]:
+        """At the end: how many features were `sent`, and `stored` in the coreset trees."""
+        return {name: int(value) for name, value in self._end.totals.items()} if self._end else {}
+
+    @property
+    def health(self) -> dict[str, dict[str, float]]:
+        """The latest counters of each process, by its name."""
+        self._listen()
+        return {name: health.counters for name, health in self._health.items()}
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process id by name."""
+        return self._supervisor.pids
+
+    @property
+    def restarts(self) -> int:
+        """How often a process died and was restarted."""
+        return self._supervisor.restarts
+
+    def _watch(self) -> None:
+        self._listen()
+        self._supervisor.check()
+        if self._supervisor.finished:
+            raise ServiceError("the processes ended before the video did: this should not happen, please report it")
+
+    def _listen(self) -> None:
+        for health in self._reports.waiting():
+            self._health[health.process] = health
+
+    def _wait(self) -> None:
+        """For the others to take in the last messages, and end."""
+        deadline = time.monotonic() + _FAREWELL_SECONDS
+        while not self._supervisor.finished and time.monotonic() < deadline:
+            self._listen()
+            self._supervisor.check()
+            time.sleep(0.01)
+        self._listen()

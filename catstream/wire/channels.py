@@ -1,0 +1,70 @@
+"""The channels: what flows between the processes, from whom to whom, and what a slow reader does to it.
+
+    features   every message arrives exactly once: acknowledged, and sent again to a restarted receiver
+    samples    the newest counts, an older one is stale; who comes late gets the last one at once
+    models     as samples
+    tracks     every message, to any number of readers; a slow one loses some, and sees by `seq` how many
+    results    the tracks once more, acknowledged: for the one process that started the pipeline
+    health     the newest of each process
+
+The receiver of an acknowledged channel binds its address, and so does the sender of any other;
+the rest connect, in any order. See `catstream.wire.endpoint` for what the addresses are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from catstream.messages import End, Features, Health, Model, Sample, Track
+
+__all__ = ["CHANNELS", "PORT", "Channel"]
+
+#: The port of the first channel, by default.
+PORT = 5700
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One row of the table.
+
+    name       the plural of what flows
+    messages   kinds that it carries
+    senders    processes that send
+    receiver   the one process that every message is for, or None: whoever wants them
+    keeps      "every" message, or the "newest"
+    port       offset from the first port; each further sender takes the next one
+    megabytes  size of the largest message
+    """
+
+    name: str
+    messages: tuple[type, ...]
+    senders: tuple[str, ...]
+    receiver: str | None
+    keeps: Literal["every", "newest"]
+    port: int
+    megabytes: int
+
+    @property
+    def acknowledged(self) -> bool:
+        """Whether each message is held until its receiver has stored it."""
+        return self.receiver is not None
+
+    @property
+    def limit(self) -> int:
+        """Bytes of the largest message."""
+        return self.megabytes << 20
+
+
+#: THE TABLE.
+CHANNELS: dict[str, Channel] = {
+    channel.name: channel
+    for channel in (
+        Channel("features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=64),
+        Channel("samples", (Sample, End), ("compressor",), None, "newest", port=1, megabytes=512),
+        Channel("models", (Model,), ("trainer",), None, "newest", port=2, megabytes=1),
+        Channel("tracks", (Track, End), ("detector",), None, "every", port=3, megabytes=1),
+        Channel("results", (Track, End), ("detector",), "owner", "every", port=4, megabytes=1),
+        Channel("health", (Health,), ("detector", "compressor", "trainer"), None, "newest", port=5, megabytes=1),
+    )
+}

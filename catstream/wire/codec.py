@@ -1,0 +1,186 @@
+"""Messages to bytes and back; nothing that arrives is believed before it is checked.
+
+A message is one frame of msgpack, `[version, kind, fields]`:
+
+    version   1; another one is refused
+    kind      name of the message in small letters: "features", "track" ...
+    fields    map from each field's name to its value, see `catstream.messages`
+    a box     [x, y, w, h]
+    an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
+
+Every size has a limit before memory is taken for it; then types, shapes, dtypes and ranges are
+checked, and every number is finite. A field that this version does not know is ignored.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import msgpack
+import msgspec
+import numpy as np
+
+from catstream.box import Box
+from catstream.errors import ProtocolError
+from catstream.messages import End, Features, Health, Model, Motion, Position, Sample, Stored, Summary, Track
+
+__all__ = ["KINDS", "VERSION", "decode", "encode"]
+
+#: Of the envelope and of what the fields mean.
+VERSION = 1
+
+#: Kinds of message, by their name on the wire.
+KINDS: dict[str, type] = {
+    kind.__name__.lower(): kind for kind in (End, Features, Health, Model, Position, Sample, Stored, Track)
+}
+
+_F32, _F64 = np.dtype("<f4"), np.dtype("<f8")
+
+#: Of each array: its dtype and shape. A letter stands for the same length throughout a message.
+_ARRAYS: dict[type, dict[str, tuple[np.dtype, tuple[int | str, ...]]]] = {
+    Features: {"rows": (_F32, ("k", "d")), "labels": (_F32, ("k",)), "weights": (_F32, ("k",))},
+    Summary: {"rows": (_F32, ("r", "d")), "mean": (_F32, ("d",))},
+    Sample: {"centres": (_F64, ("m", 2))},
+    Motion: {"process": (_F64, (4, 4)), "observation": (_F64, (2, 2))},
+    Model: {"weights": (_F32, ("d",))},
+}
+
+#: Arrays in which NaN has a meaning.
+_MAY_BE_NAN = {(Sample, "centres")}
+
+_LONGEST_TEXT = 4096  # bytes
+_LONGEST_LIST = 256  # entries of a list or map: levels of a tree, counters
+_LARGEST_INTEGER = 2**53  # so that a reader in any language holds it exactly
+
+
+def encode(message: Any) -> bytes:
+    """A message as bytes.
+
+    Raises
+    ------
+    ProtocolError
+        Where it is not what its kind promises: it would be refused on arrival.
+    """
+    _check(message)
+    return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
+
+
+def decode(data: bytes | memoryview, *kinds: type) -> Any:
+    """The message in `data`, one of `kinds`. Arrays come read-only.
+
+    Raises
+    ------
+    ProtocolError
+        Where it is anything else; says what was expected and what came.
+    """
+    expected = " or ".join(sorted(kind.__name__.lower() for kind in kinds))
+    try:
+        envelope = msgpack.unpackb(
+            data,
+            object_pairs_hook=_unique,
+            max_bin_len=len(data),
+            max_str_len=_LONGEST_TEXT,
+            max_array_len=_LONGEST_LIST,
+            max_map_len=_LONGEST_LIST,
+            max_ext_len=0,
+        )
+    except (ValueError, msgpack.exceptions.UnpackException) as error:
+        raise ProtocolError(f"expected {expected}, got {len(data)} bytes that are not its msgpack: {error}") from None
+    if not isinstance(envelope, list) or len(envelope) != 3:
+        raise ProtocolError(f"expected {expected} as [version, kind, fields], got something else in msgpack")
+    version, name, fields = envelope
+    if version != VERSION:
+        raise ProtocolError(f"expected version {VERSION} of the protocol, got {version!r:.40}: run the same catstream")
+    kind = KINDS.get(name) if isinstance(name, str) else None
+    if kind not in kinds:
+        raise ProtocolError(f"expected {expected}, got {name!r:.40}")
+    try:
+        message = msgspec.convert(fields, kind, dec_hook=_array)
+    except msgspec.ValidationError as error:
+        raise ProtocolError(f"{name}: {error}") from None
+    _check(message)
+    return message
+
+
+def _plain(value: Any) -> Any:
+    """How an array travels."""
+    if isinstance(value, np.ndarray):
+        array = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
+        return {"dtype": array.dtype.str, "shape": array.shape, "data": array.data.cast("B") if array.size else b""}
+    raise TypeError(f"{type(value).__name__} does not travel")
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
+
+
+class _Array(msgspec.Struct, forbid_unknown_fields=True):
+    dtype: str
+    shape: list[int]
+    data: bytes
+
+
+def _array(_: type, value: Any) -> np.ndarray:
+    """The array that `_plain` described."""
+    plain = msgspec.convert(value, _Array)
+    if plain.dtype not in ("<f4", "<f8") or not 1 <= len(plain.shape) <= 2 or min(plain.shape) < 0:
+        raise ValueError(f"an array of {plain.dtype:.20} and shape {plain.shape} does not travel")
+    dtype = np.dtype(plain.dtype)
+    if math.prod(plain.shape) * dtype.itemsize != len(plain.data):
+        raise ValueError(f"{len(plain.data)} bytes are not an array of {plain.dtype} and shape {plain.shape}")
+    return np.frombuffer(plain.data, dtype).reshape(plain.shape)
+
+
+def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        raise ValueError("a name comes twice in a map")
+    return fields
+
+
+def _check(message: Any) -> None:
+    """Raise ProtocolError unless every field of a message keeps its promise."""
+    lengths: dict[str, int] = {}
+    for field in dataclasses.fields(message):
+        value = getattr(message, field.name)
+        where = f"{type(message).__name__.lower()} {field.name}"
+        if isinstance(value, np.ndarray):
+            _check_array(value, type(message), field.name, where, lengths)
+        elif dataclasses.is_dataclass(value):
+            _check(value)
+        else:
+            _check_numbers(value, where)
+    if isinstance(message, Features):
+        labels, weights = message.labels, message.weights
+        if len(labels) and not (labels.min() >= 0 and labels.max() <= 1 and weights.min() > 0):
+            raise ProtocolError("features: expected labels from 0 to 1 and weights above 0")
+    if isinstance(message, Sample):
+        widths = [len(tree.mean) for tree in (message.object, message.background, message.loss)]
+        if widths != [widths[0], widths[0], widths[0] + 2]:
+            raise ProtocolError(f"sample: expected trees of d, d and d + 2 columns, got {widths}")
+
+
+def _check_array(array: np.ndarray, kind: type, name: str, where: str, lengths: dict[str, int]) -> None:
+    dtype, shape = _ARRAYS[kind][name]
+    if array.ndim == len(shape):
+        expected = tuple(
+            lengths.setdefault(side, length) if isinstance(side, str) else side
+            for side, length in zip(shape, array.shape, strict=True)
+        )
+    if array.ndim != len(shape) or array.shape != expected or array.dtype != dtype:
+        letters = ", ".join(map(str, shape))
+        raise ProtocolError(f"{where}: expected {dtype} ({letters}), got {array.dtype} {array.shape} with {lengths}")
+    if (kind, name) not in _MAY_BE_NAN and not np.isfinite(array).all():
+        raise ProtocolError(f"{where}: holds numbers that are not finite")
+
+
+def _check_numbers(value: Any, where: str) -> None:
+    if isinstance(value, Box) and not (value.w > 0 and value.h > 0):
+        raise ProtocolError(f"{where}: expected a width and a height above 0, got {value}")
+    numbers = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
+    for number in numbers:
+        if isinstance(number, float) and not math.isfinite(number):
+            raise ProtocolError(f"{where}: expected a finite number, got {number}")
+        if isinstance(number, int) and not 0 <= number <= _LARGEST_INTEGER:
+            raise ProtocolError(f"{where}: expected a whole number from 0 to 2**53, got {number}")

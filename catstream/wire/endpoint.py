@@ -1,0 +1,162 @@
+"""Endpoints: the one place where the processes of a pipeline meet, and the address of each channel there.
+
+A folder holds a Unix socket a channel, for this user alone: `FOLDER/features`. Or, from
+`tcp://127.0.0.1:5700` on, each channel takes a port, as its row in the table says.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import ipaddress
+import os
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from catstream.errors import ServiceError
+from catstream.wire.channels import CHANNELS, Channel
+
+__all__ = ["Endpoint", "meeting_place", "private_folder"]
+
+_LONGEST_PATH = 107  # bytes that the kernel takes for the name of a Unix socket
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where the processes meet: a folder, or a host and its first port.
+
+    >>> Endpoint.parse("tcp://localhost:5700").address(CHANNELS["models"])
+    'tcp://127.0.0.1:5702'
+    >>> Endpoint.parse("run").address(CHANNELS["health"], "trainer")
+    'ipc://run/health-trainer'
+    """
+
+    folder: Path | None = None
+    host: str = ""
+    port: int = 0
+
+    def __str__(self) -> str:
+        """As the setting `endpoint` says it."""
+        return str(self.folder) if self.folder is not None else f"tcp://{self.host}:{self.port}"
+
+    @classmethod
+    def parse(cls, text: str) -> Endpoint:
+        """Read the setting `endpoint`.
+
+        Raises
+        ------
+        ServiceError
+            Where it is neither, or a host that others can reach.
+        """
+        if not text:
+            raise ServiceError("this process was not told where to meet the others: --set endpoint=FOLDER")
+        if text.startswith("tcp://"):
+            return cls._tcp(text)
+        if "://" in text:
+            raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT, got {text!r}")
+        folder = Path(text)
+        for channel in CHANNELS.values():
+            for sender in channel.senders:
+                if len(os.fsencode(folder / _file(channel, sender))) > _LONGEST_PATH:
+                    raise ServiceError(f"the name of the folder {text!r} is too long for a Unix socket: give another")
+        return cls(folder=folder)
+
+    @classmethod
+    def _tcp(cls, text: str) -> Endpoint:
+        last = max(channel.port + len(channel.senders) for channel in CHANNELS.values()) - 1
+        try:
+            parts = urlsplit(text)
+            host, port = parts.hostname or "", parts.port or 0
+        except ValueError:
+            host, port = "", 0
+        if not host or not 1 <= port <= 65535 - last or parts.path:
+            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
+        host = "127.0.0.1" if host == "localhost" else host
+        try:
+            private = ipaddress.ip_address(host).is_loopback
+        except ValueError:
+            private = False
+        if not private:
+            raise ServiceError(
+                f"{text} can be reached from other machines, and nothing on it asks who is there: "
+                "give a folder, or tcp://127.0.0.1:PORT (between machines, through an ssh tunnel)"
+            )
+        return cls(host=f"[{host}]" if ":" in host else host, port=port)
+
+    def address(self, channel: Channel, sender: str | None = None) -> str:
+        """Of a channel, as ZeroMQ takes it; of the given sender where there are several."""
+        sender = sender or channel.senders[0]
+        if self.folder is not None:
+            return f"ipc://{self.folder / _file(channel, sender)}"
+        return f"tcp://{self.host}:{self.port + channel.port + channel.senders.index(sender)}"
+
+    def taken(self, channel: Channel, sender: str | None = None) -> bool:
+        """Whether a process listens at a channel's Unix socket: ZeroMQ would push it aside, and not say so."""
+        if self.folder is None:
+            return False
+        with socket.socket(socket.AF_UNIX) as knock:
+            return knock.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
+
+
+def _file(channel: Channel, sender: str) -> str:
+    return channel.name if len(channel.senders) == 1 else f"{channel.name}-{sender}"
+
+
+@contextlib.contextmanager
+def private_folder() -> Iterator[Path]:
+    """A fresh folder that only this user may enter, gone afterwards."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    folder = Path(tempfile.mkdtemp(prefix="catstream-", dir=runtime if os.access(runtime, os.W_OK) else None))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def meeting_place(text: str, default: Path) -> Iterator[Endpoint]:
+    """The endpoint for one pipeline, held for it alone; afterwards no socket file is left.
+
+    Parameters
+    ----------
+    text : the setting `endpoint`
+    default : the folder to use where that is empty
+
+    Raises
+    ------
+    ServiceError
+        Where another pipeline is there, or other users could be.
+    """
+    endpoint = Endpoint.parse(text or str(default))
+    if endpoint.folder is None:  # the kernel gives a port to one process only
+        yield endpoint
+        return
+    folder = endpoint.folder.absolute()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise ServiceError(f"the processes cannot meet in {text!r} ({error.strerror}): give another folder") from None
+    try:
+        facts = os.fstat(handle)
+        if facts.st_uid != os.geteuid() or facts.st_mode & 0o022:
+            raise ServiceError(f"other users may write to {text!r}: give a folder of your own, chmod 700")
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ServiceError(
+                f"a pipeline is already running on {text!r}: wait for it, or give another folder (--set endpoint=FOLDER)"
+            ) from None
+        try:
+            yield Endpoint.parse(str(folder))
+        finally:
+            for channel in CHANNELS.values():
+                for sender in channel.senders:
+                    (folder / _file(channel, sender)).unlink(missing_ok=True)
+    finally:
+        os.close(handle)

@@ -1,0 +1,291 @@
+"""Sockets: senders and receivers of a channel, and the only place that knows ZeroMQ.
+
+An acknowledged channel (`Sender`, `Receiver`) loses nothing. The sender keeps every message
+until the receiver says that it is stored, at most `window` of them. A receiver that finds one
+missing, or that is new, answers with its `Position`; the sender goes on from there, whatever
+was on the way. A sender that hears nothing asks again. So either side may die, and the
+messages are still taken once each, in order.
+
+The other channels (`Publisher`, `Subscriber`) never wait for a reader. Where the newest
+counts, the last message is sent again to everyone who comes late, so that a reader must
+take the same message twice calmly.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from time import monotonic
+from typing import Any, Self
+
+import zmq
+
+from catstream.errors import ProtocolError, ServiceError
+from catstream.messages import Position, Stored
+from catstream.wire.channels import CHANNELS, Channel
+from catstream.wire.codec import decode, encode
+from catstream.wire.endpoint import Endpoint
+
+__all__ = ["Publisher", "Receiver", "Sender", "Subscriber"]
+
+_HELLO = b""
+_PATIENCE = 0.2  # seconds of silence after which a sender asks where the receiver is
+_LINGER = 2000  # milliseconds that a closed socket still has for its last messages
+_TRACKS = 1000  # messages that a slow reader of a channel that keeps every message may fall behind
+
+_log = logging.getLogger(__name__)
+
+
+class _Socket:
+    """One ZeroMQ socket with limits on everything that could grow."""
+
+    def __init__(self, kind: int, channel: str, endpoint: Endpoint, depth: int) -> None:
+        self.channel: Channel = CHANNELS[channel]
+        self.refused = 0  #: messages that were dropped because they were not what the channel carries
+        self._endpoint = endpoint
+        self._socket = zmq.Context.instance().socket(kind)
+        self._socket.linger = _LINGER
+        self._socket.sndhwm = self._socket.rcvhwm = depth
+        self._socket.maxmsgsize = self.channel.limit
+        # A peer that froze, or a host that went away, is noticed.
+        self._socket.heartbeat_ivl, self._socket.heartbeat_timeout = 1000, 5000
+        self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 20, 500
+
+    def _bind(self, sender: str | None = None) -> None:
+        address = self._endpoint.address(self.channel, sender)
+        try:
+            if self._endpoint.taken(self.channel, sender):
+                raise zmq.ZMQError(zmq.EADDRINUSE)
+            self._socket.bind(address)
+        except zmq.ZMQError as error:
+            self._socket.close(linger=0)
+            raise ServiceError(
+                f"cannot listen on {address} ({error.strerror}): another pipeline may be running there, "
+                "wait for it or give another endpoint (--set endpoint=...)"
+            ) from None
+
+    def _connect(self) -> None:
+        for sender in self.channel.senders:
+            self._socket.connect(self._endpoint.address(self.channel, sender))
+
+    def _decode(self, data: bytes | memoryview, *kinds: type) -> Any:
+        """The message, or None for what a stranger sent: counted, said once, dropped."""
+        try:
+            return decode(data, *kinds)
+        except ProtocolError as error:
+            self.refused += 1
+            if self.refused == 1:
+                _log.warning("%s: a message was dropped: %s", self.channel.name, error)
+            return None
+
+    def _wait(self, seconds: float) -> bool:
+        return bool(self._socket.poll(max(0, round(seconds * 1000))))
+
+    def close(self) -> None:
+        """Send what is on its way, then close."""
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Sender(_Socket):
+    """The sending side of an acknowledged channel.
+
+    sent     newest seq that was given to `send`
+    stored   newest seq that survives the receiver's death
+    taken    newest seq that the receiver has taken
+    version  newest sample that the receiver has made
+    """
+
+    def __init__(self, channel: str, endpoint: Endpoint, window: int) -> None:
+        super().__init__(zmq.DEALER, channel, endpoint, depth=window + 1)
+        self.sent = self.stored = self.taken = self.version = 0
+        self._window = window
+        self._waiting: deque[tuple[int, bytes]] = deque()  # not stored yet, oldest first
+        self._on_the_way = 0  # how many of them were handed to the socket
+        self._known = 0  # what the receiver had stored when this sender took over
+        self._heard = monotonic()
+        self._socket.immediate = True  # nothing is handed over before somebody is there
+        self._connect()
+
+    def position(self) -> Position | None:
+        """Ask once where the receiver is; None where it does not answer yet."""
+        self._say_hello()
+        if self._wait(_PATIENCE):
+            answer = self._decode(self._socket.recv(), Stored, Position)
+            return answer if isinstance(answer, Position) else None
+        return None
+
+    def resume(self, seq: int, known: int) -> None:
+        """Go on after message `seq` of a sender before this one, of which the receiver has stored `known`."""
+        self.sent = self.stored = self.taken = seq
+        self._known = known
+
+    def send(self, message: Any) -> bool:
+        """Send a message with the next seq, without waiting; False where the window is full."""
+        self.listen(0)
+        if len(self._waiting) >= self._window:
+            return False
+        self._waiting.append((message.seq, encode(message)))
+        self.sent = message.seq
+        self._hand_over()
+        return True
+
+    def listen(self, seconds: float) -> None:
+        """Take in acknowledgements, waiting at most this long for the first."""
+        if self._wait(seconds):
+            while True:
+                try:
+                    answer = self._decode(self._socket.recv(zmq.NOBLOCK), Stored, Position)
+                except zmq.Again:
+                    break
+                self._take(answer)
+        elif self._waiting and monotonic() - self._heard > _PATIENCE:
+            self._say_hello()
+        self._hand_over()
+
+    def _take(self, answer: Stored | Position | None) -> None:
+        if answer is None:
+            return
+        if answer.seq > max(self.sent, self._known):
+            raise ProtocolError(
+                f"the receiver of {self.channel.name} has stored message {answer.seq}, only {self.sent} were sent: "
+                "it holds another stream, start it anew or this process with --resume"
+            )
+        self._heard = monotonic()
+        self.version = max(self.version, answer.version)
+        while self._waiting and self._waiting[0][0] <= answer.seq:
+            self._waiting.popleft()
+            self._on_the_way = max(self._on_the_way - 1, 0)
+        self.stored = max(self.stored, min(answer.seq, self.sent))
+        if isinstance(answer, Position):
+            self._on_the_way = 0
+            self.taken = self.stored
+        else:
+            self.taken = min(answer.taken, self.sent)
+
+    def _hand_over(self) -> None:
+        while self._on_the_way < len(self._waiting):
+            try:
+                self._socket.send(self._waiting[self._on_the_way][1], zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                break
+            self._on_the_way += 1
+
+    def _say_hello(self) -> None:
+        self._heard = monotonic()
+        try:
+            self._socket.send(_HELLO, zmq.NOBLOCK)
+        except zmq.Again:
+            pass  # nobody there yet: it is asked again
+
+
+class Receiver(_Socket):
+    """The receiving side of an acknowledged channel; it binds.
+
+    Parameters
+    ----------
+    position : where the stream goes on: the next message taken is the one after `position.seq`
+    """
+
+    def __init__(self, channel: str, endpoint: Endpoint, position: Position, window: int) -> None:
+        super().__init__(zmq.ROUTER, channel, endpoint, depth=window + 1)
+        self.taken = position.seq
+        self._position = position
+        self._peer: bytes | None = None
+        self._asked = 0.0  # when a message was last found missing
+        self._bind()
+
+    def receive(self, seconds: float) -> Any:
+        """The next message in order, or None where none came in time."""
+        if not self._wait(seconds):
+            return None
+        # Two parts, who and what; a stranger may send any number.
+        peer, *parts = self._socket.recv_multipart(copy=False)
+        self._peer = peer.bytes
+        if len(parts) == 1 and not len(parts[0].buffer):
+            self._answer(self._position)
+            return None
+        message = self._decode(parts[0].buffer if len(parts) == 1 else b"", *self.channel.messages)
+        if message is None or message.seq <= self.taken:
+            return None
+        if message.seq > self.taken + 1:
+            if monotonic() - self._asked > _PATIENCE:
+                self._asked = monotonic()
+                self._answer(self._position)
+            return None
+        self._asked = 0.0
+        self.taken = message.seq
+        return message
+
+    def acknowledge(self, position: Position) -> None:
+        """Say that all is taken up to the last message, and stored up to `position.seq`."""
+        self._position = position
+        self._answer(Stored(position.seq, self.taken, position.version))
+
+    def _answer(self, message: Stored | Position) -> None:
+        if self._peer is not None:
+            try:
+                self._socket.send_multipart([self._peer, encode(message)], zmq.NOBLOCK)
+            except zmq.Again:
+                pass  # a sender that does not listen asks again
+
+
+class Publisher(_Socket):
+    """Sends to anyone who listens, and waits for no one."""
+
+    def __init__(self, channel: str, endpoint: Endpoint, sender: str | None = None) -> None:
+        newest = CHANNELS[channel].keeps == "newest"
+        super().__init__(zmq.XPUB, channel, endpoint, depth=2 if newest else _TRACKS)
+        self._last: bytes | None = None
+        self._newest = newest
+        self._socket.xpub_verbose = True  # hear of every reader, also of one that asks for what others get
+        self._bind(sender)
+
+    def send(self, message: Any) -> None:
+        """Send to all who listen now, and where the newest counts to those who come later."""
+        data = encode(message)
+        if self._newest:
+            self._last = data
+        self._socket.send(data, copy=False)
+        self.welcome()
+
+    def welcome(self) -> None:
+        """Send the last message to those who came since; call it now and then."""
+        late = False
+        while True:
+            try:
+                late |= self._socket.recv(zmq.NOBLOCK).startswith(b"\x01")
+            except zmq.Again:
+                break
+        if late and self._last is not None:
+            self._socket.send(self._last, copy=False)
+
+
+class Subscriber(_Socket):
+    """Receives what a channel's publishers send from now on, and where the newest counts their last."""
+
+    def __init__(self, channel: str, endpoint: Endpoint) -> None:
+        row = CHANNELS[channel]
+        super().__init__(zmq.SUB, channel, endpoint, depth=_TRACKS if row.keeps == "every" else 16)
+        if row.keeps == "newest" and len(row.senders) == 1:
+            self._socket.conflate = True
+        self._socket.subscribe(b"")
+        self._connect()
+
+    def receive(self, seconds: float) -> Any:
+        """The next message, or None where none came in time."""
+        if not self._wait(seconds):
+            return None
+        return self._decode(self._socket.recv(copy=False).buffer, *self.channel.messages)
+
+    def waiting(self) -> list[Any]:
+        """All messages that are here already, oldest first."""
+        messages = []
+        while (message := self.receive(0)) is not None:
+            messages.append(message)
+        return messages

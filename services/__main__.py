@@ -1,0 +1,101 @@
+"""`python -m catstream.services NAME`: THE LIST of processes, a command each.
+
+Each can be started by hand, in any order, on any endpoint; `catstream track` starts them all.
+"""
+
+from __future__ import annotations
+
+import os
+
+# The processes are the parallelism: BLAS threads of their own would only take turns on the same cores.
+for _library in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import click
+from catstream.services.loop import run
+from catstream.services.options import with_settings
+
+from catstream.box import Box
+from catstream.errors import CatstreamError
+from catstream.settings import Settings
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
+@click.option("--parent", type=int, hidden=True, help="Process id of the one to end with.")
+@click.pass_context
+def main(context: click.Context, parent: int | None) -> None:
+    """The processes of a catstream pipeline.
+
+    They meet at an endpoint: a folder that holds their sockets, or tcp://127.0.0.1:PORT. All need
+    the same settings.
+
+    \b
+      python -m catstream.services compressor --set endpoint=run &
+      python -m catstream.services trainer    --set endpoint=run &
+      python -m catstream.services detector   --set endpoint=run walk.mp4 --box 120,80,64,48
+    """
+    context.obj = parent
+
+
+_source = click.argument("source")
+_box = click.option("--box", required=True, metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
+
+
+@main.command()
+@_source
+@_box
+@click.option("--resume", is_flag=True, help="Go on where a detector before this one stopped.")
+@click.option("--owned", is_flag=True, help="Somebody takes every track from the channel `results`.")
+@with_settings
+@click.pass_obj
+def detector(parent: int | None, settings: Settings, source: str, box: str, resume: bool, owned: bool) -> None:
+    """Frames in; tracks and features out, with the newest model there is."""
+    import cv2
+    from catstream.services import detector
+
+    cv2.setNumThreads(1)
+    action = partial(detector.main, source=source, box=Box.parse(box), resume=resume, owned=owned)
+    sys.exit(run("detector", action, settings, parent))
+
+
+@main.command()
+@click.option("--state", type=click.Path(path_type=Path), help="Folder of the checkpoint to go on from.")
+@with_settings
+@click.pass_obj
+def compressor(parent: int | None, settings: Settings, state: Path | None) -> None:
+    """Features in, samples out; owns the coreset trees."""
+    from catstream.services import compressor
+
+    sys.exit(run("compressor", partial(compressor.main, state=state), settings, parent))
+
+
+@main.command()
+@with_settings
+@click.pass_obj
+def trainer(parent: int | None, settings: Settings) -> None:
+    """Samples in, models out."""
+    from catstream.services import trainer
+
+    sys.exit(run("trainer", trainer.main, settings, parent))
+
+
+@main.command()
+@_source
+@_box
+@with_settings
+def supervisor(settings: Settings, source: str, box: str) -> None:
+    """Start the other three on a source, and keep them running."""
+    from catstream.services import supervisor
+
+    supervisor.main(source, Box.parse(box), settings)
+
+
+if __name__ == "__main__":
+    try:
+        main(prog_name="python -m catstream.services")
+    except CatstreamError as error:
+        sys.exit(f"catstream: {error}")

@@ -1,0 +1,80 @@
+"""Features in, samples out; owns the coreset trees, and keeps them on disk as they grow."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+from catstream.services.loop import Process
+
+from catstream.compression.compressor import Compressor
+from catstream.errors import ServiceError
+from catstream.messages import End, Position
+from catstream.wire.sockets import Publisher, Receiver
+
+__all__ = ["main"]
+
+_log = logging.getLogger(__name__)
+
+
+def main(process: Process, state: Path | None) -> None:
+    """Take every message once, until the stream ends.
+
+    Parameters
+    ----------
+    state : folder of the checkpoint that a restarted compressor goes on from; without one,
+        what was taken counts as stored
+    """
+    settings = process.settings
+    file = _checkpoint(state)
+    compressor = Compressor.load(file, settings) if file and file.exists() else Compressor(settings)
+    stored, saved = _position(compressor), time.monotonic()
+    with (
+        Receiver("features", process.endpoint, stored, settings.window) as features,
+        Publisher("samples", process.endpoint) as samples,
+    ):
+
+        def counters() -> dict[str, float]:
+            return {**compressor.counters(), "stored": stored.seq, "refused": features.refused}
+
+        if compressor.last_sample is not None:
+            samples.send(compressor.last_sample)
+        while not process.ended:
+            message = features.receive(0.1)
+            end = isinstance(message, End)
+            if message is not None and not end:
+                sample = compressor.take(message)
+                if sample is not None:
+                    samples.send(sample)
+            waiting = compressor.seq - stored.seq
+            overdue = time.monotonic() - saved >= settings.checkpoint_seconds
+            if file is None:
+                stored = _position(compressor)
+            elif waiting and (end or overdue or 2 * waiting >= settings.window):
+                compressor.save(file)
+                stored, saved = _position(compressor), time.monotonic()
+            if message is not None:
+                # The end of the stream holds no features: with all before it, it is stored too.
+                features.acknowledge(_position(compressor, message.seq) if end else stored)
+            samples.welcome()
+            process.beat(counters, now=end)
+            if end:
+                samples.send(message)
+                break
+
+
+def _checkpoint(state: Path | None) -> Path | None:
+    if state is None:
+        return None
+    try:
+        state.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise ServiceError(f"cannot keep checkpoints in {state} ({error.strerror}): give another folder") from None
+    return state / "compressor.safetensors"
+
+
+def _position(compressor: Compressor, seq: int | None = None) -> Position:
+    return Position(
+        compressor.seq if seq is None else seq, max(compressor.frame, 0), compressor.box, compressor.version
+    )

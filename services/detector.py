@@ -1,0 +1,151 @@
+"""Frames in; tracks and features out, with the newest model there is."""
+
+from __future__ import annotations
+
+import logging
+import time
+from contextlib import ExitStack
+
+from catstream.services.loop import Process
+
+from catstream.box import Box
+from catstream.detection.detector import Detector
+from catstream.errors import VideoError
+from catstream.messages import End, Features, Model, Position, Track
+from catstream.video.source import open_source
+from catstream.wire.sockets import Publisher, Sender, Subscriber
+
+__all__ = ["main"]
+
+_FAREWELL_SECONDS = 10.0  # what the last messages may take to be stored
+
+_log = logging.getLogger(__name__)
+
+
+def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool) -> None:
+    """Follow the object to the last frame.
+
+    Parameters
+    ----------
+    source : as `catstream.video.source.open_source` takes it
+    box : of the object in the first frame
+    resume : go on where a detector before this one stopped
+    owned : somebody takes every track from the channel `results`
+    """
+    with ExitStack() as stack:
+        line = _Line(process, stack, owned)
+        position = line.position() if resume else Position()
+        detector = Detector(process.settings)
+        if position.seq and position.box is not None:
+            detector.resume(position.seq, position.box, line.model(0))
+        # From the last frame that was stored, which is passed over: there may be none after it.
+        frames = stack.enter_context(open_source(source, start=max(detector.seq - 1, 0)))
+        reason, failed = "the source came to its end", False
+        try:
+            for frame in frames:
+                if frame.number < detector.seq:
+                    continue
+                for model in line.models.waiting():
+                    detector.adopt(model)
+                if detector.seq:
+                    track, features = detector.step(frame.image, frame.time)
+                else:
+                    track, features = detector.init(frame.image, box, frame.time)
+                line.send(track, features)
+                if process.settings.lockstep and not process.ended:
+                    line.wait(detector)
+                if process.ended:
+                    reason = "it was stopped"
+                    break
+        except VideoError as error:
+            reason, failed = str(error), True
+        line.end(detector.seq, reason, failed)
+
+
+class _Line:
+    """The detector's channels, as one."""
+
+    def __init__(self, process: Process, stack: ExitStack, owned: bool) -> None:
+        window, endpoint = process.settings.window, process.endpoint
+        self._process = process
+        self._features = stack.enter_context(Sender("features", endpoint, window))
+        self._results = stack.enter_context(Sender("results", endpoint, window)) if owned else None
+        self._tracks = stack.enter_context(Publisher("tracks", endpoint))
+        self.models = stack.enter_context(Subscriber("models", endpoint))
+        self._senders = [self._features] + ([self._results] if self._results else [])
+        self._version = 0
+
+    def position(self) -> Position:
+        """Where to go on: after the last frame that all receivers have; from the start where there is no model yet."""
+        positions: list[Position] = []
+        for sender in self._senders:
+            while (position := sender.position()) is None:
+                self._turn()
+            positions.append(position)
+        start = min(positions, key=lambda position: position.seq)
+        if not positions[0].version or start.box is None:
+            start = Position()
+        for sender, position in zip(self._senders, positions, strict=True):
+            sender.resume(start.seq, position.seq)
+        return start
+
+    def model(self, version: int) -> Model:
+        """The next model of at least this version, however long it takes."""
+        while True:
+            message = self.models.receive(0.05)
+            if message is not None and message.version >= version:
+                return message
+            self._turn()
+
+    def send(self, track: Track, features: Features) -> None:
+        """Send what one frame gave; wait where a window is full."""
+        self._version = track.model_version
+        self._tracks.send(track)
+        if self._results is not None:
+            self._deliver(self._results, track)
+        self._deliver(self._features, features)
+        self._process.beat(self._counters)
+
+    def wait(self, detector: Detector) -> None:
+        """Wait until the frame is taken, and for the model that it led to."""
+        while self._features.taken < self._features.sent and not self._process.ended:
+            self._features.listen(0.02)
+            self._process.beat(self._counters)
+        if self._features.version > detector.model.version and not self._process.ended:
+            detector.adopt(self.model(self._features.version))
+
+    def end(self, seq: int, reason: str, failed: bool) -> None:
+        """Say that nothing follows, once all before is stored."""
+        deadline = time.monotonic() + _FAREWELL_SECONDS
+        totals = {}
+        for sender in self._senders:
+            self._deliver(sender, End(seq + 1, reason, failed, totals), deadline)
+            while sender.stored < sender.sent and time.monotonic() < deadline:
+                sender.listen(0.02)
+            if sender is self._features:
+                totals = {"sent": float(seq), "stored": float(min(sender.stored, seq))}
+        self._tracks.send(End(seq + 1, reason, failed, totals))
+        self._process.beat(self._counters, now=True)
+
+    def _deliver(self, sender: Sender, message: Track | Features | End, deadline: float = float("inf")) -> None:
+        while not sender.send(message):
+            sender.listen(0.02)
+            self._process.beat(self._counters)
+            if time.monotonic() > deadline or (self._process.ended and not isinstance(message, End)):
+                _log.warning(
+                    "message %d of %s could not be sent: its receiver is gone", message.seq, sender.channel.name
+                )
+                return
+
+    def _turn(self) -> None:
+        self._process.beat(self._counters)
+        if self._process.ended:
+            raise SystemExit(0)
+
+    def _counters(self) -> dict[str, float]:
+        return {
+            "sent": self._features.sent,
+            "taken": self._features.taken,
+            "stored": self._features.stored,
+            "model_version": self._version,
+        }

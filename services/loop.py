@@ -1,0 +1,90 @@
+"""What every process of the pipeline does alike: signals, health, errors, and not to outlive its parent."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable
+
+from catstream.errors import CatstreamError
+from catstream.messages import Health
+from catstream.settings import Settings
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Publisher
+
+__all__ = ["REFUSED", "Process", "run"]
+
+#: Exit code of a process that would fail the same way again: it is not restarted.
+REFUSED = 2
+
+_SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
+_log = logging.getLogger(__name__)
+
+
+class Process:
+    """What a process has, whichever it is.
+
+    settings, endpoint : as all processes of this pipeline have them
+    ended : whether it was asked to end
+    """
+
+    def __init__(self, name: str, settings: Settings) -> None:
+        self.name = name
+        self.settings = settings
+        self.endpoint = Endpoint.parse(settings.endpoint)
+        self.ended = False
+        self._health = Publisher("health", self.endpoint, sender=name)
+        self._beat = 0.0
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._end)
+
+    def beat(self, counters: Callable[[], dict[str, float]], now: bool = False) -> None:
+        """Tell how it is, once a second; cheap to call in every turn of a loop."""
+        if now or time.monotonic() - self._beat >= 1:
+            self._beat = time.monotonic()
+            self._health.send(Health(self.name, time.time(), counters()))
+        else:
+            self._health.welcome()
+
+    def close(self) -> None:
+        """Send the last health, then close."""
+        self._health.close()
+
+    def _end(self, *_: object) -> None:
+        self.ended = True
+
+
+def run(name: str, main: Callable[[Process], None], settings: Settings, parent: int | None) -> int:
+    """Be a process of the pipeline until it ends.
+
+    Parameters
+    ----------
+    parent : process id of the one that started this, not to be outlived; None to be independent
+
+    Returns
+    -------
+    its exit code: 0 at the end of the stream or after SIGTERM, `REFUSED` for an error that names its cause
+    """
+    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
+    if parent is not None:
+        _die_with(parent)
+    try:
+        process = Process(name, settings)
+        try:
+            main(process)
+        finally:
+            process.close()
+    except CatstreamError as error:
+        _log.error("%s", error)
+        return REFUSED
+    return 0
+
+
+def _die_with(parent: int) -> None:
+    """Have the kernel kill this process when the one that started it is gone: no orphan is left."""
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # it went before the kernel was told
+        raise SystemExit(0)

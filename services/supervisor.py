@@ -1,0 +1,173 @@
+"""Starts the processes of a pipeline as children, restarts one that dies, and leaves none behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO
+
+from catstream.services.loop import REFUSED
+
+from catstream.box import Box
+from catstream.errors import ServiceError
+from catstream.settings import Settings
+from catstream.wire.endpoint import meeting_place, private_folder
+
+__all__ = ["NAMES", "Supervisor", "main"]
+
+#: The processes, in the order they end.
+NAMES = ("detector", "compressor", "trainer")
+
+_RESTARTS, _PER_SECONDS = 5, 60.0
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 5.0
+_FAREWELL_SECONDS = 12.0
+_LAST_WORDS = 2000  # bytes of a child's log that may hold why it died
+
+
+@dataclass(slots=True)
+class _Child:
+    """One process and its history."""
+
+    name: str
+    log: IO[bytes]
+    process: subprocess.Popen[bytes] | None = None
+    restarts: deque[float] = field(default_factory=deque)
+    due: float = 0.0
+
+    @property
+    def finished(self) -> bool:
+        return self.process is not None and self.process.poll() == 0
+
+    def last_words(self) -> str:
+        """The last line that it logged."""
+        self.log.seek(0, os.SEEK_END)
+        self.log.seek(max(0, self.log.tell() - _LAST_WORDS))
+        lines = self.log.read().decode(errors="replace").strip().splitlines()
+        return lines[-1].removeprefix(f"{self.name}: ") if lines else "it said nothing"
+
+
+class Supervisor:
+    """The children of one pipeline.
+
+    Call `check` now and then: it restarts who died, after a pause that doubles, at most 5 times a minute each.
+
+    Parameters
+    ----------
+    settings : with the endpoint where the processes meet
+    folder : where checkpoints and logs are kept while the pipeline runs
+    owned : whether somebody takes every track from the channel `results`
+    """
+
+    def __init__(self, source: str, box: Box, settings: Settings, folder: Path, *, owned: bool) -> None:
+        self._source, self._box, self._settings, self._folder, self._owned = source, box, settings, folder, owned
+        self._children = {name: _Child(name, (folder / f"{name}.log").open("w+b")) for name in NAMES}
+        for child in self._children.values():
+            self._start(child)
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process id by name, of those that run."""
+        running = ((name, child.process) for name, child in self._children.items())
+        return {name: process.pid for name, process in running if process is not None and process.poll() is None}
+
+    @property
+    def restarts(self) -> int:
+        """How often a child was restarted."""
+        return sum(len(child.restarts) for child in self._children.values())
+
+    @property
+    def finished(self) -> bool:
+        """Whether all have ended, and well."""
+        return all(child.finished for child in self._children.values())
+
+    def check(self) -> None:
+        """Restart who died.
+
+        Raises
+        ------
+        ServiceError
+            Where one would only die again; says why.
+        """
+        for child in self._children.values():
+            if child.process is None:
+                if time.monotonic() >= child.due:
+                    self._start(child)
+                continue
+            code = child.process.poll()
+            if code is None or code == 0:
+                continue
+            if code == REFUSED:
+                raise ServiceError(child.last_words())
+            now = time.monotonic()
+            child.restarts.append(now)
+            recent = sum(now - moment < _PER_SECONDS for moment in child.restarts)
+            if recent > _RESTARTS:
+                raise ServiceError(
+                    f"the {child.name} died {recent} times in a minute, the last time with {_ending(code)}: "
+                    f"{child.last_words()}"
+                )
+            pause = min(_FIRST_PAUSE * 2 ** (recent - 1), _LONGEST_PAUSE) * random.uniform(0.5, 1)
+            child.process, child.due = None, now + pause
+
+    def stop(self) -> None:
+        """End all children: asked first, killed where they do not listen."""
+        deadline = time.monotonic() + _FAREWELL_SECONDS
+        try:
+            for child in self._children.values():
+                if child.process is None or child.process.poll() is not None:
+                    continue
+                child.process.send_signal(signal.SIGTERM)
+                # The detector's last messages need the others: they are asked once it is gone.
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.process.wait(max(0.1, deadline - time.monotonic()))
+        finally:
+            for child in self._children.values():
+                if child.process is not None and child.process.poll() is None:
+                    child.process.kill()
+                    child.process.wait()
+                child.log.close()
+
+    def _start(self, child: _Child) -> None:
+        command = [sys.executable, "-m", "catstream.services", "--parent", str(os.getpid()), child.name]
+        for pair in self._settings.changed():
+            command += ["--set", pair]
+        if child.name == "detector":
+            command += [self._source, "--box", ",".join(map(repr, self._box))]
+            command += ["--owned"] * self._owned + ["--resume"] * bool(child.restarts)
+        if child.name == "compressor":
+            command += ["--state", str(self._folder)]
+        own = {name: value for name, value in os.environ.items() if not name.startswith("CATSTREAM_")}
+        child.process = subprocess.Popen(
+            command,
+            env=own,
+            stdin=subprocess.DEVNULL,
+            stderr=child.log,
+            start_new_session=True,  # Ctrl-C is for the parent, which then ends them in order
+        )
+
+
+def main(source: str, box: Box, settings: Settings) -> None:
+    """Run a pipeline for whoever subscribes, until the source ends or a signal comes."""
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    with private_folder() as folder, meeting_place(settings.endpoint, folder) as endpoint:
+        supervisor = Supervisor(source, box, replace(settings, endpoint=str(endpoint)), folder, owned=False)
+        try:
+            while not supervisor.finished and not ended.wait(0.05):
+                supervisor.check()
+        finally:
+            supervisor.stop()
+
+
+def _ending(code: int) -> str:
+    return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

@@ -1,0 +1,32 @@
+"""Samples in, models out: always from the newest, older ones are stale."""
+
+from __future__ import annotations
+
+from catstream.services.loop import Process
+
+from catstream.messages import End
+from catstream.training.trainer import Trainer
+from catstream.wire.sockets import Publisher, Subscriber
+
+__all__ = ["main"]
+
+
+def main(process: Process) -> None:
+    """Learn a model from each sample that comes, until the stream ends."""
+    trainer = Trainer(process.settings)
+    version = trained = 0
+    with Subscriber("samples", process.endpoint) as samples, Publisher("models", process.endpoint) as models:
+
+        def counters() -> dict[str, float]:
+            return {"version": version, "trained": trained, "refused": samples.refused}
+
+        while not process.ended:
+            message = samples.receive(0.1)
+            end = isinstance(message, End)
+            if message is not None and not end and message.version > version:
+                models.send(trainer.train(message))
+                version, trained = message.version, trained + 1
+            models.welcome()
+            process.beat(counters, now=end)
+            if end:
+                break
