@@ -12,6 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from catstream.errors import CatstreamError
+from catstream.services.options import with_settings
+from catstream.settings import Settings
 
 __all__ = ["evaluate"]
 
@@ -19,19 +21,15 @@ __all__ = ["evaluate"]
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
 @click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see below.")
-@click.option("--preset", help="A preset of catstream's settings.")
-@click.option("--settings", "file", type=click.Path(path_type=Path), help="A TOML file of settings.")
-@click.option("--set", "overrides", multiple=True, metavar="NAME=VALUE", help="One setting; may be repeated.")
 @click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Frames to start from.")
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Processes at once.")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder for results and report.html.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all numbers.")
+@with_settings
 def evaluate(
+    settings: Settings,
     paths: tuple[Path, ...],
     trackers: str,
-    preset: str | None,
-    file: Path | None,
-    overrides: tuple[str, ...],
     starts: int,
     jobs: int,
     output: Path | None,
@@ -75,10 +73,8 @@ def evaluate(
     from catstream.evaluation.report import write_report
     from catstream.evaluation.runs import Run
     from catstream.evaluation.summary import rows_of, to_json
-    from catstream.settings import Settings
 
     names = [name.strip() for name in trackers.split(",") if name.strip()]
-    settings = Settings.load(preset=preset, file=file, overrides=overrides)
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
     if json_file is not None and not json_file.absolute().parent.is_dir():
         raise CatstreamError(f"cannot write {str(json_file)!r}: its folder does not exist, make it first")

@@ -1,0 +1,26 @@
+"""`catstream demo`, from the photographs to the annotated video."""
+
+from __future__ import annotations
+
+import re
+
+from click.testing import CliRunner
+
+from catstream.cli.demo import demo
+from catstream.video.source import open_source
+
+
+def test_the_demo_is_followed_and_shown(tmp_path):
+    result = CliRunner().invoke(demo, ["--output", str(tmp_path), "--frames", "25"], catch_exceptions=False)
+    assert result.exit_code == 0
+    success = re.search(r"success rate: ([\d.]+)", result.output)
+    assert success
+    assert float(success[1]) > 0.9
+    with open_source(tmp_path / "tracks" / "demo.mp4") as source:
+        assert sum(1 for _ in source) == 25
+
+
+def test_rendering_alone_starts_nothing(tmp_path):
+    result = CliRunner().invoke(demo, ["--output", str(tmp_path), "--frames", "2", "--render-only"])
+    assert result.exit_code == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["demo.mp4", "groundtruth_rect.txt"]
