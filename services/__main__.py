@@ -16,11 +16,11 @@ from functools import partial
 from pathlib import Path
 
 import click
-from catstream.services.loop import run
-from catstream.services.options import with_settings
 
 from catstream.box import Box
 from catstream.errors import CatstreamError
+from catstream.services.loop import run
+from catstream.services.options import with_settings
 from catstream.settings import Settings
 
 
@@ -55,6 +55,7 @@ _box = click.option("--box", required=True, metavar="X,Y,W,H", help="The object 
 def detector(parent: int | None, settings: Settings, source: str, box: str, resume: bool, owned: bool) -> None:
     """Frames in; tracks and features out, with the newest model there is."""
     import cv2
+
     from catstream.services import detector
 
     cv2.setNumThreads(1)

@@ -6,11 +6,10 @@ import logging
 import time
 from pathlib import Path
 
-from catstream.services.loop import Process
-
 from catstream.compression.compressor import Compressor
 from catstream.errors import ServiceError
 from catstream.messages import End, Position
+from catstream.services.loop import Process
 from catstream.wire.sockets import Publisher, Receiver
 
 __all__ = ["main"]

@@ -6,12 +6,11 @@ import logging
 import time
 from contextlib import ExitStack
 
-from catstream.services.loop import Process
-
 from catstream.box import Box
 from catstream.detection.detector import Detector
 from catstream.errors import VideoError
 from catstream.messages import End, Features, Model, Position, Track
+from catstream.services.loop import Process
 from catstream.video.source import open_source
 from catstream.wire.sockets import Publisher, Sender, Subscriber
 
@@ -117,7 +116,7 @@ class _Line:
     def end(self, seq: int, reason: str, failed: bool) -> None:
         """Say that nothing follows, once all before is stored."""
         deadline = time.monotonic() + _FAREWELL_SECONDS
-        totals = {}
+        totals: dict[str, float] = {}
         for sender in self._senders:
             self._deliver(sender, End(seq + 1, reason, failed, totals), deadline)
             while sender.stored < sender.sent and time.monotonic() < deadline:

@@ -15,10 +15,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO
 
-from catstream.services.loop import REFUSED
-
 from catstream.box import Box
 from catstream.errors import ServiceError
+from catstream.services.loop import REFUSED
 from catstream.settings import Settings
 from catstream.wire.endpoint import meeting_place, private_folder
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from catstream.services.loop import Process
-
 from catstream.messages import End
+from catstream.services.loop import Process
 from catstream.training.trainer import Trainer
 from catstream.wire.sockets import Publisher, Subscriber
 

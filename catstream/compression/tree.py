@@ -193,7 +193,8 @@ class CoresetTree:
         """The tree whose `state` this is; ProtocolError where it is not one."""
         try:
             tree = cls(int(facts["size"]))  # type: ignore[call-overload]
-            for i, (level, count, dropped) in enumerate(facts["nodes"]):  # type: ignore[arg-type]
+            nodes: list[tuple[int, int, str]] = facts["nodes"]  # type: ignore[assignment]
+            for i, (level, count, dropped) in enumerate(nodes):
                 rows, total = arrays[f"rows.{i}"], arrays[f"sum.{i}"]
                 tree.nodes.append(Node(int(level), rows, int(count), total, float.fromhex(dropped)))
             tree.pending = arrays["pending"]

@@ -150,7 +150,8 @@ def meeting_place(text: str, default: Path) -> Iterator[Endpoint]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ServiceError(
-                f"a pipeline is already running on {text!r}: wait for it, or give another folder (--set endpoint=FOLDER)"
+                f"a pipeline is already running on {text!r}: "
+                "wait for it, or give another folder (--set endpoint=FOLDER)"
             ) from None
         try:
             yield Endpoint.parse(str(folder))

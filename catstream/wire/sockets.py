@@ -13,6 +13,7 @@ take the same message twice calmly.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections import deque
 from time import monotonic
@@ -43,8 +44,9 @@ class _Socket:
         self.channel: Channel = CHANNELS[channel]
         self.refused = 0  #: messages that were dropped because they were not what the channel carries
         self._endpoint = endpoint
-        self._socket = zmq.Context.instance().socket(kind)
+        self._socket: Any = zmq.Context.instance().socket(kind)
         self._socket.linger = _LINGER
+        self._socket.ipv6 = endpoint.host.startswith("[")
         self._socket.sndhwm = self._socket.rcvhwm = depth
         self._socket.maxmsgsize = self.channel.limit
         # A peer that froze, or a host that went away, is noticed.
@@ -178,10 +180,8 @@ class Sender(_Socket):
 
     def _say_hello(self) -> None:
         self._heard = monotonic()
-        try:
+        with contextlib.suppress(zmq.Again):  # nobody there yet: it is asked again
             self._socket.send(_HELLO, zmq.NOBLOCK)
-        except zmq.Again:
-            pass  # nobody there yet: it is asked again
 
 
 class Receiver(_Socket):
@@ -229,10 +229,8 @@ class Receiver(_Socket):
 
     def _answer(self, message: Stored | Position) -> None:
         if self._peer is not None:
-            try:
+            with contextlib.suppress(zmq.Again):  # a sender that does not listen asks again
                 self._socket.send_multipart([self._peer, encode(message)], zmq.NOBLOCK)
-            except zmq.Again:
-                pass  # a sender that does not listen asks again
 
 
 class Publisher(_Socket):
