@@ -44,7 +44,8 @@ class _Socket:
         self.channel: Channel = CHANNELS[channel]
         self.refused = 0  #: messages that were dropped because they were not what the channel carries
         self._endpoint = endpoint
-        self._socket: Any = zmq.Context.instance().socket(kind)
+        context: Any = zmq.Context.instance()  # its types do not know a socket's options
+        self._socket = context.socket(kind)
         self._socket.linger = _LINGER
         self._socket.ipv6 = endpoint.host.startswith("[")
         self._socket.sndhwm = self._socket.rcvhwm = depth
