@@ -29,7 +29,7 @@ FLOORS = [
 HOMES = {
     "numpy": ["catstream", "services"],
     "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
-    "cv2": ["catstream/detection", "catstream/video"],
+    "cv2": ["catstream/detection", "catstream/video", "catstream/evaluation/peers.py", "services/__main__.py"],
     "numba": ["catstream/detection"],
     "filterpy": ["catstream/detection/motion.py", "catstream/training/motion_em.py"],
     "sklearn": ["catstream/training/one_class.py", "catstream/video/demo.py"],
@@ -38,6 +38,7 @@ HOMES = {
     "zmq": ["catstream/wire/sockets.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
+    "threadpoolctl": ["catstream/evaluation/onepass.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "rich": ["catstream/cli"],
 }

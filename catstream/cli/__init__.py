@@ -7,7 +7,6 @@ from importlib import import_module
 
 import click
 
-from catstream import __version__
 from catstream.errors import CatstreamError
 
 __all__ = ["main"]
@@ -34,7 +33,7 @@ class _Verbs(click.Group):
 
 
 @click.command(cls=_Verbs, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="catstream")
+@click.version_option(package_name="catstream", prog_name="catstream")
 def group() -> None:
     """Learn to follow one object in a video stream, from a single box, on a CPU.
 
