@@ -92,16 +92,23 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
         raise ProtocolError(f"expected {expected} as [version, kind, fields], got something else in msgpack")
     version, name, fields = envelope
     if version != VERSION:
-        raise ProtocolError(f"expected version {VERSION} of the protocol, got {version!r:.40}: run the same catstream")
+        raise ProtocolError(
+            f"expected version {VERSION} of the protocol, got {_brief(version)}: run the same catstream"
+        )
     kind = KINDS.get(name) if isinstance(name, str) else None
     if kind not in kinds:
-        raise ProtocolError(f"expected {expected}, got {name!r:.40}")
+        raise ProtocolError(f"expected {expected}, got {_brief(name)}")
     try:
-        message = msgspec.convert(fields, kind, dec_hook=_array)
+        message: Any = msgspec.convert(fields, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
         raise ProtocolError(f"{name}: {error}") from None
     _check(message)
     return message
+
+
+def _brief(value: Any) -> str:
+    """A value for a person to read; lists may be nested deeper than Python can print."""
+    return f"{value!r:.40}" if isinstance(value, str | int) else f"a {type(value).__name__}"
 
 
 def _plain(value: Any) -> Any:

@@ -7,8 +7,9 @@ was on the way. A sender that hears nothing asks again. So either side may die, 
 messages are still taken once each, in order.
 
 The other channels (`Publisher`, `Subscriber`) never wait for a reader. Where the newest
-counts, the last message is sent again to everyone who comes late, so that a reader must
-take the same message twice calmly.
+counts, the last message is sent again to everyone who comes late, and once to all when
+nothing newer followed: a burst may have cost a reader the last of it. So a reader must take
+the same message twice calmly.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ from catstream.wire.endpoint import Endpoint
 __all__ = ["Publisher", "Receiver", "Sender", "Subscriber"]
 
 _HELLO = b""
-_PATIENCE = 0.2  # seconds of silence after which a sender asks where the receiver is
+_PATIENCE = 0.2  # seconds of silence after which a sender asks where the receiver is, a publisher says it once more
 _LINGER = 2000  # milliseconds that a closed socket still has for its last messages
+_NEWEST = 8  # messages of a burst that are on their way at once where only the newest counts
 _TRACKS = 1000  # messages that a slow reader of a channel that keeps every message may fall behind
 
 _log = logging.getLogger(__name__)
@@ -44,6 +46,7 @@ class _Socket:
         self.channel: Channel = CHANNELS[channel]
         self.refused = 0  #: messages that were dropped because they were not what the channel carries
         self._endpoint = endpoint
+        self._bound = ""  # the address, where it listens
         context: Any = zmq.Context.instance()  # its types do not know a socket's options
         self._socket = context.socket(kind)
         self._socket.linger = _LINGER
@@ -60,6 +63,7 @@ class _Socket:
             if self._endpoint.taken(self.channel, sender):
                 raise zmq.ZMQError(zmq.EADDRINUSE)
             self._socket.bind(address)
+            self._bound = address
         except zmq.ZMQError as error:
             self._socket.close(linger=0)
             raise ServiceError(
@@ -85,7 +89,13 @@ class _Socket:
         return bool(self._socket.poll(max(0, round(seconds * 1000))))
 
     def close(self) -> None:
-        """Send what is on its way, then close."""
+        """Send what is on its way, then close; the address is free for the next one."""
+        if self._bound and not self._socket.closed:
+            # ZeroMQ stops listening some time later, and would take the next one's socket file with it.
+            with self._socket.get_monitor_socket(zmq.EVENT_CLOSED) as stopped:
+                self._socket.unbind(self._bound)
+                stopped.poll(_LINGER)
+                self._socket.disable_monitor()
         self._socket.close()
 
     def __enter__(self) -> Self:
@@ -239,8 +249,9 @@ class Publisher(_Socket):
 
     def __init__(self, channel: str, endpoint: Endpoint, sender: str | None = None) -> None:
         newest = CHANNELS[channel].keeps == "newest"
-        super().__init__(zmq.XPUB, channel, endpoint, depth=2 if newest else _TRACKS)
+        super().__init__(zmq.XPUB, channel, endpoint, depth=_NEWEST if newest else _TRACKS)
         self._last: bytes | None = None
+        self._repeat = float("inf")  # when the last message is due once more
         self._newest = newest
         self._socket.xpub_verbose = True  # hear of every reader, also of one that asks for what others get
         self._bind(sender)
@@ -249,19 +260,20 @@ class Publisher(_Socket):
         """Send to all who listen now, and where the newest counts to those who come later."""
         data = encode(message)
         if self._newest:
-            self._last = data
+            self._last, self._repeat = data, monotonic() + _PATIENCE
         self._socket.send(data, copy=False)
         self.welcome()
 
     def welcome(self) -> None:
-        """Send the last message to those who came since; call it now and then."""
-        late = False
+        """Send the last message to those who came since, or missed it; call it now and then."""
+        late = monotonic() >= self._repeat
         while True:
             try:
                 late |= self._socket.recv(zmq.NOBLOCK).startswith(b"\x01")
             except zmq.Again:
                 break
         if late and self._last is not None:
+            self._repeat = float("inf")
             self._socket.send(self._last, copy=False)
 
 

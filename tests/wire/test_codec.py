@@ -1,0 +1,228 @@
+"""Messages to bytes and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from catstream.box import Box
+from catstream.errors import ProtocolError
+from catstream.messages import End, Features, Health, Model, Motion, Position, Sample, Stored, Summary, Track
+from catstream.wire.codec import KINDS, VERSION, decode, encode
+
+
+def array(*shape: int, dtype: str = "<f4") -> np.ndarray:
+    return np.linspace(0.1, 0.9, int(np.prod(shape)), dtype=dtype).reshape(shape)
+
+
+def summary(columns: int) -> Summary:
+    return Summary(array(6, columns), array(columns), 40, (3, 1, 0))
+
+
+EXAMPLES = {
+    "end": End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),
+    "features": Features(3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3)),
+    "health": Health("trainer", 1.7e9, {"version": 4.0}),
+    "model": Model(4, 20, array(5), -0.25, Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))),
+    "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2),
+    "sample": Sample(4, 20, summary(5), summary(5), summary(7), np.array([[1.0, 2.0], [np.nan, np.nan]])),
+    "stored": Stored(5, 7, 2),
+    "track": Track(3, 2, 0.08, "present", Box(4.5, 3.0, 20.0, 10.0), 0.75, 4),
+}
+MESSAGES = pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
+ALL = tuple(KINDS.values())
+
+
+def packed(kind: str, **changes: object) -> bytes:
+    """An example as bytes, with some of its fields replaced on the wire."""
+    version, name, fields = msgpack.unpackb(encode(EXAMPLES[kind]))
+    return msgpack.packb([version, name, {**fields, **changes}])
+
+
+def plain(dtype: str, shape: list[int], data: bytes) -> dict[str, object]:
+    return {"dtype": dtype, "shape": shape, "data": data}
+
+
+def test_every_kind_has_an_example():
+    assert set(EXAMPLES) == set(KINDS)
+
+
+@MESSAGES
+def test_a_message_arrives_as_it_was_sent(message):
+    arrived = decode(encode(message), type(message))
+    assert type(arrived) is type(message)
+    np.testing.assert_equal(dataclasses.asdict(arrived), dataclasses.asdict(message))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Track(1, 0, 0.0, "absent", None, -0.5, 0),
+        Features(1, 0, 0.0, None, np.empty((0, 5), "<f4"), array(0), array(0)),
+        Model(1, 0, array(5), 0.0, None),
+        Position(),
+    ],
+    ids=["absent", "no rows", "no motion", "nowhere"],
+)
+def test_what_is_missing_arrives_as_missing(message):
+    np.testing.assert_equal(dataclasses.asdict(decode(encode(message), type(message))), dataclasses.asdict(message))
+
+
+def test_arrays_arrive_read_only():
+    arrived = decode(encode(EXAMPLES["features"]), Features)
+    with pytest.raises(ValueError, match="read-only"):
+        arrived.rows[0, 0] = 1
+
+
+def test_arrays_travel_row_by_row_whatever_their_layout():
+    rows = np.asfortranarray(array(3, 5)).astype(">f4")
+    message = dataclasses.replace(EXAMPLES["features"], rows=np.asfortranarray(array(3, 5)))
+    np.testing.assert_array_equal(decode(encode(message), Features).rows, rows)
+
+
+def test_a_field_of_a_later_version_is_ignored():
+    assert decode(packed("track", colour="red"), Track) == EXAMPLES["track"]
+
+
+@MESSAGES
+def test_a_message_of_another_kind_is_refused(message):
+    others = [kind for kind in ALL if kind is not type(message)]
+    with pytest.raises(ProtocolError, match=f"got '{type(message).__name__.lower()}'"):
+        decode(encode(message), *others)
+
+
+REFUSED = {
+    "a dtype that is not promised": packed("features", rows=plain("<f8", [3, 5], bytes(120))),
+    "objects": packed("features", rows=plain("|O", [3, 5], bytes(120))),
+    "another width of its labels": packed("features", labels=plain("<f4", [2], bytes(8))),
+    "rows in one dimension": packed("features", rows=plain("<f4", [15], bytes(60))),
+    "rows in three dimensions": packed("features", rows=plain("<f4", [1, 3, 5], bytes(60))),
+    "a negative side": packed("features", rows=plain("<f4", [-3, -5], bytes(60))),
+    "less data than its shape": packed("features", rows=plain("<f4", [3, 5], bytes(59))),
+    "a side of 2**63": packed("features", rows=plain("<f4", [0, 2**63], b"")),
+    "sides whose product is huge": packed("features", rows=plain("<f4", [2**32, 2**32], bytes(60))),
+    "NaN in an array": packed("features", rows=plain("<f4", [3, 5], struct.pack("<f", np.nan) * 15)),
+    "infinity in an array": packed("model", weights=plain("<f4", [1], struct.pack("<f", np.inf))),
+    "NaN as a number": packed("track", score=np.nan),
+    "infinity as a counter": packed("health", counters={"rate": np.inf}),
+    "a label above 1": packed("features", labels=plain("<f4", [3], struct.pack("<3f", 0, 1, 1.5))),
+    "a weight of 0": packed("features", weights=plain("<f4", [3], bytes(12))),
+    "a tree of another width": packed("sample", loss=msgpack.unpackb(packed("sample"))[2]["object"]),
+    "a box without width": packed("track", box=[1.0, 2.0, 0.0, 4.0]),
+    "a box of three numbers": packed("track", box=[1.0, 2.0, 3.0]),
+    "a state that does not exist": packed("track", state="asleep"),
+    "a negative seq": packed("track", seq=-1),
+    "a seq above 2**53": packed("track", seq=2**53 + 1),
+    "a text for a number": packed("track", score="0.5"),
+    "a missing field": msgpack.packb([VERSION, "track", {"seq": 1}]),
+    "another version": msgpack.packb([VERSION + 1, "track", {}]),
+    "a kind that does not exist": msgpack.packb([VERSION, "orders", {}]),
+    "no envelope": msgpack.packb({"seq": 1}),
+    "nothing": b"",
+    "half a message": encode(EXAMPLES["features"])[:-20],
+    "more than a message": encode(EXAMPLES["track"]) + b"\x00",
+    "a name twice in a map": b"\x93\x01\xa3end\x82\xa3seq\x01\xa3seq\x02",
+    "a map of bytes": b"\x93\x01\xa3end\x82\xc4\x03seq\x01\xa6reason\xa1x",
+    "a list of four thousand million": b"\x93\x01\xa3end\xdd\xff\xff\xff\xff",
+    "a map of four thousand million": b"\x93\x01\xa3end\xdf\xff\xff\xff\xff",
+    "bytes of four gigabytes": b"\x93\x01\xa3end\xc6\xff\xff\xff\xff",
+    "a text of four gigabytes": b"\x93\x01\xdb\xff\xff\xff\xff",
+    "a list longer than any message's": msgpack.packb([VERSION, "end", [None] * 257]),
+    "a reason longer than a page": packed("end", reason="x" * 4097),
+    "an extension type": b"\x93\x01\xa3end\xd4\x05\x00",
+    "a timestamp": b"\x93\x01\xa3end\xd6\xff\x00\x00\x00\x00",
+    "lists in lists, as version": b"\x93" + b"\x91" * 1015 + b"\x90\xa3end\x80",
+    "lists in lists, as kind": b"\x93\x01" + b"\x91" * 1015 + b"\x90\x80",
+    "lists in lists, as fields": b"\x93\x01\xa3end" + b"\x91" * 1015 + b"\x90",
+    "lists in lists without end": b"\x91" * 100_000,
+}
+
+
+@pytest.mark.parametrize("data", REFUSED.values(), ids=REFUSED)
+def test_what_breaks_a_promise_is_refused_on_arrival(data):
+    with pytest.raises(ProtocolError):
+        decode(data, *ALL)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        dataclasses.replace(EXAMPLES["features"], rows=array(3, 5, dtype="<f8")),
+        dataclasses.replace(EXAMPLES["features"], labels=array(4)),
+        dataclasses.replace(EXAMPLES["track"], score=float("nan")),
+        dataclasses.replace(EXAMPLES["track"], seq=-1),
+    ],
+    ids=["dtype", "shape", "NaN", "negative"],
+)
+def test_what_would_be_refused_on_arrival_is_not_sent(message):
+    with pytest.raises(ProtocolError):
+        encode(message)
+
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.binary(max_size=8)
+    | st.builds(
+        plain,
+        st.sampled_from(["<f4", "<f8", "|O", ">f4", ""]),
+        st.lists(st.integers(-2, 2**64 - 1) | st.integers(0, 3), max_size=3),
+        st.binary(max_size=32),
+    ),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=8,
+)
+FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def decoded_or_refused(data: bytes) -> None:
+    """The law of every arrival: a message that keeps all promises, or a ProtocolError."""
+    try:
+        message = decode(data, *ALL)
+    except ProtocolError:
+        return
+    encode(message)
+
+
+@FUZZ
+@given(st.sampled_from(sorted(EXAMPLES)), st.data())
+def test_any_value_in_any_field_arrives_whole_or_is_refused(kind, data):
+    version, name, fields = msgpack.unpackb(encode(EXAMPLES[kind]))
+    place = fields
+    while isinstance(inner := place[key := data.draw(st.sampled_from(sorted(place)))], dict) and inner:
+        if data.draw(st.booleans()):
+            break
+        place = inner
+    place[key] = data.draw(VALUES)
+    decoded_or_refused(msgpack.packb([version, name, fields]))
+
+
+@FUZZ
+@given(
+    st.sampled_from(sorted(EXAMPLES)),
+    st.lists(st.tuples(st.integers(0, 2**16), st.integers(0, 255)), min_size=1, max_size=8),
+    st.integers(0, 2**16),
+)
+def test_damaged_bytes_arrive_whole_or_are_refused(kind, changes, cut):
+    data = bytearray(encode(EXAMPLES[kind]))
+    for place, value in changes:
+        data[place % len(data)] = value
+    decoded_or_refused(bytes(data))
+    decoded_or_refused(bytes(data[: cut % len(data)]))
+
+
+@FUZZ
+@given(st.binary(max_size=64))
+@example(b"\xc1")
+def test_random_bytes_are_refused(data):
+    with pytest.raises(ProtocolError):
+        decode(data, *ALL)

@@ -1,0 +1,126 @@
+"""Where the processes meet, and who is kept out."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from catstream.errors import ServiceError
+from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import Endpoint, meeting_place, private_folder
+
+PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
+
+
+def mode(path):
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+@pytest.mark.parametrize("text", ["run", "tcp://127.0.0.1:5700", "tcp://[::1]:5700"])
+def test_each_sender_of_each_channel_has_its_own_address(text):
+    endpoint = Endpoint.parse(text)
+    assert len({endpoint.address(channel, sender) for channel, sender in PLACES}) == len(PLACES)
+
+
+@pytest.mark.parametrize("text", ["run", "tcp://127.0.0.1:5700", "tcp://[::1]:5700"])
+def test_an_endpoint_is_written_as_it_is_read(text):
+    assert str(Endpoint.parse(text)) == text
+
+
+def test_ports_follow_the_table():
+    endpoint = Endpoint.parse("tcp://127.0.0.1:6000")
+    ports = sorted(int(endpoint.address(channel, sender).rpartition(":")[2]) for channel, sender in PLACES)
+    assert ports == list(range(6000, 6000 + len(PLACES)))
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "localhost", "[::1]"])
+def test_this_machine_is_accepted(host):
+    assert Endpoint.parse(f"tcp://{host}:5700").port == 5700
+
+
+@pytest.mark.parametrize(
+    "host", ["0.0.0.0", "192.168.1.1", "[::]", "[fe80::1]", "example.org", "*", "127.0.0.1.nip.io"]
+)
+def test_a_host_that_others_can_reach_is_refused(host):
+    with pytest.raises(ServiceError, match="other machines"):
+        Endpoint.parse(f"tcp://{host}:5700")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["tcp://", "tcp://127.0.0.1", "tcp://127.0.0.1:0", "tcp://127.0.0.1:65535", "tcp://127.0.0.1:x", "tcp://[:5700"],
+)
+def test_a_tcp_endpoint_without_room_for_its_ports_is_refused(text):
+    with pytest.raises(ServiceError, match="more ports after PORT"):
+        Endpoint.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "word"), [("", "--set endpoint"), ("udp://127.0.0.1:1", "a folder or tcp"), ("x" * 100, "too long")]
+)
+def test_what_is_no_endpoint_is_refused(text, word):
+    with pytest.raises(ServiceError, match=word):
+        Endpoint.parse(text)
+
+
+def test_a_private_folder_is_for_this_user_and_gone_afterwards():
+    with private_folder() as folder:
+        assert mode(folder) == 0o700
+        (folder / "features").touch()
+    assert not folder.exists()
+
+
+def test_a_folder_that_is_made_is_for_this_user_alone(folder):
+    with meeting_place(str(folder / "a" / "b"), folder):
+        assert mode(folder / "a" / "b") == 0o700
+
+
+def test_a_folder_that_others_may_write_to_is_refused(folder):
+    folder.chmod(0o777)
+    with pytest.raises(ServiceError, match="other users may write"), meeting_place(str(folder), folder):
+        pass
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
+def test_a_folder_of_another_user_is_refused(folder):
+    (folder / "theirs").mkdir(mode=0o755)
+    os.chown(folder / "theirs", 12345, 12345)
+    with pytest.raises(ServiceError, match="a folder of your own"), meeting_place(str(folder / "theirs"), folder):
+        pass
+
+
+def test_a_file_is_no_meeting_place(folder):
+    (folder / "file").touch()
+    with pytest.raises(ServiceError, match="give another folder"), meeting_place(str(folder / "file"), folder):
+        pass
+
+
+def test_one_pipeline_at_a_time_meets_in_a_folder(folder):
+    with (
+        meeting_place(str(folder), folder),
+        pytest.raises(ServiceError, match="already running"),
+        meeting_place(str(folder), folder),
+    ):
+        pass
+    with meeting_place(str(folder), folder):
+        pass
+
+
+def test_the_folder_of_a_killed_pipeline_is_free_again(folder):
+    script = "import os, signal, sys; from pathlib import Path; from catstream.wire.endpoint import meeting_place\n"
+    script += "with meeting_place(sys.argv[1], Path()): os.kill(os.getpid(), signal.SIGKILL)"
+    assert subprocess.run([sys.executable, "-c", script, str(folder)]).returncode == -9
+    with meeting_place(str(folder), folder) as endpoint:
+        assert endpoint.folder == folder
+
+
+def test_no_socket_file_is_left_of_a_pipeline(folder):
+    with meeting_place(str(folder), folder) as endpoint:
+        for channel, sender in PLACES:
+            Path(endpoint.address(channel, sender).removeprefix("ipc://")).touch()
+    assert not list(folder.iterdir())

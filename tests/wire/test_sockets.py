@@ -1,0 +1,317 @@
+"""Channels between sockets: what arrives when one side dies, dawdles, or is a stranger."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+import zmq
+
+from catstream.errors import ProtocolError, ServiceError
+from catstream.messages import End, Health, Model, Position, Track
+from catstream.wire.channels import CHANNELS
+from catstream.wire.codec import encode
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Publisher, Receiver, Sender, Subscriber
+
+WINDOW = 4
+
+
+def track(seq):
+    return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0)
+
+
+def model(version):
+    return Model(version, version, np.full(5, version, np.float32), 0.0)
+
+
+def take(receiver, taken, *, store):
+    """One turn of a receiver that stores what it takes, or only takes it."""
+    message = receiver.receive(0.05)
+    if message is not None:
+        taken.append(message.seq)
+        receiver.acknowledge(Position(message.seq if store else 0))
+
+
+@pytest.fixture
+def stranger(endpoint):
+    """A raw socket of a given kind at a channel's address."""
+    with ExitStack() as stack:
+
+        def connect(kind, channel):
+            stranger = stack.enter_context(zmq.Context.instance().socket(kind))
+            stranger.linger = 0
+            stranger.connect(endpoint.address(CHANNELS[channel]))
+            return stranger
+
+        yield connect
+
+
+def test_an_acknowledged_channel_delivers_every_message_once_in_order(endpoint, until):
+    taken = []
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+
+        def turn():
+            if sender.sent < 50:
+                sender.send(track(sender.sent + 1))
+            else:
+                sender.listen(0)
+            take(receiver, taken, store=True)
+
+        until(lambda: sender.stored == 50, turn)
+    assert taken == list(range(1, 51))
+    assert sender.taken == 50
+
+
+def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
+    taken = []
+    with Sender("results", endpoint, WINDOW) as sender:
+        assert sender.position() is None
+        assert sender.send(track(1))
+        with Receiver("results", endpoint, Position(), WINDOW) as receiver:
+
+            def turn():
+                sender.listen(0.05)
+                take(receiver, taken, store=True)
+
+            until(lambda: sender.stored == 1, turn)
+    assert taken == [1]
+
+
+def test_a_full_window_takes_no_more(endpoint, until):
+    taken = []
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+        assert [sender.send(track(seq)) for seq in range(1, WINDOW + 2)] == [True] * WINDOW + [False]
+
+        def turn():
+            sender.listen(0)
+            take(receiver, taken, store=False)
+
+        until(lambda: sender.taken == WINDOW, turn)
+        assert not sender.send(track(WINDOW + 1)), "taken is not yet stored"
+        receiver.acknowledge(Position(1))
+        until(lambda: sender.stored == 1, lambda: sender.listen(0.05))
+        assert sender.send(track(WINDOW + 1))
+
+
+def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
+    taken = []
+    with Sender("results", endpoint, 10) as sender:
+        with Receiver("results", endpoint, Position(), 10) as receiver:
+            for seq in range(1, 9):
+                sender.send(track(seq))
+
+            def turn():
+                sender.listen(0)
+                take(receiver, taken, store=len(taken) < 3)
+
+            until(lambda: len(taken) == 6, turn)
+            receiver.acknowledge(Position(3))
+        again = []
+        with Receiver("results", endpoint, Position(3), 10) as receiver:
+
+            def on():
+                if sender.sent < 20:
+                    sender.send(track(sender.sent + 1))
+                sender.listen(0)
+                take(receiver, again, store=True)
+
+            until(lambda: sender.stored == 20, on)
+    assert taken == [1, 2, 3, 4, 5, 6]
+    assert again == list(range(4, 21))
+
+
+def test_a_restarted_sender_repeats_nothing_that_was_taken(endpoint, until):
+    taken = []
+    with Receiver("results", endpoint, Position(), 10) as receiver:
+        with Sender("results", endpoint, 10) as sender:
+            for seq in range(1, 6):
+                sender.send(track(seq))
+
+            def turn():
+                sender.listen(0)
+                take(receiver, taken, store=True)
+
+            until(lambda: len(taken) == 5, turn)
+        with Sender("results", endpoint, 10) as sender:
+            found = []
+
+            def ask():
+                found.append(sender.position())
+                take(receiver, taken, store=True)
+
+            until(lambda: found and found[-1] is not None, ask)
+            assert found[-1].seq == 5
+            sender.resume(3, found[-1].seq)  # another receiver had less
+
+            def on():
+                if sender.sent < 9:
+                    sender.send(track(sender.sent + 1))
+                sender.listen(0)
+                take(receiver, taken, store=True)
+
+            until(lambda: sender.stored == 9, on)
+    assert taken == list(range(1, 10))
+
+
+def test_a_receiver_of_another_stream_is_noticed(endpoint, until):
+    with Receiver("results", endpoint, Position(99), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+        sender.send(track(1))
+
+        def turn():
+            receiver.receive(0.05)
+            sender.listen(0.05)
+
+        with pytest.raises(ProtocolError, match="another stream"):
+            until(lambda: False, turn)
+
+
+JUNK = [
+    [b"\x00"],
+    [b"not msgpack"],
+    [b"", b"two parts"],
+    [encode(Health("trainer", 0.0))],
+    [b"\x93\x01" + b"\x91" * 1015 + b"\x90\x80"],
+]
+
+
+def test_the_bytes_of_a_stranger_are_counted_and_dropped(endpoint, stranger, until):
+    taken = []
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+        other = stranger(zmq.DEALER, "results")
+        for parts in JUNK:
+            other.send_multipart(parts)
+
+        def turn():
+            sender.listen(0)
+            take(receiver, taken, store=True)
+
+        until(lambda: receiver.refused == len(JUNK), turn)
+        sender.send(track(1))
+        until(lambda: sender.stored == 1, turn)
+    assert taken == [1]
+
+
+def test_a_message_above_the_limit_is_not_even_read(endpoint, stranger, until):
+    taken = []
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+        other = stranger(zmq.DEALER, "results")
+        other.send(bytes(CHANNELS["results"].limit + 1))
+        sender.send(track(1))
+
+        def turn():
+            sender.listen(0)
+            take(receiver, taken, store=True)
+
+        until(lambda: sender.stored == 1, turn)
+        assert not other.poll(0)
+    assert taken == [1]
+    assert not receiver.refused
+
+
+def test_a_reader_that_never_reads_holds_nobody_up(endpoint, until):
+    messages, long = 8000, "x" * 4000  # more than all buffers on the way hold
+    with Publisher("tracks", endpoint) as tracks, Subscriber("tracks", endpoint) as idle:
+        heard = []
+        until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(idle.waiting())))
+        for seq in range(2, messages + 2):
+            tracks.send(End(seq, long))
+        rest = [message.seq for message in iter(lambda: idle.receive(0.2), None)]
+    assert rest == sorted(set(rest)), "what arrives is in order"
+    assert 0 < len(rest) < messages, "what does not fit is lost, and seq tells"
+
+
+def test_where_the_newest_counts_a_slow_reader_skips_the_older(endpoint, until):
+    with Publisher("models", endpoint) as models, Subscriber("models", endpoint) as reader:
+        until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))
+        for version in range(2, 101):
+            models.send(model(version))
+        seen = []
+
+        def turn():
+            models.welcome()
+            seen.extend(message.version for message in reader.waiting())
+
+        until(lambda: seen and seen[-1] == 100, turn)
+    assert len(seen) < 100
+
+
+def test_who_comes_late_gets_the_last_model(endpoint, until):
+    with Publisher("models", endpoint) as models:
+        models.send(model(1))
+        models.send(model(2))
+        with Subscriber("models", endpoint) as late:
+            got = []
+            until(lambda: got, lambda: (models.welcome(), got.extend(late.waiting())))
+    assert got[0].version == 2
+    assert got[0].weights.tolist() == [2] * 5
+
+
+def test_who_comes_late_gets_no_old_tracks(endpoint, until):
+    with Publisher("tracks", endpoint) as tracks:
+        tracks.send(track(1))
+        with Subscriber("tracks", endpoint) as late:
+            got, seq = [], iter(range(2, 10_000))
+
+            def turn():
+                tracks.send(track(next(seq)))
+                message = late.receive(0.01)
+                if message is not None:
+                    got.append(message.seq)
+
+            until(lambda: got, turn)
+    assert got[0] > 1
+
+
+def test_all_three_processes_are_heard_on_one_channel(endpoint, until):
+    with ExitStack() as stack:
+        names = CHANNELS["health"].senders
+        publishers = {name: stack.enter_context(Publisher("health", endpoint, name)) for name in names}
+        reader = stack.enter_context(Subscriber("health", endpoint))
+        heard = set()
+
+        def turn():
+            for name, publisher in publishers.items():
+                publisher.send(Health(name, 0.0))
+            heard.update(message.process for message in reader.waiting())
+
+        until(lambda: heard == set(names), turn)
+
+
+def test_the_end_comes_through_like_any_other_message(endpoint, until):
+    with Publisher("samples", endpoint) as samples, Subscriber("samples", endpoint) as reader:
+        samples.send(End(1, "the source came to its end"))
+        got = []
+        until(lambda: got, lambda: (samples.welcome(), got.extend(reader.waiting())))
+    assert got[0].reason == "the source came to its end"
+
+
+@pytest.mark.parametrize(
+    "bind",
+    [
+        lambda endpoint: Receiver("features", endpoint, Position(), WINDOW),
+        lambda endpoint: Publisher("models", endpoint),
+    ],
+    ids=["receiver", "publisher"],
+)
+def test_a_second_one_at_the_same_address_is_refused(endpoint, bind):
+    with bind(endpoint):
+        with pytest.raises(ServiceError, match="another pipeline may be running"):
+            bind(endpoint)
+        with pytest.raises(ServiceError, match="another pipeline may be running"):
+            bind(endpoint)
+    with bind(endpoint):
+        pass
+
+
+def test_ipv6_loopback_is_an_endpoint(until):
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6) as probe:
+            port = probe.getsockname()[1]
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    endpoint = Endpoint.parse(f"tcp://[::1]:{min(port, 65000)}")
+    with Publisher("models", endpoint) as models, Subscriber("models", endpoint) as reader:
+        until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))
