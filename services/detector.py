@@ -17,6 +17,7 @@ from catstream.wire.sockets import Publisher, Sender, Subscriber
 __all__ = ["main"]
 
 _FAREWELL_SECONDS = 10.0  # what the last messages may take to be stored
+_STOPPED_SECONDS = 0.5  # what the last tracks may take where the run was stopped: its owner may listen no more
 
 _log = logging.getLogger(__name__)
 
@@ -118,6 +119,8 @@ class _Line:
         deadline = time.monotonic() + _FAREWELL_SECONDS
         totals: dict[str, float] = {}
         for sender in self._senders:
+            if sender is self._results and self._process.ended:
+                deadline = min(deadline, time.monotonic() + _STOPPED_SECONDS)
             self._deliver(sender, End(seq + 1, reason, failed, totals), deadline)
             while sender.stored < sender.sent and time.monotonic() < deadline:
                 sender.listen(0.02)
