@@ -62,6 +62,7 @@ class Pipeline:
         with open_source(self._source) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
         self._box.inside(*self.size)
+        self.settings = self.settings.for_length(self.frames)
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -104,8 +105,7 @@ class Pipeline:
 
     @property
     def health(self) -> dict[str, dict[str, float]]:
-        """The latest counters of each process, by its name."""
-        self._listen()
+        """The latest counters of each process that came while iterating, by its name."""
         return {name: health.counters for name, health in self._health.items()}
 
     @property

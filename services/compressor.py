@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from catstream.compression.compressor import Compressor
@@ -54,8 +55,10 @@ def main(process: Process, state: Path | None) -> None:
                 compressor.save(file)
                 stored, saved = _position(compressor), time.monotonic()
             if message is not None:
-                # The end of the stream holds no features: with all before it, it is stored too.
-                features.acknowledge(_position(compressor, message.seq) if end else stored)
+                # The end of the stream holds no features: with all before it, it is stored too. A sample needs
+                # no checkpoint to be made: in lockstep the detector waits for its model.
+                now = replace(stored, version=compressor.version)
+                features.acknowledge(_position(compressor, message.seq) if end else now)
             samples.welcome()
             process.beat(counters, now=end)
             if end:

@@ -35,6 +35,14 @@ def take(receiver, taken, *, store):
         receiver.acknowledge(Position(message.seq if store else 0))
 
 
+def first(publisher, endpoint, until):
+    """What a new reader hears first."""
+    heard = []
+    with Subscriber(publisher.channel.name, endpoint) as reader:
+        until(lambda: heard, lambda: (publisher.welcome(), heard.extend(reader.waiting())))
+    return heard[0]
+
+
 @pytest.fixture
 def stranger(endpoint):
     """A raw socket of a given kind at a channel's address."""
@@ -242,11 +250,10 @@ def test_who_comes_late_gets_the_last_model(endpoint, until):
     with Publisher("models", endpoint) as models:
         models.send(model(1))
         models.send(model(2))
-        with Subscriber("models", endpoint) as late:
-            got = []
-            until(lambda: got, lambda: (models.welcome(), got.extend(late.waiting())))
-    assert got[0].version == 2
-    assert got[0].weights.tolist() == [2] * 5
+        assert first(models, endpoint, until).version == 2
+        late = first(models, endpoint, until)
+    assert late.version == 2
+    assert late.weights.tolist() == [2] * 5
 
 
 def test_who_comes_late_gets_no_old_tracks(endpoint, until):
@@ -281,11 +288,9 @@ def test_all_three_processes_are_heard_on_one_channel(endpoint, until):
 
 
 def test_the_end_comes_through_like_any_other_message(endpoint, until):
-    with Publisher("samples", endpoint) as samples, Subscriber("samples", endpoint) as reader:
+    with Publisher("samples", endpoint) as samples:
         samples.send(End(1, "the source came to its end"))
-        got = []
-        until(lambda: got, lambda: (samples.welcome(), got.extend(reader.waiting())))
-    assert got[0].reason == "the source came to its end"
+        assert first(samples, endpoint, until).reason == "the source came to its end"
 
 
 @pytest.mark.parametrize(
