@@ -46,7 +46,7 @@ format: $(READY)  ## put style right where that needs no thought
 	$(BIN)/ruff format .
 
 docs: $(READY)  ## the documentation, into site/
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 settings: $(READY)  ## write the table of docs/settings.md anew
 	$(BIN)/python tests/test_docs.py

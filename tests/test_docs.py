@@ -1,0 +1,185 @@
+"""The docs say what the code does: whatever a person can name has its line, and what the pages show runs.
+
+Run as a program, it writes the table of `docs/settings.md` anew: `make settings`.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import json
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import click
+import pytest
+
+import catstream
+from catstream.cli import VERBS
+from catstream.settings import PRESETS, describe
+from catstream.wire.channels import CHANNELS
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("**/*.md")])
+EVERY_PAGE = pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+
+_TABLE = re.compile(r"(<!-- settings: .*? -->\n).*?(<!-- /settings -->)", re.DOTALL)
+
+
+def page(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def everything() -> str:
+    return "\n".join(path.read_text(encoding="utf-8") for path in PAGES)
+
+
+def prose(path: Path) -> str:
+    """A page without its fenced blocks."""
+    return re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def blocks(path: Path, language: str) -> Iterator[str]:
+    """Contents of the fenced blocks of a language."""
+    yield from re.findall(rf"^```{language}\n(.*?)^```", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def commands(path: Path) -> Iterator[list[str]]:
+    """Words of each command that a page shows after a prompt."""
+    for block in blocks(path, "console"):
+        for line in block.replace("\\\n", " ").splitlines():
+            if line.startswith("$ "):
+                yield shlex.split(line.removeprefix("$ "), comments=True)
+
+
+def anchors(path: Path) -> set[str]:
+    """What a link may name after #."""
+    headings = re.findall(r"^#+ (.*)", prose(path), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+def settings_table() -> str:
+    """The tables of settings and of presets, as `docs/settings.md` shows them."""
+    lines = ["| setting | takes | default | meaning |", "| --- | --- | --- | --- |"]
+    for name, takes, default, meaning in describe():
+        shown = "empty" if default == "" else str(default).lower() if isinstance(default, bool) else default
+        takes, meaning = takes.replace("|", "\\|"), meaning.replace("|", "\\|")
+        lines.append(f"| `{name}` | {takes} | {shown} | {meaning} |")
+    lines += ["", "| preset | sets |", "| --- | --- |"]
+    for preset, values in PRESETS.items():
+        pairs = (f"`{name} = {json.dumps(value)}`" for name, value in values.items())
+        lines.append(f"| `{preset}` | {', '.join(pairs)} |")
+    return "\n".join(lines) + "\n"
+
+
+def verbs() -> dict[str, click.Command]:
+    return {name: getattr(import_module(f"catstream.cli.{name}"), name) for name in VERBS}
+
+
+def test_every_setting_and_preset_has_its_row():
+    shown = _TABLE.search(page("docs/settings.md"))
+    assert shown, "docs/settings.md has lost the marks around its table"
+    assert settings_table() in shown[0], "docs/settings.md does not show the settings as they are: run `make settings`"
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_every_channel_has_its_row(name):
+    for where in ("docs/architecture.md", "docs/protocol.md"):
+        assert f"`{name}`" in page(where), f"{where} says nothing of the channel {name}"
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_every_verb_is_shown(name):
+    assert f"`{name}`" in page("README.md") or f"catstream {name}" in page("README.md"), f"README.md: add {name}"
+    assert re.search(rf"catstream {name}\b", everything()), f"no page of docs/ shows `catstream {name}`"
+
+
+@pytest.mark.parametrize(
+    ("verb", "option"),
+    [(name, option) for name, verb in verbs().items() for option in verb.params if isinstance(option, click.Option)],
+    ids=lambda part: part if isinstance(part, str) else part.name,
+)
+def test_every_option_is_explained(verb, option):
+    flag = max(option.opts, key=len)
+    where = "docs/command-line.md"
+    rows = page(where).partition(f"## {verb}\n")[2].partition("\n## ")[0]
+    common = page(where).partition("## settings\n")[2].partition("\n## ")[0]
+    assert f"`{flag}" in rows + common, f"{where}, section {verb}: add the option {flag}"
+
+
+def test_every_file_that_track_writes_is_explained(tmp_path):
+    from catstream.video.results import ResultsWriter
+
+    with ResultsWriter(tmp_path, "NAME"):
+        names = [path.name for path in tmp_path.iterdir()]
+    for name in [*names, "NAME.mp4"]:
+        assert f"`{name}`" in page("docs/tutorial.md"), f"docs/tutorial.md does not say what is in {name}"
+
+
+@EVERY_PAGE
+def test_links_lead_somewhere(path):
+    for link in re.findall(r"\]\(([^)\s]+)\)", prose(path)):
+        if "://" in link:
+            continue
+        file, _, anchor = link.partition("#")
+        target = (path.parent / file).resolve() if file else path
+        assert target.exists(), f"{path.name} links to {link}, which is not there"
+        assert not anchor or anchor in anchors(target), f"{path.name} links to {link}, but it has no such heading"
+
+
+@EVERY_PAGE
+def test_commands_are_ones_that_exist(path):
+    """Their verbs, options and make's targets."""
+    targets = set(re.findall(r"^([a-z-]+):", page("Makefile"), re.MULTILINE))
+    for program, *words in commands(path):
+        if program == "make":
+            assert words[0] in targets, f"{path.name} shows `make {words[0]}`, which is no target"
+        if program == "catstream":
+            name, *words = words
+            assert name in VERBS, f"{path.name} shows `catstream {name}`, which is no verb"
+            verb = verbs()[name]
+            with click.Context(verb) as context:
+                known = {flag for option in verb.get_params(context) for flag in option.opts}
+            wrong = {word for word in words if word.startswith("--")} - known
+            assert not wrong, f"{path.name} shows `catstream {name}` with {wrong}, which it does not take"
+
+
+@EVERY_PAGE
+def test_python_on_a_page_uses_names_that_exist(path):
+    for block in blocks(path, "python"):
+        tree = ast.parse(block)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("catstream"):
+                for alias in node.names:
+                    assert hasattr(import_module(node.module or ""), alias.name), f"{path.name}: no {alias.name}"
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "catstream":
+                assert node.attr in catstream.__all__, f"{path.name}: there is no catstream.{node.attr}"
+
+
+def test_the_tutorials_tracker_follows():
+    (block,) = (block for block in blocks(DOCS / "tutorial.md", "python") if "catstream.Tracker()" in block)
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(block, "docs/tutorial.md", "exec"), {})
+    found, x, y = printed.getvalue().split()[:3]
+    assert (found, abs(int(x) - 62) <= 2, abs(int(y) - 40) <= 2) == ("True", True, True)
+
+
+def test_every_test_that_a_page_names_exists():
+    tests = "\n".join(path.read_text(encoding="utf-8") for path in ROOT.glob("tests/**/test_*.py"))
+    for name in set(re.findall(r"`(test_\w+)`", everything())):
+        assert f"def {name}(" in tests, f"docs/ name {name}, which is no test"
+
+
+def test_one_version_is_told_everywhere():
+    assert tomllib.loads(page("pyproject.toml"))["project"]["version"] == catstream.__version__
+
+
+if __name__ == "__main__":
+    settings = DOCS / "settings.md"
+    settings.write_text(_TABLE.sub(lambda found: found[1] + settings_table() + found[2], page("docs/settings.md")))
