@@ -1,0 +1,73 @@
+"""Whether the pipeline slows down or grows: 20,000 frames and more through the real processes.
+
+TLD_01_david, forwards and backwards again and again, so that nothing jumps. Both medians are over one whole
+such turn, so that the same images are compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from journey import Journey, draw, travel
+from sequences import named, scratch
+from table import Table, command, publish
+
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.metrics import score
+from catstream.settings import Settings
+from catstream.video.writer import VideoWriter
+
+EARLY = 1_000
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    sequence = named(options, "TLD_01_david")
+    turn = 2 * len(sequence) - 2
+    frames, early = (200, turn) if options.quick else (options.frames, EARLY)
+    order = len(sequence) - 1 - abs(np.arange(frames + turn // 2) % turn - (len(sequence) - 1))
+    source = looped(sequence, order)
+    journey = travel(str(source), sequence.boxes[0], Settings(), watch=20 if options.quick else 250)
+    draw({"": journey}, options.plot)
+
+    before, after = (around(journey, frame, turn) for frame in (early, frames))
+    success = score(np.array(journey.boxes), sequence.boxes[order]).success
+    columns = ("frames", f"ms around {early}", f"ms around {frames}", "ratio", "frames/s", "success")
+    rows = [(len(order), before, after, after / before, journey.rate, success)]
+    yield Table("Time a frame", columns, rows, f"medians over {turn} frames; {options.plot} shows all")
+    yield Table("Memory", ("process", f"MB at {early}", "MB at the end", "most"), list(memory(journey, early)))
+
+
+def looped(sequence: Sequence, order: np.ndarray) -> Path:
+    """A video of the sequence's frames in some order."""
+    images = list(sequence.frames())
+    height, width = images[0].shape[:2]
+    path = scratch() / "loop.mp4"
+    with VideoWriter(path, 25, (width, height)) as video:
+        for number in order:
+            video.write(images[number])
+    return path
+
+
+def around(journey: Journey, frame: int, turn: int) -> float:
+    """Median milliseconds a frame over a turn, as far as there are frames before the given one."""
+    begin = max(frame - turn // 2, 0)
+    return float(np.median(journey.milliseconds[begin : begin + turn]))
+
+
+def memory(journey: Journey, early: int) -> Iterator[tuple[str, float, float, float]]:
+    """Resident megabytes of each process: early, last and most."""
+    for name, seen in journey.memory.items():
+        megabytes = [resident for _, resident in seen]
+        first = next(resident for frame, resident in seen if frame >= early)
+        yield name, first, megabytes[-1], max(megabytes)
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--frames", type=int, default=20_000, help="at least as many (default: %(default)s)")
+    parser.add_argument("--plot", type=Path, default=Path("out/endurance.png"), help="(default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)

@@ -1,0 +1,90 @@
+"""Milliseconds that the parts of the algorithm take, one by one, on one core."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from statistics import median
+from time import perf_counter
+
+import numpy as np
+from sequences import rendered
+from table import Table, command, publish
+
+from catstream.compression.reduce import reduce
+from catstream.detection.hog import grid
+from catstream.detection.windows import respond
+from catstream.evaluation.datasets import Sequence
+from catstream.messages import Sample
+from catstream.settings import Settings
+from catstream.tracker import Tracker
+from catstream.training.motion_em import learn_motion
+from catstream.training.trainer import Trainer
+
+SIZES = (64, 256)
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    sequence = rendered(24 if options.quick else 600)
+    work = list(detection(sequence)) + list(learning(sequence)) + list(motion())
+    runs = 1 if options.quick else options.runs
+    rows = [(name, milliseconds(call, runs)) for name, call in work]
+    yield Table("Kernels", ("step", "ms"), rows, f"median of {runs} after one to warm up")
+
+
+def milliseconds(call: Callable[[], object], runs: int) -> float:
+    """Median time of a call, after one to warm up."""
+    call()
+    times = []
+    for _ in range(runs):
+        begin = perf_counter()
+        call()
+        times.append((perf_counter() - begin) * 1000)
+    return median(times)
+
+
+def detection(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Of one image of 640x480 pixels."""
+    image = next(sequence.frames())
+    cells = grid(image)
+    weights = cells[:8, :8].reshape(-1).copy()
+    yield "HOG and colour, 640x480", lambda: grid(image)
+    yield f"score all {(cells.shape[0] - 7) * (cells.shape[1] - 7)} windows of it", lambda: respond(cells, weights, 0.0)
+
+
+def learning(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:
+    """From what was learned of a whole video, at each coreset size."""
+    for n in SIZES:
+        sample = sample_of(sequence, n)
+        rows = np.vstack([sample.object.rows, sample.background.rows])[: 2 * n]
+        yield f"reduce {len(rows)} rows to n = {n}", lambda rows=rows, n=n: reduce(rows, n)
+        for classifier in ("joint", "least-squares", "one-class"):
+            trainer = Trainer(Settings(coreset_size=n, classifier=classifier))
+            yield f"train, {classifier}, n = {n}", lambda trainer=trainer, sample=sample: trainer.train(sample)
+
+
+def sample_of(sequence: Sequence, n: int) -> Sample:
+    """What the trees hold once the tracker has followed the whole sequence."""
+    tracker = Tracker(Settings(coreset_size=n))
+    for row, image in enumerate(sequence.frames()):
+        if row == 0:
+            tracker.init(image, sequence.boxes[0])
+        else:
+            tracker.update(image)
+    sample = tracker.compressor.last_sample
+    assert sample is not None, "the first frame teaches a leaf of each tree"
+    return sample
+
+
+def motion() -> Iterator[tuple[str, Callable[[], object]]]:
+    """Of a random walk."""
+    for m in (64, 500):
+        centres = np.random.default_rng(0).normal(size=(m, 2)).cumsum(axis=0) + 200
+        yield f"EM of the Kalman filter, {m} centres", lambda centres=centres: learn_motion(centres)
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--runs", type=int, default=21, help="of each step (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)

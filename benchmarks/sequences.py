@@ -1,0 +1,61 @@
+"""The videos that benchmarks run on: annotated sequences from a folder, or rendered ones."""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import tempfile
+from functools import cache
+from pathlib import Path
+
+from catstream.errors import VideoError
+from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.video import demo
+
+__all__ = ["named", "rendered", "scratch", "sequences", "video"]
+
+_QUICK_FRAMES = 24
+
+
+@cache
+def scratch() -> Path:
+    """A folder that is gone when the benchmark is."""
+    folder = tempfile.TemporaryDirectory(prefix="catstream-benchmark-")
+    atexit.register(folder.cleanup)
+    return Path(folder.name)
+
+
+@cache
+def rendered(frames: int, size: tuple[int, int] = demo.SIZE) -> Sequence:
+    """The demo's video, of any length and size, as a sequence."""
+    folder = scratch() / f"demo-{size[0]}x{size[1]}-{frames}"
+    demo.write(folder, frames, size)
+    return find_sequences(folder)[0]
+
+
+def sequences(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
+    """Those in the folder of data whose name begins so; with --quick a few rendered frames instead.
+
+    Raises
+    ------
+    VideoError
+        Where there is none.
+    """
+    if options.quick:
+        return [rendered(_QUICK_FRAMES, (320, 240))]
+    if not options.data.is_dir():
+        raise VideoError(f"there are no sequences at {options.data}: give their folder with --data, or --quick")
+    found = [sequence for sequence in find_sequences(options.data) if sequence.name.startswith(prefix)]
+    if not found:
+        raise VideoError(f"there is no sequence {prefix}* in {options.data}: give another --data")
+    return found
+
+
+def named(options: argparse.Namespace, name: str) -> Sequence:
+    """The one sequence of that name, or what --quick puts in its place."""
+    return sequences(options, name)[0]
+
+
+def video(sequence: Sequence) -> str:
+    """What `catstream track` is given to follow it."""
+    return str(sequence.path)

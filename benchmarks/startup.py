@@ -1,0 +1,84 @@
+"""Seconds from the command `catstream track` to its first track, and to the first model that it learned.
+
+Cold: the kernels have to be compiled first. Warm: they are in the cache, as from the second start on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+
+from sequences import named, video
+from table import Table, command, publish
+
+from catstream.box import Box
+from catstream.errors import ServiceError
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    sequence = named(options, "TLD_01_david")
+    box, runs = Box(*sequence.boxes[0]), 1 if options.quick else options.runs
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for kernels in ("cold", "warm"):
+            caches = [Path(folder, str(run) if kernels == "cold" else "0") for run in range(runs)]
+            times = [start(video(sequence), box, cache) for cache in caches]
+            first = [seconds for seconds, _ in times]
+            learned = [seconds for _, seconds in times if seconds is not None]
+            rows.append((kernels, runs, median(first), max(first), median(learned) if learned else None))
+    columns = ("kernels", "runs", "first track, s", "the slowest", "first learned model, s")
+    yield Table(f"From the command on, {sequence.name}", columns, rows, "medians; a real process, imports and all")
+
+
+def start(source: str, box: Box, kernels: Path) -> tuple[float, float | None]:
+    """Seconds to the first track, and to the first of a learned model, None where the video ends before.
+
+    Compiled kernels are kept in the folder `kernels`.
+    """
+    with tempfile.TemporaryDirectory() as output:
+        begin = time.perf_counter()
+        process = subprocess.Popen(
+            [Path(sys.executable).with_name("catstream"), "track", source, "--box", str(box), "--output", output],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(kernels)},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            first, learned = (wait(process, Path(output), version, begin) for version in (0, 1))
+        finally:
+            process.terminate()
+            process.wait()
+    if first is None:
+        raise ServiceError(f"catstream track {source} --box {box} gave no track: run it by hand to see why")
+    return first, learned
+
+
+def wait(process: subprocess.Popen[bytes], output: Path, version: int, begin: float) -> float | None:
+    """Seconds until a track with this version of the model, or a newer one, is in the results."""
+    running = True
+    while running:
+        running = process.poll() is None
+        if any(found >= version for found in versions(output / "tracks.csv")):
+            return time.perf_counter() - begin
+        time.sleep(0.002)
+    return None
+
+
+def versions(tracks: Path) -> list[int]:
+    """Model version of each whole row."""
+    lines = tracks.read_text().split("\n")[1:-1] if tracks.exists() else []
+    return [int(line.rsplit(",", 1)[1]) for line in lines]
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--runs", type=int, default=7, help="starts of each kind (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)

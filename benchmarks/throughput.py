@@ -1,0 +1,92 @@
+"""Frames a second from end to end, decoding included, by the real pipeline; and what each step costs.
+
+A file that is fast to decode and small (TLD_01_david, 320x240), and a rendered one of 640x480 pixels.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from journey import travel
+from sequences import named, rendered, video
+from table import Table, command, publish
+
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
+from catstream.detection.detector import Detector
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.metrics import score
+from catstream.settings import Settings
+from catstream.training.trainer import Trainer
+
+MODES = ("local", "full")
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    videos = [named(options, "TLD_01_david")] + ([] if options.quick else [rendered(600)])
+    runs = [
+        (sequence, mode, *repeated(sequence, mode, 1 if options.quick else options.runs))
+        for sequence in videos
+        for mode in MODES
+    ]
+    columns = ("video", "detection", "frames", "frames/s", "slowest run", "success")
+    rows = [(sequence.name, mode, len(sequence), *found) for sequence, mode, *found in runs]
+    note = "three processes, from the first track to the last; the paper: 3 frames/s, n <= 64"
+    yield Table("End to end", columns, rows, note)
+    yield steps(videos)
+
+
+def repeated(sequence: Sequence, mode: str, runs: int) -> tuple[float, float, float]:
+    """Median and least frames a second of some runs, and the success of the last."""
+    rates = []
+    for _ in range(runs):
+        journey = travel(video(sequence), sequence.boxes[0], Settings(detection=mode))
+        rates.append(journey.rate)
+    return median(rates), min(rates), score(np.array(journey.boxes), sequence.boxes).success
+
+
+def steps(videos: list[Sequence]) -> Table:
+    """Milliseconds a frame of each step: the three stages in one process, one after the other."""
+    columns = ("video", "detection", "decode", "detect", "compress", "train", "all")
+    rows = []
+    for sequence in videos:
+        for mode in MODES:
+            spent = np.array(costs(sequence, Settings(detection=mode))) / len(sequence)
+            rows.append((sequence.name, mode, *spent.tolist(), float(spent.sum())))
+    return Table("Milliseconds a frame, on one core", columns, rows, "in the pipeline the last three run side by side")
+
+
+def costs(sequence: Sequence, settings: Settings) -> list[float]:
+    """Milliseconds spent in all on decoding, detecting, compressing and training."""
+    detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
+    spent = [0.0] * 4
+
+    def timed(step: int, work: Callable[..., Any], *arguments: Any) -> Any:
+        begin = perf_counter()
+        answer = work(*arguments)
+        spent[step] += (perf_counter() - begin) * 1000
+        return answer
+
+    frames = sequence.frames()
+    for row in range(len(sequence)):
+        image = timed(0, next, frames)
+        if row == 0:
+            _, features = timed(1, detector.init, image, Box(*sequence.boxes[0]))
+        else:
+            _, features = timed(1, detector.step, image)
+        sample = timed(2, compressor.take, features)
+        if sample is not None:
+            detector.adopt(timed(3, trainer.train, sample))
+    return spent
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--runs", type=int, default=3, help="runs of each video (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)

@@ -1,0 +1,27 @@
+"""Every benchmark runs, on a few rendered frames: what it would measure is for a quiet machine."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SCRIPTS = sorted(path for path in BENCHMARKS.rglob("*.py") if "__main__" in path.read_text())
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: str(path.relative_to(BENCHMARKS)))
+def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path):
+    figures = tmp_path / "figures.json"
+    command = [sys.executable, script, "--quick", "--json", figures]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    tables = json.loads(figures.read_text())["tables"]
+    assert tables
+    for table in tables:
+        assert table["rows"], table["title"]
+        for row in table["rows"]:
+            assert len(row) == len(table["columns"])
+            assert all(math.isfinite(cell) for cell in row if isinstance(cell, float)), (table["title"], row)
