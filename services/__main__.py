@@ -34,6 +34,7 @@ def main(context: click.Context, parent: int | None) -> None:
     the same settings.
 
     \b
+      mkdir -m 700 run
       python -m catstream.services compressor --set endpoint=run &
       python -m catstream.services trainer    --set endpoint=run &
       python -m catstream.services detector   --set endpoint=run walk.mp4 --box 120,80,64,48
