@@ -36,8 +36,8 @@ class Tracker:
     >>> tracker = Tracker()
     >>> tracker.init(frame, (60, 40, 40, 40))
     >>> ok, box = tracker.update(np.roll(frame, 2, axis=1))
-    >>> ok, round(box.x), round(box.y)
-    (True, 62, 40)
+    >>> ok, box.overlap(Box(62, 40, 40, 40)) > 0.9
+    (True, True)
     """
 
     def __init__(self, settings: Settings | None = None) -> None:

@@ -166,8 +166,7 @@ def test_the_tutorials_tracker_follows():
     (block,) = (block for block in blocks(DOCS / "tutorial.md", "python") if "catstream.Tracker()" in block)
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(compile(block, "docs/tutorial.md", "exec"), {})
-    found, x, y = printed.getvalue().split()[:3]
-    assert (found, abs(int(x) - 62) <= 2, abs(int(y) - 40) <= 2) == ("True", True, True)
+    assert printed.getvalue().startswith("True True\n")
 
 
 def test_every_test_that_a_page_names_exists():
