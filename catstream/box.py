@@ -43,6 +43,15 @@ class Box(NamedTuple):
         """The box with the same size around another centre."""
         return Box(x - self.w / 2, y - self.h / 2, self.w, self.h)
 
+    def held_in(self, width: int, height: int) -> Box:
+        """The box moved, where it must be, until its centre is in a frame of this size.
+
+        >>> Box(90, 10, 20, 20).held_in(80, 60)
+        Box(x=69.0, y=10.0, w=20, h=20)
+        """
+        x, y = self.centre
+        return self.centred(min(max(x, 0), width - 1), min(max(y, 0), height - 1))
+
     def overlap(self, other: Box) -> float:
         """Intersection over union, 0 to 1: the overlap score S of the benchmarks."""
         w = min(self.x + self.w, other.x + other.w) - max(self.x, other.x)

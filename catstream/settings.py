@@ -26,7 +26,7 @@ __all__ = ["PRESETS", "Settings", "describe"]
 
 
 def _about(description: str, **bounds: float) -> Meta:
-    return Meta(description=description, **bounds)  # type: ignore[arg-type]
+    return Meta(description=description, **bounds)  # type: ignore[call-overload]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,9 @@ class Settings:
 
     # --- the coreset trees (paper, "Coreset Tree") -----------------------------------------------
     coreset_size: Annotated[int, _about("n: rows of a node of a coreset tree.", ge=2, le=4096)] = 64
-
+    coreset_share: Annotated[
+        float, _about("n as a share of the video's frames, as the paper sets it (0: coreset_size holds).", ge=0, le=0.5)
+    ] = 0.0
     train_frames: Annotated[int, _about("Frames at least between two samples that the trainer learns from.", ge=1)] = 5
 
     # --- training --------------------------------------------------------------------------------
@@ -113,9 +115,6 @@ class Settings:
     near_sigma: Annotated[
         float, _about("Distance, in cells, at which a near miss is worth exp(-1/2) of the object.", gt=0)
     ] = 0.9
-    kalman: Annotated[int, _about("k")] = 1
-    near_scale: Annotated[float, _about("scale near misses")] = 1.0
-    near_scale_sigma: Annotated[float, _about("scale near misses")] = 0.1
     near_negatives: Annotated[int, _about("Background windows a frame around the object.", ge=1)] = 12
     far_negatives: Annotated[int, _about("Hard negatives from a whole frame.", ge=0)] = 10
     mine_frames: Annotated[int, _about("Frames from one search for hard negatives to the next.", ge=1)] = 5
@@ -179,6 +178,27 @@ class Settings:
                 raise SettingsError(f"setting {name} cannot be {value!r}: {error}") from None
         return cls(**checked)
 
+    def for_length(self, frames: int | None) -> Settings:
+        """These settings for a video of so many frames: `coreset_share` becomes a `coreset_size`.
+
+        Raises
+        ------
+        SettingsError
+            Where there is a share and the length is not known.
+
+        >>> Settings(coreset_share=0.1).for_length(945).coreset_size
+        94
+        """
+        if not self.coreset_share:
+            return self
+        if frames is None:
+            raise SettingsError(
+                f"coreset_share={self.coreset_share:g} is a share of the video's length, and this source has none: "
+                "set coreset_size instead"
+            )
+        size = {"coreset_size": max(2, round(self.coreset_share * frames)), "coreset_share": 0.0}
+        return Settings.of(self.values() | size)
+
     def values(self) -> dict[str, Any]:
         """All of them, by name."""
         return dataclasses.asdict(self)
@@ -194,9 +214,13 @@ class Settings:
         return [f"{field.name}={text}" for field, text in texts if getattr(self, field.name) != field.default]
 
 
-#: What the paper set, and other points of departure, by name.
+_PAPER = {"classifier": "one-class", "detection": "full"}
+
+#: What the paper set, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.
 PRESETS: dict[str, dict[str, Any]] = {
-    "one-class-paper": {"classifier": "one-class", "detection": "full"},
+    "one-class-paper": _PAPER,
+    "cat10": _PAPER | {"coreset_share": 0.10, "copies": 1},
+    "cat25": _PAPER | {"coreset_share": 0.25, "copies": 0},
 }
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from catstream.errors import BoxError
+from catstream.box import Box
+from catstream.errors import BoxError, SettingsError
 from catstream.settings import PRESETS, Settings
 from catstream.tracker import Tracker
 
@@ -33,18 +34,18 @@ def follow(video, settings):
 
 @pytest.mark.parametrize("preset", [None, *PRESETS])
 def test_a_patch_is_followed(video, preset):
-    found, tracker = follow(video, Settings.load(preset=preset, environment={}))
+    found, tracker = follow(video, Settings.load(preset=preset, environment={}).for_length(len(video[0])))
     assert tracker.track.model_version >= 1
     assert tracker.compressor.seq == len(found) + 1
-    assert (
-        np.mean(
-            [
-                box is not None and box.overlap(type(box)(*truth)) > 0.5
-                for box, truth in zip(found, video[1][1:], strict=True)
-            ]
-        )
-        > 0.9
-    )
+    pairs = zip(found, video[1][1:], strict=True)
+    assert np.mean([box is not None and box.overlap(Box(*truth)) > 0.5 for box, truth in pairs]) > 0.9
+
+
+def test_a_share_of_an_unknown_length_is_refused(video):
+    with pytest.raises(SettingsError, match="for_length"):
+        follow(video, Settings(coreset_share=0.1))
+    with pytest.raises(SettingsError, match="has none"):
+        Settings(coreset_share=0.1).for_length(None)
 
 
 def test_the_same_frames_give_the_same_boxes(video):

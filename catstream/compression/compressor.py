@@ -14,7 +14,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.compression import storage
 from catstream.compression.tree import CoresetTree
-from catstream.errors import ProtocolError
+from catstream.errors import ProtocolError, SettingsError
 from catstream.messages import Features, Sample
 from catstream.settings import Settings
 
@@ -31,6 +31,11 @@ class Compressor:
     """
 
     def __init__(self, settings: Settings) -> None:
+        if settings.coreset_share:
+            raise SettingsError(
+                f"coreset_share={settings.coreset_share:g} is a share of a video's length: "
+                "call Settings.for_length first, or set coreset_size"
+            )
         self.settings = settings
         self.trees = {name: CoresetTree(settings.coreset_size) for name in _TREES}
         self.centres = np.empty((0, 2))

@@ -17,6 +17,7 @@ from catstream.settings import Settings
 __all__ = ["Detector"]
 
 _FACTORS = [1.0, 0.8, 1.25]  # of the object's size, at which a lost object is searched for
+_GROWTH = 1.18  # factor of size that no object grows by in a frame
 
 
 class Detector:
@@ -89,32 +90,32 @@ class Detector:
         if not self.seq:
             raise BoxError("there is no box to follow yet: call init with a frame and a box first")
         self.seq += 1
-        if self._centre is not None and settings.kalman:
+        if self._centre is not None:
             self._box = self._box.centred(*self._centre.predict())
         found = self._find(image)
-        keep = settings.present_score if self.state != "absent" else settings.return_score
-        if found.score < keep:
-            self.state = "absent"
-            if self._centre:
-                self._centre.update(None)
-            return self._answer(time, found.score, Lesson.of([], 0))
-        self.state = "present" if self.model.version else "bootstrapping"
-        height, width = image.shape[:2]
-        x, y = found.box.centre
-        box = found.box.centred(min(max(x, 0), width - 1), min(max(y, 0), height - 1))
-        growth = math.sqrt(box.area / self._box.area)
-        if found.score < settings.scale_score and 0.85 < growth < 1.2:
-            box = box.scaled(1 / growth)
+        there = found.score >= (settings.return_score if self.state == "absent" else settings.present_score)
+        if there:
+            self.state = "present" if self.model.version else "bootstrapping"
+            height, width = image.shape[:2]
+            self._box = self._resized(found).held_in(width, height)
+            if found.score >= settings.sure_score:
+                self._sure_box = self._box
         else:
-            box = box.scaled(growth ** (settings.scale_rate - 1)) if 0.85 < growth < 1.2 else box
-        if self._centre:
-            self._centre.update(box.centre)
-            if settings.kalman == 2:
-                box = box.centred(*self._centre.centre)
-        self._box = box
-        if found.score >= settings.sure_score:
-            self._sure_box = box
-        return self._answer(time, found.score, self._lesson(image, found.score))
+            self.state = "absent"
+        if self._centre is not None:
+            self._centre.update(self._box.centre if there else None)
+        return self._answer(time, found.score, self._lesson(image, found.score) if there else Lesson.none())
+
+    def _resized(self, found: search.Found) -> Box:
+        """The box found, its size following slowly, and not at all where the score is low.
+
+        A far larger change is no growth of the object, but another place: it is taken over whole.
+        """
+        growth = math.sqrt(found.box.area / self._box.area)
+        if not 1 / _GROWTH < growth < _GROWTH:
+            return found.box
+        followed = self.settings.scale_rate if found.score >= self.settings.scale_score else 0.0
+        return found.box.scaled(growth ** (followed - 1))
 
     def _find(self, image: np.ndarray) -> search.Found:
         settings = self.settings
@@ -133,7 +134,7 @@ class Detector:
     def _lesson(self, image: np.ndarray, score: float) -> Lesson:
         settings = self.settings
         if score < settings.teach_score:
-            return Lesson.of([], 0)
+            return Lesson.none()
         lesson = lessons.near(image, self._box, self.model, self._random(), settings)
         if score > settings.mine_score and self.seq % settings.mine_frames == 0:
             lesson += lessons.far(image, self._box, self.model, settings)

@@ -100,7 +100,7 @@ def _cache_folder() -> str:
 
 
 if not os.environ.get("NUMBA_CACHE_DIR"):
-    numba.config.CACHE_DIR = _cache_folder()
+    numba.config.CACHE_DIR = _cache_folder()  # type: ignore[attr-defined]
 
 _MAGNITUDE, _ORIENTATION = _tables()
 #: For each pixel of a cell: its share in the cell itself; the rest goes to the neighbour on its side.
@@ -113,7 +113,7 @@ _SHARES = (1 - np.abs((np.arange(CELL) + 0.5) / CELL - 0.5)).astype(np.float32)
     nogil=True,
     fastmath=True,
 )
-def _hog(image, magnitudes, orientations, shares, cells):  # type: ignore[no-untyped-def]
+def _hog(image, magnitudes, orientations, shares, cells):
     height, width = image.shape[:2]
     rows, columns = height // CELL, width // CELL
     # One cell more on every side takes the shares that fall outside.

@@ -38,6 +38,11 @@ class Lesson:
         array = np.array(rows, np.float32).reshape(k, row_length())
         return cls(array, np.full(k, label, np.float32), np.full(k, weight, np.float32))
 
+    @classmethod
+    def none(cls) -> Lesson:
+        """A frame that teaches nothing."""
+        return cls.of([], 0)
+
     def __add__(self, other: Lesson) -> Lesson:
         return Lesson(
             np.concatenate([self.rows, other.rows]),
@@ -73,18 +78,13 @@ def _around(
     image: np.ndarray, box: Box, model: Model | None, negatives: int, rng: np.random.Generator, settings: Settings
 ) -> Lesson:
     """Near misses, and background: with a model half of it the highest scoring windows, the rest anywhere."""
-    cells, origin, step = windows.around(image, box, _CELLS)
-    lesson = Lesson.of([], 0)
+    cells, _, _ = windows.around(image, box, _CELLS)
+    lesson = Lesson.none()
     for down, across in rng.integers(-_NEAR, _NEAR + 1, size=(settings.near_misses, 2)):
         distance = down * down + across * across
         if distance:
             label = float(np.exp(-distance / (2 * settings.near_sigma**2)))
             lesson += Lesson.of([windows.row_at(cells, _MIDDLE + down, _MIDDLE + across)], label)
-    for power in (-2, -1, 1, 2) if settings.near_scale > 1 else ():
-        factor = settings.near_scale**power
-        label = float(np.exp(-(np.log(factor) ** 2) / (2 * settings.near_scale_sigma**2)))
-        features, _, _ = windows.around(image, box.scaled(factor), WINDOW)
-        lesson += Lesson.of([features.reshape(-1)], label)
     outside = np.ones((_CELLS - WINDOW + 1,) * 2, bool)
     outside[_MIDDLE - _NEAR : _MIDDLE + _NEAR + 1, _MIDDLE - _NEAR : _MIDDLE + _NEAR + 1] = False
     places = []
@@ -92,7 +92,6 @@ def _around(
         scores = np.where(outside, windows.respond(cells, model.weights, model.bias), -np.inf)
         places = windows.peaks(scores, negatives // 2, _NEAR)
     anywhere = np.argwhere(outside)
-    places += [
-        tuple(place) for place in rng.choice(anywhere, negatives - len(places), replace=negatives > len(anywhere))
-    ]
+    more = rng.choice(anywhere, negatives - len(places), replace=negatives > len(anywhere))
+    places += [(row, column) for row, column in more]
     return lesson + Lesson.of([windows.row_at(cells, *place) for place in places], 0)

@@ -87,7 +87,8 @@ def scored_around(image: np.ndarray, box: Box, cells: int, model: Model) -> Scor
 def scored_whole(image: np.ndarray, box: Box, model: Model) -> Scored:
     """Scores of all windows of the size of a box in a frame.
 
-    Where the frame, resized so that the box is a window, would be too large to search in time, it is the part around the box.
+    Where the frame, resized so that the box is a window, would be too large to search in time,
+    it is the part around the box.
     """
     height, width = image.shape[:2]
     window = WINDOW * CELL

@@ -160,7 +160,7 @@ def _vertex(values: np.ndarray, i: int) -> float:
 
 
 @numba.njit("void(float32[:,:,::1], float32[:,::1])", cache=True, nogil=True, fastmath=True)
-def _add_shifted(parts, scores):  # type: ignore[no-untyped-def]
+def _add_shifted(parts, scores):
     rows, columns = scores.shape
     for row in range(rows):
         for column in range(columns):

@@ -41,9 +41,9 @@ def starts_of(sequence: Sequence, count: int) -> list[int]:
 
 def follow(tracker: str, settings: Settings, sequence: Sequence, start: int = 0) -> Run:
     """Run one tracker from one start to the end of a sequence, in this process."""
-    worker = Tracker(settings) if tracker == "catstream" else Peer(tracker)
-    given = Box(*map(float, sequence.boxes[start]))
     frames = len(sequence) - start
+    worker = Tracker(settings.for_length(frames)) if tracker == "catstream" else Peer(tracker)
+    given = Box(*map(float, sequence.boxes[start]))
     boxes, confidence, seconds = np.full((frames, 4), np.nan), np.full(frames, np.nan), np.zeros(frames)
     for row, image in enumerate(sequence.frames(start)):
         begin = perf_counter()
