@@ -61,7 +61,7 @@ def publish(tables: Iterable[Table], file: Path | None) -> None:
         with threadpool_limits(1):
             for table in tables:
                 console.print(f"[bold]{table.title}[/]", _printed(table), sep="\n")
-                console.print(f"[dim]{table.note}[/]\n", soft_wrap=True)
+                console.print(table.note, "", sep="\n", style="dim", markup=False, soft_wrap=True)
                 shown.append(asdict(table))
     except CatstreamError as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")

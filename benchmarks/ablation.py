@@ -1,0 +1,59 @@
+"""What each ingredient is worth: all of them but one, over all sequences and several starts of each.
+
+Single runs are chaotic: what counts is the difference run by run, beside its standard error.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+from accuracy import MEANS, accuracy_command, compared, difference, means, spread
+from sequences import sequences
+from table import Table, publish
+
+from catstream.settings import PRESETS, Settings
+
+_NEVER = -100.0  # no score is below it
+_LONGER_THAN_ANY_VIDEO = 1 << 30
+
+#: Ingredient -> the settings that are without it.
+WITHOUT: dict[str, dict[str, Any]] = {
+    "loss tree": {"classifier": "least-squares"},
+    "least squares, a one-class SVM instead": {"classifier": "one-class"},
+    "hard negatives of the whole frame": {"far_negatives": 0},
+    "near misses": {"near_misses": 0},
+    "weight of the object's row": {"object_weight": 1.0},
+    "search of the whole frame": {"sure_score": _NEVER, "lost_score": _NEVER},
+    "search over scales": {"scale_count": 1},
+    "cost of distance": {"distance_penalty": 0.0},
+    "cost of a change of size": {"scale_penalty": 0.0},
+    "size held where unsure": {"scale_score": _NEVER},
+    "size followed slowly": {"scale_rate": 1.0},
+    "Kalman filter": {"motion_frames": _LONGER_THAN_ANY_VIDEO},
+    "window wider than the object": {"context": 1.0},
+    "no answer where absent": {"present_score": _NEVER},
+    "no lesson where unsure": {"teach_score": _NEVER},
+}
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    base = Settings()
+    variants = {"nothing left out": base}
+    variants |= {f"without {name}": replace(base, **changes) for name, changes in WITHOUT.items()}
+    variants |= {"the paper's tracker": Settings(**PRESETS["one-class-paper"])}
+    if options.quick:
+        variants = dict(list(variants.items())[:2])
+    runs = compared(options, sequences(options), variants)
+    whole = runs["nothing left out"]
+    rows = [(name, *means(found), spread(found), *difference(whole, found)) for name, found in runs.items()]
+    columns = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error")
+    note = f"{len(whole)} runs each; spread: standard deviation over {options.starts} starts, mean over the sequences"
+    yield Table("Ablation", columns, rows, note)
+
+
+if __name__ == "__main__":
+    options = accuracy_command(__doc__, starts=5).parse_args()
+    publish(figures(options), options.json)

@@ -1,0 +1,70 @@
+"""Accuracy of several settings, or trackers, over the same sequences and starts."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+from table import command
+
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.onepass import evaluate
+from catstream.evaluation.runs import Run
+from catstream.evaluation.summary import rows_of
+from catstream.settings import Settings
+
+__all__ = ["accuracy_command", "compared", "difference", "means"]
+
+#: What `means` gives, as headings.
+MEANS = ("AUC", "success", "precision")
+
+
+def accuracy_command(about: str | None, starts: int = 1) -> argparse.ArgumentParser:
+    """The options of a benchmark that follows many sequences."""
+    parser = command(about)
+    parser.add_argument(
+        "--starts", type=int, default=starts, help="frames of each to start from (default: %(default)s)"
+    )
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once (default: %(default)s)")
+    parser.add_argument("--output", type=Path, help="folder that keeps runs: finished ones are not run again")
+    return parser
+
+
+def compared(
+    options: argparse.Namespace, sequences: list[Sequence], variants: dict[str, Settings]
+) -> dict[str, list[Run]]:
+    """Runs of catstream with each of several settings, by their name, in the same order in each."""
+    return {
+        name: evaluate(
+            sequences,
+            ["catstream"],
+            settings,
+            starts=options.starts,
+            jobs=1 if options.quick else options.jobs,
+            output=options.output and options.output / name.replace("/", "-"),
+            done=lambda run, name=name: print(f"{name}: {run.name}", file=sys.stderr),
+        )
+        for name, settings in variants.items()
+    }
+
+
+def means(runs: Iterable[Run]) -> tuple[float, float, float]:
+    """AUC, success and precision, over the starts of each sequence and then over the sequences."""
+    rows = rows_of(runs)
+    return tuple(fmean(getattr(row, measure.lower()) for row in rows) for measure in MEANS)
+
+
+def spread(runs: Iterable[Run]) -> float:
+    """Standard deviation of the AUC over the starts of a sequence, the mean over the sequences."""
+    return fmean(row.auc_spread for row in rows_of(runs))
+
+
+def difference(runs: list[Run], others: list[Run]) -> tuple[float, float]:
+    """Mean difference of AUC run by run, and its standard error: above twice that it is hardly chance."""
+    apart = np.array([a.score().auc - b.score().auc for a, b in zip(runs, others, strict=True)])
+    return float(apart.mean()), float(apart.std() / np.sqrt(len(apart)))

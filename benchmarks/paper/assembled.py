@@ -1,0 +1,74 @@
+"""A tracker put together by hand from the library's stages, with another kind of coreset tree in it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
+from catstream.compression.tree import CoresetTree
+from catstream.detection.detector import Detector
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.onepass import starts_of
+from catstream.evaluation.peers import one_thread
+from catstream.evaluation.runs import Run
+from catstream.settings import Settings
+from catstream.training.trainer import Trainer
+
+__all__ = ["Recipe", "follow_all"]
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What a tracker is made of.
+
+    settings  of the stages
+    tree      class of the compressor's trees: `sample` says what is learned from
+    learned   share of the frames that it learns from, the first ones; the rest it only follows
+    """
+
+    settings: Settings
+    tree: type[CoresetTree] = CoresetTree
+    learned: float = 1.0
+
+
+def follow_all(recipes: dict[str, Recipe], sequences: list[Sequence], starts: int, jobs: int) -> dict[str, list[Run]]:
+    """Runs of each recipe over all sequences and starts, in the same order in each."""
+    tasks = [
+        (name, recipe, sequence, start)
+        for name, recipe in recipes.items()
+        for sequence in sequences
+        for start in starts_of(sequence, starts)
+    ]
+    runs: dict[str, list[Run]] = {name: [] for name in recipes}
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for run in pool.map(follow, *zip(*tasks, strict=True)):
+            runs[run.tracker].append(run)
+            print(f"{run.tracker}: {run.name}", file=sys.stderr)
+    return runs
+
+
+def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> Run:
+    """The loop of `catstream.tracker.Tracker`, with other trees, and an end to learning."""
+    frames = len(sequence) - start
+    settings = recipe.settings.for_length(frames)
+    detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
+    compressor.trees = {tree: recipe.tree(settings.coreset_size) for tree in compressor.trees}
+    boxes, scores, moments = [], [], [perf_counter()]
+    with threadpool_limits(1), one_thread():
+        for row, image in enumerate(sequence.frames(start)):
+            track, features = detector.step(image) if row else detector.init(image, Box(*sequence.boxes[start]))
+            sample = compressor.take(features) if row < recipe.learned * frames else None
+            if sample is not None:
+                detector.adopt(trainer.train(sample))
+            boxes.append(track.box or (np.nan,) * 4)
+            scores.append(track.score)
+            moments.append(perf_counter())
+    return Run(name, sequence, start, np.array(boxes), np.array(scores), np.diff(moments))

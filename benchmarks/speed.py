@@ -1,0 +1,76 @@
+"""Speed beside OpenCV's trackers on the same frames in one run, and against the size of the image and of the coreset.
+
+CSRT and KCF come with the contrib modules of OpenCV 4: pip install "catstream[peers]".
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from statistics import median
+
+from journey import travel
+from sequences import rendered, sequences, video
+from table import Table, command, publish
+from throughput import MODES, steps
+
+from catstream.errors import SettingsError
+from catstream.evaluation.onepass import evaluate
+from catstream.evaluation.peers import Peer
+from catstream.evaluation.runs import Run
+from catstream.settings import Settings
+
+PEERS = ("csrt", "kcf", "mil")
+SIZES = ((320, 240), (640, 480), (960, 720), (1280, 720), (1920, 1080))
+CORESETS = (16, 32, 64, 128, 256, 512)
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    yield beside_peers(options)
+    yield steps(sequences(options, "TLD_01_david"))
+    sizes, coresets, frames = (SIZES[:1], CORESETS[:1], 24) if options.quick else (SIZES, CORESETS, 300)
+    rows = []
+    for size in sizes:
+        local, full = (rate(frames, size, Settings(detection=mode)) for mode in MODES)
+        rows.append((f"{size[0]}x{size[1]}", local, full))
+    yield Table("Frames/s against the size of the image", ("pixels", *MODES), rows, "three processes, with decoding")
+    rows = [(n, rate(frames, (640, 480), Settings(coreset_size=n))) for n in coresets]
+    yield Table(
+        "Frames/s against the size of the coreset", ("n", "640x480, local"), rows, "three processes, with decoding"
+    )
+
+
+def beside_peers(options: argparse.Namespace) -> Table:
+    """All trackers on all sequences, one after the other, each on one core."""
+    trackers, note = ["catstream"], "without decoding"
+    for name in PEERS:
+        try:
+            Peer(name)
+            trackers.append(name)
+        except SettingsError as error:  # says how to get it
+            note += f"\n{error}"
+    runs = evaluate(sequences(options), trackers, Settings())
+    own = [run for run in runs if run.tracker == "catstream"]
+    rows = []
+    for tracker in trackers:
+        others = [run for run in runs if run.tracker == tracker]
+        ratios = [ours.fps / theirs.fps for ours, theirs in zip(own, others, strict=True)]
+        rows.append((tracker, together(others), together(own) / together(others), median(ratios), min(ratios)))
+    columns = ("tracker", "frames/s", "catstream is faster by", "median sequence", "worst")
+    return Table("Beside OpenCV's trackers", columns, rows, f"{len(own)} sequences, {note}")
+
+
+def together(runs: list[Run]) -> float:
+    """Frames a second over all runs, the first frame of each apart."""
+    return sum(len(run.seconds) - 1 for run in runs) / sum(float(run.seconds[1:].sum()) for run in runs)
+
+
+def rate(frames: int, size: tuple[int, int], settings: Settings) -> float:
+    """Frames a second of the pipeline on the rendered video."""
+    sequence = rendered(frames, size)
+    return travel(video(sequence), sequence.boxes[0], settings).rate
+
+
+if __name__ == "__main__":
+    options = command(__doc__).parse_args()
+    publish(figures(options), options.json)
