@@ -1,0 +1,112 @@
+"""Table 6 of the paper: a TLD video lengthened to 100,000 frames, with a fixed coreset size.
+
+Success must not fall with the length, and time a frame and memory must stay flat. As in the paper, the video is
+followed by clips of a tenth of its length, flipped, reversed in time, with other contrast and brightness, shifted,
+and with noise. The real pipeline follows it; a shorter video is the beginning of a longer one. Each clip is a cut:
+the object jumps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+
+from journey import Journey, draw, travel
+from sequences import named, scratch
+from table import Table, command, publish
+
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.metrics import score
+from catstream.settings import PRESETS, Settings
+from catstream.video.writer import VideoWriter
+
+#: Tracker -> mean success of the four longest TLD videos at 10, 20, 50, 75 and 100 thousand frames.
+PAPER = {
+    "CAT, n = 500": (0.522, 0.559, 0.578, 0.586, 0.594),
+    "CAT, n = 1000": (0.606, 0.634, 0.658, 0.669, 0.673),
+    "CAT, n = 1500": (0.627, 0.674, 0.697, 0.701, 0.702),
+    "CAT, n = 2000": (0.685, 0.702, 0.718, 0.725, 0.726),
+    "CAT, n = 2500": (0.713, 0.724, 0.736, 0.743, 0.744),
+    "TLD": (0.579, 0.573, 0.569, 0.567, 0.567),
+    "TGPR": (0.382, 0.368, 0.365, 0.364, 0.362),
+}
+LENGTHS = np.array([0.1, 0.2, 0.5, 0.75, 1.0])
+_CONTRAST, _BRIGHTNESS, _SHIFT, _NOISE = 0.2, 20.0, 0.05, 4.0
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    frames = 200 if options.quick else options.frames
+    journeys, successes = {}, []
+    for name in options.videos[:1] if options.quick else options.videos:
+        sequence = named(options, name)
+        path, truth = lengthened(sequence, frames)
+        for n in options.sizes[:1] if options.quick else options.sizes:
+            settings = Settings(**PRESETS.get(options.preset, {}) | {"coreset_size": n})
+            label = f"{sequence.name}, n = {n}"
+            journey = journeys[label] = travel(str(path), truth[0], settings, watch=max(frames // 200, 1))
+            ends = (LENGTHS * frames).astype(int)
+            boxes = np.array(journey.boxes)
+            successes.append((label, *(score(boxes[:end], truth[:end]).success for end in ends)))
+        path.unlink()
+    draw(journeys, options.plot)
+    lengths = [f"{length * frames:.0f}" for length in LENGTHS]
+    paper = [(f"paper: {name}", *printed) for name, printed in PAPER.items()]
+    yield Table("Success", ("frames", *lengths), successes + paper, "the paper's columns: 10K, 20K, 50K, 75K and 100K")
+    yield Table("Growth", ("video", *GROWTH), [(name, *growth(journey)) for name, journey in journeys.items()])
+
+
+def lengthened(sequence: Sequence, frames: int) -> tuple[Path, np.ndarray]:
+    """The video with clips of itself after it, and the object's box in each frame."""
+    rng, images = np.random.default_rng(0), list(sequence.frames())
+    height, width = images[0].shape[:2]
+    clip = max(len(images) // 10, 1)
+    path, truth = scratch() / f"{sequence.name}.mp4", []
+    with VideoWriter(path, 25, (width, height)) as video:
+        for image, box in zip(images[:frames], sequence.boxes, strict=False):
+            video.write(image)
+            truth.append(box)
+        while len(truth) < frames:
+            begin = rng.integers(len(images) - clip + 1)
+            order = np.arange(begin, begin + clip)[:: rng.choice([-1, 1])]
+            flip, contrast = rng.random() < 0.5, 1 + rng.uniform(-_CONTRAST, _CONTRAST)
+            brightness = rng.uniform(-_BRIGHTNESS, _BRIGHTNESS)
+            shift = rng.uniform(-_SHIFT, _SHIFT, 2) * (width, height)
+            for number in order[: frames - len(truth)]:
+                image, (x, y, w, h) = images[number], sequence.boxes[number]
+                if flip:
+                    image, x = image[:, ::-1], width - x - w
+                place = np.array([[1, 0, shift[0]], [0, 1, shift[1]]])
+                moved = cv2.warpAffine(image, place, (width, height), borderMode=cv2.BORDER_REPLICATE)
+                noise = rng.standard_normal(moved.shape, np.float32) * _NOISE
+                video.write((moved * contrast + brightness + noise).clip(0, 255).astype(np.uint8))
+                truth.append((x + shift[0], y + shift[1], w, h))
+    return path, np.array(truth)
+
+
+GROWTH = ("ms, first tenth", "ms, last tenth", "ratio", "MB, first tenth", "MB at the end")
+
+
+def growth(journey: Journey) -> tuple[float, ...]:
+    """Median milliseconds a frame, and memory of all processes, early and late."""
+    tenth = max(len(journey.milliseconds) // 10, 1)
+    early, late = np.median(journey.milliseconds[:tenth]), np.median(journey.milliseconds[-tenth:])
+    megabytes = np.sum([[resident for _, resident in seen] for seen in journey.memory.values()], axis=0)
+    return float(early), float(late), float(late / early), float(megabytes[len(megabytes) // 10]), float(megabytes[-1])
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--frames", type=int, default=100_000, help="of the longest (default: %(default)s)")
+    parser.add_argument("--videos", nargs="+", default=["TLD_06_car", "TLD_10_panda"], help="(default: %(default)s)")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 500], help="n (default: %(default)s)")
+    parser.add_argument("--preset", choices=PRESETS, help="settings but for n; the defaults where not given")
+    parser.add_argument("--plot", type=Path, default=Path("out/long_videos.png"), help="(default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)

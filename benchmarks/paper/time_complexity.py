@@ -1,0 +1,110 @@
+"""The paper's figure of time complexity: training with the coreset against training with all points.
+
+Points are rows of the object from a real video, affine copies included. On the left the paper shows the time of one
+training against the points so far: constant with the coreset. On the right the time to build the tree, a point:
+constant on average, at several n. Its figure prints no numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+
+from sequences import named
+from table import Table, command, publish
+
+from catstream.box import Box
+from catstream.compression.tree import CoresetTree
+from catstream.detection import affine
+from catstream.detection.hog import row_length
+from catstream.evaluation.datasets import Sequence
+from catstream.training.one_class import one_class
+
+SIZES = (32, 64, 128, 256)
+_ORIGIN = np.zeros(row_length(), np.float32)
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    points = 512 if options.quick else options.points
+    rows = points_of(named(options, "TLD_10_panda"), points)
+    counts = [count for count in (256 << k for k in range(20)) if count <= points]
+    training = []
+    for count in counts:
+        samples = [grown(rows[:count], n).sample().rows for n in SIZES[1:3]]
+        training.append((count, *(seconds(one_class, part, _ORIGIN) * 1000 for part in (rows[:count], *samples))))
+    columns = ("points", "all points, ms", *(f"coreset, n = {n}, ms" for n in SIZES[1:3]))
+    yield Table("One training of the one-class SVM", columns, training)
+
+    building = [(count, *(seconds(grown, rows[:count], n) / count * 1e6 for n in SIZES)) for count in counts]
+    columns = ("points", *(f"n = {n}, us" for n in SIZES))
+    yield Table("Building the tree, a point", columns, building)
+    draw(training, building, options.plot)
+
+
+def points_of(sequence: Sequence, count: int) -> np.ndarray:
+    """Rows of the object, float32 (count, d): as many copies of it from each frame as that takes."""
+    present = int(np.isfinite(sequence.boxes).all(axis=1).sum())
+    copies, rng = -(-count // present), np.random.default_rng(0)
+    rows = [
+        affine.copies(image, Box(*box), copies, rng)
+        for image, box in zip(sequence.frames(), sequence.boxes, strict=True)
+        if np.isfinite(box).all()
+    ]
+    return np.vstack(rows)[:count]
+
+
+def grown(rows: np.ndarray, n: int) -> CoresetTree:
+    """A tree of all rows, inserted one by one, as they come."""
+    tree = CoresetTree(n)
+    for row in rows:
+        tree.insert(row[None])
+    return tree
+
+
+def seconds(work: Callable[..., object], *arguments: object) -> float:
+    """Least time of three runs: the others were disturbed."""
+    times = []
+    for _ in range(3):
+        begin = perf_counter()
+        work(*arguments)
+        times.append(perf_counter() - begin)
+    return min(times)
+
+
+def draw(training: list[tuple[float, ...]], building: list[tuple[float, ...]], file: Path) -> None:
+    """The two plots of the figure, side by side."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    points, everything, *coresets = zip(*training, strict=True)
+    left.loglog(points, everything, label="all points")
+    for n, times in zip(SIZES[1:3], coresets, strict=True):
+        left.loglog(points, times, label=f"coreset, n = {n}")
+    points, *times = zip(*building, strict=True)
+    for n, each in zip(SIZES, times, strict=True):
+        right.semilogx(points, each, label=f"n = {n}")
+    left.set(xlabel="points", ylabel="one training, ms")
+    right.set(xlabel="points", ylabel="building the tree, us a point", ylim=(0, None))
+    left.legend()
+    right.legend()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=120)
+    pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--points", type=int, default=8192, help="at most (default: %(default)s)")
+    parser.add_argument("--plot", type=Path, default=Path("out/time_complexity.png"), help="(default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)
