@@ -47,14 +47,14 @@ def main(process: Process, state: Path | None) -> None:
                 sample = compressor.take(message)
                 if sample is not None:
                     samples.send(sample)
-            waiting = compressor.seq - stored.seq
+            before, waiting = stored.seq, compressor.seq - stored.seq
             overdue = time.monotonic() - saved >= settings.checkpoint_seconds
             if file is None:
                 stored = _position(compressor)
             elif waiting and (end or overdue or 2 * waiting >= settings.window):
                 compressor.save(file)
                 stored, saved = _position(compressor), time.monotonic()
-            if message is not None:
+            if message is not None or stored.seq > before:
                 # The end of the stream holds no features: with all before it, it is stored too. A sample needs
                 # no checkpoint to be made: in lockstep the detector waits for its model.
                 now = replace(stored, version=compressor.version)

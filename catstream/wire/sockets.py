@@ -222,7 +222,10 @@ class Receiver(_Socket):
             self._answer(self._position)
             return None
         message = self._decode(parts[0].buffer if len(parts) == 1 else b"", *self.channel.messages)
-        if message is None or message.seq <= self.taken:
+        if message is None:
+            return None
+        if message.seq <= self.taken:  # it was asked and sent all again: it does not know what is taken
+            self.acknowledge(self._position)
             return None
         if message.seq > self.taken + 1:
             if monotonic() - self._asked > _PATIENCE:

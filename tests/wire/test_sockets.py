@@ -88,6 +88,23 @@ def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
     assert taken == [1]
 
 
+def test_a_sender_that_asked_a_slow_receiver_still_learns_what_it_has_taken(endpoint, until):
+    taken = []
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+
+        def turn():
+            take(receiver, taken, store=False)
+            sender.listen(0.05)
+
+        sender.send(track(1))
+        for _ in range(10):
+            sender.listen(0.05)  # nobody answers: it asks where the receiver is, and will send all again
+        for _ in range(10):
+            turn()
+        until(lambda: sender.taken == 1, turn, seconds=5)
+    assert taken == [1]
+
+
 def test_a_full_window_takes_no_more(endpoint, until):
     taken = []
     with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
