@@ -53,8 +53,8 @@ class _Socket:
         self._socket.ipv6 = endpoint.host.startswith("[")
         self._socket.sndhwm = self._socket.rcvhwm = depth
         self._socket.maxmsgsize = self.channel.limit
-        # A peer that froze, or a host that went away, is noticed.
-        self._socket.heartbeat_ivl, self._socket.heartbeat_timeout = 1000, 5000
+        # No heartbeats: ZeroMQ aborts the process where one is due to a peer that went away while the queue of
+        # its messages was full (libzmq issue 4767). On one machine the kernel tells when a peer is gone.
         self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 20, 500
 
     def _bind(self, sender: str | None = None) -> None:

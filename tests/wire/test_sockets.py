@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 from contextlib import ExitStack
 
 import numpy as np
@@ -217,6 +219,33 @@ def test_the_bytes_of_a_stranger_are_counted_and_dropped(endpoint, stranger, unt
         sender.send(track(1))
         until(lambda: sender.stored == 1, turn)
     assert taken == [1]
+
+
+#: Takes nothing while its queue is full and the sender dies, for longer than any timer of ZeroMQ.
+BUSY_RECEIVER = """
+import sys, time
+from catstream.messages import Position
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Receiver
+with Receiver("results", Endpoint.parse(sys.argv[1]), Position(), 1) as receiver:
+    print("ready", flush=True)
+    sys.stdin.readline()
+    time.sleep(1.5)
+    print(receiver.receive(1).seq)
+"""
+
+
+def test_a_receiver_with_a_full_queue_survives_its_sender(endpoint):
+    command = [sys.executable, "-c", BUSY_RECEIVER, str(endpoint)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as busy:
+        assert busy.stdout.readline() == "ready\n"
+        with Sender("results", endpoint, 8) as sender:
+            for seq in range(1, 9):
+                sender.send(track(seq))
+            for _ in range(5):
+                sender.listen(0.1)
+        assert busy.communicate("gone\n", timeout=60)[0] == "1\n"
+    assert busy.returncode == 0
 
 
 def test_a_message_above_the_limit_is_not_even_read(endpoint, stranger, until):
