@@ -49,9 +49,17 @@ def travel(source: str, box: Sequence[float], settings: Settings, watch: int = 2
             journey.boxes.append(track.box or (np.nan,) * 4)
             if track.frame % watch == 0:
                 for name, pid in pipeline.pids.items():
-                    resident = psutil.Process(pid).memory_info().rss / 1e6
-                    journey.memory.setdefault(name, []).append((track.frame, resident))
+                    if megabytes := resident(pid):
+                        journey.memory.setdefault(name, []).append((track.frame, megabytes))
     return journey
+
+
+def resident(pid: int) -> float:
+    """Megabytes of a process; 0 where it has just ended."""
+    try:
+        return psutil.Process(pid).memory_info().rss / 1e6
+    except psutil.Error:
+        return 0.0
 
 
 def draw(journeys: dict[str, Journey], file: Path, blocks: int = 80) -> None:

@@ -97,8 +97,9 @@ def growth(journey: Journey) -> tuple[float, ...]:
     """Median milliseconds a frame, and memory of all processes, early and late."""
     tenth = max(len(journey.milliseconds) // 10, 1)
     early, late = np.median(journey.milliseconds[:tenth]), np.median(journey.milliseconds[-tenth:])
-    megabytes = np.sum([[resident for _, resident in seen] for seen in journey.memory.values()], axis=0)
-    return float(early), float(late), float(late / early), float(megabytes[len(megabytes) // 10]), float(megabytes[-1])
+    before = sum(seen[len(seen) // 10][1] for seen in journey.memory.values())
+    after = sum(seen[-1][1] for seen in journey.memory.values())
+    return float(early), float(late), float(late / early), before, after
 
 
 if __name__ == "__main__":
