@@ -85,8 +85,8 @@ class Supervisor:
 
     @property
     def finished(self) -> bool:
-        """Whether all have ended, and well."""
-        return all(child.finished for child in self._children.values())
+        """Whether all is done: detector and compressor have ended well, and the trainer learns for nobody."""
+        return all(self._children[name].finished for name in ("detector", "compressor"))
 
     def check(self) -> None:
         """Restart who died.

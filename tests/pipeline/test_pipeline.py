@@ -1,0 +1,145 @@
+"""The three processes on a real video, from the first frame to the last."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import psutil
+import pytest
+
+from catstream.errors import BoxError, ServiceError, VideoError
+from catstream.pipeline import Pipeline
+from catstream.services.supervisor import NAMES
+from catstream.settings import Settings
+from catstream.tracker import Tracker
+from catstream.video.source import open_source
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Subscriber
+
+#: A small window keeps the detector near the frame that a test has reached.
+SETTINGS = Settings(window=16)
+
+
+def follow(video, settings=SETTINGS):
+    path, boxes = video
+    with Pipeline(path, boxes[0], settings) as pipeline:
+        return list(pipeline), pipeline
+
+
+def test_every_frame_gets_one_track_and_every_feature_is_stored(video):
+    tracks, pipeline = follow(video)
+    assert [track.frame for track in tracks] == list(range(pipeline.frames))
+    assert [track.seq for track in tracks] == list(range(1, pipeline.frames + 1))
+    assert pipeline.totals == {"sent": pipeline.frames, "stored": pipeline.frames}
+    assert pipeline.restarts == 0
+    truth = zip(tracks, video[1], strict=True)
+    found = [track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth]
+    assert sum(found) > 0.8 * len(found)
+    versions = [track.model_version for track in tracks]
+    assert versions == sorted(versions)
+    assert versions[0] == 0
+    assert versions[-1] > 2
+
+
+def test_three_processes_run_while_it_is_open_and_none_afterwards(video, alive):
+    path, boxes = video
+    with Pipeline(path, boxes[0], SETTINGS) as pipeline:
+        next(iter(pipeline))
+        pids = pipeline.pids
+        assert set(pids) == set(NAMES)
+        for name, pid in pids.items():
+            command = psutil.Process(pid).cmdline()
+            assert "catstream.services" in command
+            assert name in command
+    assert not any(map(alive, pids.values()))
+    assert not pipeline.pids
+
+
+def test_all_processes_tell_how_they_are(video):
+    _, pipeline = follow(video)
+    assert set(pipeline.health) == set(NAMES)
+    assert pipeline.health["compressor"]["leaves"] > 0
+    assert pipeline.health["detector"]["sent"] > 0
+
+
+@pytest.mark.parametrize("victim", NAMES)
+def test_a_process_that_is_killed_costs_no_frame(video, victim, alive):
+    path, boxes = video
+    tracks = []
+    with Pipeline(path, boxes[0], SETTINGS) as pipeline:
+        for track in pipeline:
+            tracks.append(track)
+            if track.frame == 60:
+                killed = pipeline.pids[victim]
+                psutil.Process(killed).kill()
+        pids = pipeline.pids
+    assert [track.frame for track in tracks] == list(range(pipeline.frames))
+    assert pipeline.totals == {"sent": pipeline.frames, "stored": pipeline.frames}
+    assert pipeline.restarts == 1
+    assert not any(map(alive, [killed, *pids.values()]))
+
+
+def test_a_restarted_trainer_goes_on_learning(video, until):
+    path, boxes = video
+    with Pipeline(path, boxes[0], SETTINGS) as pipeline:
+        versions = []
+        for track in pipeline:
+            versions.append(track.model_version)
+            if track.frame == 60:
+                os.kill(pipeline.pids["trainer"], signal.SIGKILL)
+            if pipeline.restarts and len(pipeline.pids) == 3:
+                break
+        with Subscriber("models", Endpoint.parse(pipeline.endpoint)) as models:
+            model = until(lambda: models.receive(0.1))
+    assert model.version > versions[60]
+
+
+def test_in_lockstep_the_tracks_are_those_of_one_process(video):
+    path, boxes = video
+    settings = Settings(lockstep=True)
+    tracker, expected = Tracker(settings), []
+    with open_source(path) as source:
+        for frame in source:
+            if expected:
+                tracker.update(frame.image, frame.time)
+            else:
+                tracker.init(frame.image, boxes[0], frame.time)
+            expected.append(tracker.track)
+    assert follow(video, settings)[0] == expected
+
+
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+def test_a_second_pipeline_at_the_same_place_is_refused(video, transport, folder, tcp):
+    path, boxes = video
+    settings = Settings(endpoint=str(folder) if transport == "ipc" else tcp, window=16)
+    with Pipeline(path, boxes[0], settings) as first:
+        next(iter(first))
+        with pytest.raises(ServiceError, match=r"give another (endpoint|folder)"), Pipeline(path, boxes[0], settings):
+            pass
+        assert set(first.pids) == set(NAMES), "the first one goes on"
+    with Pipeline(path, boxes[0], settings) as next_one:
+        assert next(iter(next_one)).frame == 0, "the place is free at once"
+
+
+def test_who_attaches_late_gets_the_last_model(video, until):
+    path, boxes = video
+    with Pipeline(path, boxes[0], Settings(window=4)) as pipeline:
+        for track in pipeline:
+            if track.frame == 80:
+                break
+        # Nobody takes tracks now: with a full window the detector waits, and no newer model comes.
+        with Subscriber("models", Endpoint.parse(pipeline.endpoint)) as models:
+            model = until(lambda: models.receive(0.1))
+    assert model.version >= track.model_version > 0
+
+
+@pytest.mark.parametrize("box", [(0, 0, 0, 10), (400, 10, 20, 20), (10, 10, float("nan"), 20)])
+def test_a_box_that_is_not_in_the_first_frame_is_refused_before_anything_starts(video, box):
+    with pytest.raises(BoxError):
+        Pipeline(video[0], box)
+
+
+def test_a_source_that_is_not_there_is_refused_before_anything_starts(folder):
+    with pytest.raises(VideoError, match="no video or folder"):
+        Pipeline(str(folder / "none.mp4"), (0, 0, 10, 10))

@@ -1,0 +1,87 @@
+"""The processes by themselves: started by hand, in any order, and ended in any way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import psutil
+import pytest
+
+from catstream.box import Box
+from catstream.errors import ServiceError
+from catstream.messages import End
+from catstream.services.supervisor import NAMES, Supervisor
+from catstream.settings import Settings
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Subscriber
+
+
+@pytest.mark.parametrize(
+    "order", [("detector", "trainer", "compressor"), ("trainer", "compressor", "detector")], ids=" ".join
+)
+def test_started_by_hand_in_any_order_they_complete_a_run(video, folder, tcp, service, order, until):
+    path, boxes = video
+    arguments = {
+        "compressor": ["--state", folder],
+        "trainer": [],
+        "detector": ["--resume", path, "--box", ",".join(map(str, boxes[0]))],
+    }
+    with Subscriber("tracks", Endpoint.parse(tcp)) as tracks:
+        processes = [service(name, "--set", f"endpoint={tcp}", *arguments[name]) for name in order]
+        end = until(lambda: next((m for m in iter(lambda: tracks.receive(0.1), None) if isinstance(m, End)), None))
+    assert end.totals == {"sent": len(boxes), "stored": len(boxes)}
+    assert not end.failed
+    assert [process.wait(30) for process in processes] == [0, 0, 0]
+    assert (folder / "compressor.safetensors").exists()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGKILL, -9)])
+def test_no_process_outlives_its_supervisor(video, service, number, code, until, alive):
+    path, boxes = video
+    supervisor = service("supervisor", path, "--box", ",".join(map(str, boxes[0])))
+    children = until(lambda: len(found := psutil.Process(supervisor.pid).children()) == len(NAMES) and found)
+    supervisor.send_signal(number)
+    assert supervisor.wait(30) == code
+    until(lambda: not any(alive(child.pid) for child in children), 30)
+
+
+def test_a_process_whose_parent_is_gone_already_ends_at_once(folder, service):
+    assert service("--parent", 2**22 + 1, "trainer", "--set", f"endpoint={folder}").wait(60) == 0
+
+
+def test_a_process_that_would_fail_again_says_why_and_is_not_restarted(folder):
+    supervisor = Supervisor(
+        str(folder / "gone.mp4"), Box(1, 1, 9, 9), Settings(endpoint=str(folder)), folder, owned=False
+    )
+    try:
+        with pytest.raises(ServiceError, match=r"no video or folder .*gone\.mp4"):
+            check_for_a_minute(supervisor)
+        assert supervisor.restarts == 0
+    finally:
+        supervisor.stop()
+
+
+def test_a_process_that_keeps_dying_is_given_up(video, folder):
+    path, boxes = video
+    supervisor = Supervisor(path, boxes[0], Settings(endpoint=str(folder)), folder, owned=True)
+
+    def kill_trainer():
+        if "trainer" in supervisor.pids:
+            os.kill(supervisor.pids["trainer"], signal.SIGKILL)
+
+    try:
+        with pytest.raises(ServiceError, match=r"the trainer died 6 times in a minute, .* SIGKILL"):
+            check_for_a_minute(supervisor, kill_trainer)
+        assert supervisor.restarts == 6
+    finally:
+        supervisor.stop()
+
+
+def check_for_a_minute(supervisor, turn=lambda: None):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        turn()
+        supervisor.check()
+        time.sleep(0.01)
