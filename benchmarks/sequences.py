@@ -52,8 +52,10 @@ def sequences(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
 
 
 def named(options: argparse.Namespace, name: str) -> Sequence:
-    """The one sequence of that name, or what --quick puts in its place."""
-    return sequences(options, name)[0]
+    """The one sequence of that name; where there is no folder of data, the demo's video stands in."""
+    if options.quick or options.data.is_dir():
+        return sequences(options, name)[0]
+    return rendered(demo.FRAMES, (320, 240))
 
 
 def video(sequence: Sequence) -> str:

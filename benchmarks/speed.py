@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from statistics import median
 
 from journey import travel
-from sequences import rendered, sequences, video
+from sequences import named, rendered, sequences, video
 from table import Table, command, publish
 from throughput import MODES, steps
 
@@ -27,7 +27,7 @@ CORESETS = (16, 32, 64, 128, 256, 512)
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield beside_peers(options)
-    yield steps(sequences(options, "TLD_01_david"))
+    yield steps([named(options, "TLD_01_david")])
     sizes, coresets, frames = (SIZES[:1], CORESETS[:1], 24) if options.quick else (SIZES, CORESETS, 300)
     rows = []
     for size in sizes:
