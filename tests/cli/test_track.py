@@ -1,0 +1,186 @@
+"""`catstream track`, as a person runs it."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+
+from catstream.errors import VideoError
+from catstream.video.source import open_source
+
+FILES = ["demo.mp4", "demo.txt", "demo_confidence.value", "demo_time.txt", "tracks.csv"]
+
+
+def one_line(errors):
+    """The error, which is one line and no traceback."""
+    lines = [line for line in errors.strip().splitlines() if line.startswith("catstream: ")]
+    assert len(lines) == 1, errors
+    assert "Traceback" not in errors
+    return lines[0]
+
+
+def table(path):
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def test_it_writes_five_files_with_a_row_a_frame(video, said, tmp_path):
+    source, box = video
+    code, _, errors = said("track", source, "--box", box, "--output", tmp_path, "--video")
+    assert code == 0
+    assert "60 messages sent, 60 stored" in errors
+    assert sorted(file.name for file in tmp_path.iterdir()) == FILES
+    boxes = np.loadtxt(tmp_path / "demo.txt", delimiter=",")
+    assert boxes.shape == (60, 4)
+    assert np.loadtxt(tmp_path / "demo_confidence.value").shape == (60,)
+    assert (np.loadtxt(tmp_path / "demo_time.txt") >= 0).sum() == 60
+    rows = table(tmp_path / "tracks.csv")
+    assert list(rows[0]) == ["frame", "seconds", "state", "x", "y", "w", "h", "score", "model_version"]
+    assert [int(row["frame"]) for row in rows] == list(range(60))
+    assert {row["state"] for row in rows} <= {"bootstrapping", "present", "absent"}
+    assert [row["x"] == "" for row in rows] == list(np.isnan(boxes[:, 0]))
+    with open_source(tmp_path / "demo.mp4") as film:
+        assert sum(1 for _ in film) == 60
+
+
+def test_two_lockstep_runs_write_the_same_bytes(video, said, tmp_path):
+    source, box = video
+    for folder in ("one", "two"):
+        assert said("track", source, "--box", box, "--output", tmp_path / folder, "--lockstep")[0] == 0
+    for file in ("demo.txt", "demo_confidence.value", "tracks.csv"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+    assert int(table(tmp_path / "one" / "tracks.csv")[-1]["model_version"]) > 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_keeps_its_results(video, catstream, tmp_path, number):
+    source, box = video
+    # A window of one: the video cannot be over before the signal comes.
+    process = catstream("track", source, "--box", box, "--output", tmp_path, "--set", "window=1", "--lockstep")
+    children = started(process, tmp_path / "demo.txt")
+    process.send_signal(number)
+    errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert "the results so far are kept" in errors
+    rows = np.loadtxt(tmp_path / "demo.txt", delimiter=",", ndmin=2)
+    assert len(rows) >= 1
+    assert len((tmp_path / "tracks.csv").read_text().splitlines()) == len(rows) + 1
+    assert not any(map(psutil.pid_exists, children))
+
+
+def started(process, results):
+    """Wait for the first result; returns the process ids of the children."""
+    deadline = time.monotonic() + 60
+    while not (results.exists() and results.read_text()):
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline, "no track came"
+        time.sleep(0.01)
+    return [child.pid for child in psutil.Process(process.pid).children()]
+
+
+def test_a_truncated_video_is_followed_up_to_the_break(video, said, tmp_path):
+    source, box = video
+    broken = tmp_path / "broken.mpg"
+    whole = encoded(source, tmp_path / "whole.mpg")
+    broken.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    good = readable(broken)
+    assert 0 < good < 60
+    code, _, errors = said("track", broken, "--box", box, "--output", tmp_path / "out")
+    assert code == 1
+    assert f"breaks at frame {good}" in one_line(errors)
+    assert len((tmp_path / "out" / "broken.txt").read_text().splitlines()) == good
+
+
+def test_an_image_of_another_size_ends_the_run_where_it_comes(video, said, tmp_path):
+    source, box = video
+    images = tmp_path / "walk"
+    images.mkdir()
+    with open_source(source) as film:
+        for frame, _ in zip(film, range(12), strict=False):
+            cv2.imwrite(str(images / f"{frame.number}.png"), frame.image[: -8 if frame.number == 10 else None])
+    code, _, errors = said("track", images, "--box", box, "--output", tmp_path / "out")
+    assert code == 1
+    assert "one size" in one_line(errors)
+    assert "10.png" in one_line(errors)
+    assert len((tmp_path / "out" / "walk.txt").read_text().splitlines()) == 10
+
+
+REFUSED = {
+    "a file that is not there": (["none.mp4"], "no video or folder"),
+    "an empty folder": (["."], "neither images nor a video"),
+    "a text": (["notes.txt"], "not a video|no video in"),
+    "a box outside": (["--box", "400,10,20,20"], "frame"),
+    "a box without size": (["--box", "10,10,0,20"], "10,10,0,20|width|area"),
+    "a box of NaN": (["--box", "10,nan,20,20"], "nan|number"),
+    "a box of three numbers": (["--box", "10,10,20"], "x,y,w,h"),
+    "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset_size'"),
+    "a value that does not fit": (["--set", "coreset_size=x"], "coreset_size cannot be 'x'"),
+    "a preset that does not exist": (["--preset", "cat11"], "cat11"),
+    "a settings file that is not there": (["--settings", "none.toml"], "cannot read the settings file"),
+    "an endpoint on the network": (["--set", "endpoint=tcp://0.0.0.0:5700"], "other machines"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "word"), REFUSED.values(), ids=REFUSED)
+def test_bad_input_is_refused_in_one_line_and_nothing_is_written(video, said, tmp_path, arguments, word):
+    source, box = video
+    (tmp_path / "notes.txt").write_text("not a video\n")
+    given = arguments if not arguments[0].startswith("--") else [source, *arguments]
+    given = given if "--box" in given else [*given, "--box", box]
+    code, output, errors = said("track", *given, "--output", "out", cwd=tmp_path)
+    assert code in (1, 2)
+    assert not output
+    assert "Traceback" not in errors
+    assert any(part in errors.replace("\n", " ") for part in word.split("|")), errors
+    assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("output", ["a file", "/proc/catstream"])
+def test_an_output_that_cannot_be_written_to_is_refused(video, said, tmp_path, output):
+    source, box = video
+    folder = tmp_path / "file" if output == "a file" else Path(output)
+    (tmp_path / "file").write_text("mine\n")
+    code, _, errors = said("track", source, "--box", box, "--output", folder)
+    assert code == 1
+    assert "cannot write results" in one_line(errors)
+    assert (tmp_path / "file").read_text() == "mine\n"
+
+
+def test_a_second_start_at_the_same_place_is_refused_and_older_results_stay(video, catstream, said, tmp_path):
+    source, box = video
+    place = ["--set", f"endpoint={tmp_path / 'run'}"]
+    first = catstream("track", source, "--box", box, "--output", tmp_path / "one", "--lockstep", *place)
+    started(first, tmp_path / "one" / "demo.txt")
+    code, _, errors = said("track", source, "--box", box, "--output", tmp_path / "two", *place)
+    assert code == 1
+    assert "already running" in one_line(errors)
+    assert not (tmp_path / "two").exists()
+    assert first.wait(120) == 0
+    assert len((tmp_path / "one" / "demo.txt").read_text().splitlines()) == 60
+
+
+def encoded(source, path):
+    """A video as MPEG: a stream that can be cut anywhere, as old cameras wrote it."""
+    import av
+
+    with av.open(str(path), "w") as container, open_source(source) as film:
+        stream = container.add_stream("mpeg1video", rate=30)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 320, 240, "yuv420p", 4_000_000
+        for frame in film:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame.image, format="bgr24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def readable(path):
+    """How many frames come before the break."""
+    frames = []
+    with open_source(path) as source, pytest.raises(VideoError, match="breaks at frame"):
+        frames.extend(frame.number for frame in source)
+    return len(frames)
