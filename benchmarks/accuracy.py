@@ -44,7 +44,7 @@ def compared(
             sequences,
             ["catstream"],
             settings,
-            starts=options.starts,
+            starts=1 if options.quick else options.starts,
             jobs=1 if options.quick else options.jobs,
             output=options.output and options.output / name.replace("/", "-"),
             done=lambda run, name=name: print(f"{name}: {run.name}", file=sys.stderr),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -39,8 +40,11 @@ class Recipe:
     learned: float = 1.0
 
 
-def follow_all(recipes: dict[str, Recipe], sequences: list[Sequence], starts: int, jobs: int) -> dict[str, list[Run]]:
+def follow_all(
+    options: argparse.Namespace, sequences: list[Sequence], recipes: dict[str, Recipe]
+) -> dict[str, list[Run]]:
     """Runs of each recipe over all sequences and starts, in the same order in each."""
+    starts, jobs = (1, 1) if options.quick else (options.starts, options.jobs)
     tasks = [
         (name, recipe, sequence, start)
         for name, recipe in recipes.items()
@@ -49,7 +53,7 @@ def follow_all(recipes: dict[str, Recipe], sequences: list[Sequence], starts: in
     ]
     runs: dict[str, list[Run]] = {name: [] for name in recipes}
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for run in pool.map(follow, *zip(*tasks, strict=True)):
+        for run in (map if jobs == 1 else pool.map)(follow, *zip(*tasks, strict=True)):
             runs[run.tracker].append(run)
             print(f"{run.tracker}: {run.name}", file=sys.stderr)
     return runs

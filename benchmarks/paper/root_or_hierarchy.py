@@ -41,7 +41,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     for source, tree in (("root", RootTree), ("hierarchy", CoresetTree)):
         recipes[f"paper's way, {source}"] = Recipe(Settings(**PRESETS["one-class-paper"]), tree)
         recipes[f"our settings, {source}"] = Recipe(Settings(), tree)
-    runs = follow_all(recipes, sequences(options), options.starts, options.jobs)
+    runs = follow_all(options, sequences(options), recipes)
     rows = [(name, *means(found), spread(found), *PAPER[name.split(", ")[1]]) for name, found in runs.items()]
     columns = ("learned from", *MEANS, "spread of AUC", "paper: success", "paper: precision")
     yield Table("Root or hierarchy", columns, rows, f"{options.starts} starts of each sequence")

@@ -98,7 +98,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
             for name, tree in TREES.items()
             for share in shares
         }
-        runs = follow_all(recipes, sequences(options, "TLD_"), options.starts, options.jobs)
+        runs = follow_all(options, sequences(options, "TLD_"), recipes)
         rows = []
         for name, printed in PAPER.items():
             rows.append((name, *(means(runs[f"{name}, {share}"])[1] for share in shares)))
