@@ -21,9 +21,10 @@ from time import monotonic
 from typing import Any, Self
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from catstream.errors import ProtocolError, ServiceError
-from catstream.messages import Position, Stored
+from catstream.messages import End, Position, Stored
 from catstream.wire.channels import CHANNELS, Channel
 from catstream.wire.codec import decode, encode
 from catstream.wire.endpoint import Endpoint
@@ -90,13 +91,18 @@ class _Socket:
 
     def close(self) -> None:
         """Send what is on its way, then close; the address is free for the next one."""
-        if self._bound and not self._socket.closed:
-            # ZeroMQ stops listening some time later, and would take the next one's socket file with it.
-            with self._socket.get_monitor_socket(zmq.EVENT_CLOSED) as stopped:
-                self._socket.unbind(self._bound)
-                stopped.poll(_LINGER)
-                self._socket.disable_monitor()
-        self._socket.close()
+        if not self._bound or self._socket.closed:
+            self._socket.close()
+            return
+        # ZeroMQ stops listening some time later, and would take the next one's socket file with it. To unbind
+        # first would be sooner, but drops what is on its way.
+        with self._monitor() as monitor:
+            self._socket.close()
+            _hear(monitor, zmq.EVENT_CLOSED)
+
+    def _monitor(self) -> Any:
+        """A socket on which ZeroMQ tells of endings, from the first call on."""
+        return self._socket.get_monitor_socket(zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED)
 
     def __enter__(self) -> Self:
         return self
@@ -209,6 +215,7 @@ class Receiver(_Socket):
         self._position = position
         self._peer: bytes | None = None
         self._asked = 0.0  # when a message was last found missing
+        self._gone: Any = None  # hears of the sender's leaving, once it has sent its end
         self._bind()
 
     def receive(self, seconds: float) -> Any:
@@ -234,12 +241,20 @@ class Receiver(_Socket):
             return None
         self._asked = 0.0
         self.taken = message.seq
+        if isinstance(message, End):
+            self._gone = self._monitor()
         return message
 
     def acknowledge(self, position: Position) -> None:
         """Say that all is taken up to the last message, and stored up to `position.seq`."""
         self._position = position
         self._answer(Stored(position.seq, self.taken, position.version))
+
+    def close(self) -> None:
+        """Close, after the sender where it has sent its end: a connection that breaks may cost it the last answer."""
+        if self._gone is not None and not self._socket.closed:
+            _hear(self._gone, zmq.EVENT_DISCONNECTED)
+        super().close()
 
     def _answer(self, message: Stored | Position) -> None:
         if self._peer is not None:
@@ -303,3 +318,9 @@ class Subscriber(_Socket):
         while (message := self.receive(0)) is not None:
             messages.append(message)
         return messages
+
+
+def _hear(monitor: Any, event: int) -> None:
+    """Wait until ZeroMQ tells of an event, but not for ever."""
+    while monitor.poll(_LINGER) and recv_monitor_message(monitor)["event"] != event:
+        pass

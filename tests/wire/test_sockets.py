@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 import zmq
 
 from catstream.errors import ProtocolError, ServiceError
-from catstream.messages import End, Health, Model, Position, Track
+from catstream.messages import End, Health, Model, Position, Sample, Summary, Track
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import encode
 from catstream.wire.endpoint import Endpoint
@@ -337,6 +338,38 @@ def test_the_end_comes_through_like_any_other_message(endpoint, until):
     with Publisher("samples", endpoint) as samples:
         samples.send(End(1, "the source came to its end"))
         assert first(samples, endpoint, until).reason == "the source came to its end"
+
+
+def test_what_was_sent_last_arrives_though_its_sender_closes_at_once(endpoint, until):
+    tree, loss = (Summary(np.ones((200, d), np.float32), np.ones(d, np.float32), 200, (0,)) for d in (2000, 2002))
+    large = Sample(1, 0, tree, tree, loss, np.empty((0, 2)))
+
+    def run():
+        heard = []
+        with Subscriber("samples", endpoint) as reader, Publisher("samples", endpoint) as samples:
+            samples.send(large)
+            until(lambda: reader.receive(0.05), samples.welcome)
+            samples.send(large)
+            samples.send(End(1, "it was the last"))
+            samples.close()
+            until(lambda: heard and isinstance(heard[-1], End), lambda: heard.extend(reader.waiting()), seconds=5)
+
+    for _ in range(10):  # a race, as the next
+        run()
+
+
+def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_once(endpoint, until):
+    def run():
+        with ThreadPoolExecutor(1) as pool, Sender("results", endpoint, WINDOW) as sender:
+            receiver = Receiver("results", endpoint, Position(), WINDOW)
+            sender.send(End(1, "it was the last"))
+            until(lambda: receiver.receive(0.05), lambda: sender.listen(0))
+            receiver.acknowledge(Position(1))
+            pool.submit(receiver.close)
+            until(lambda: sender.stored == 1, lambda: sender.listen(0.02), seconds=5)
+
+    for _ in range(10):  # a race, which was lost every other time
+        run()
 
 
 @pytest.mark.parametrize(
