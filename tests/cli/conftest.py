@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -21,6 +22,8 @@ def video(tmp_path_factory):
 @pytest.fixture
 def catstream():
     """Starts the command `catstream`; what still runs after the test is killed."""
+    # In the background a shell has Ctrl-C ignored, and children inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with ExitStack() as stack:
 
         def start(*arguments, **options):
