@@ -175,6 +175,11 @@ def test_every_test_that_a_page_names_exists():
         assert f"def {name}(" in tests, f"docs/ name {name}, which is no test"
 
 
+def test_every_extra_that_a_page_names_can_be_installed():
+    extras = tomllib.loads(page("pyproject.toml"))["project"]["optional-dependencies"]
+    assert set(re.findall(r"catstream\[(\w+)\]", everything())) <= set(extras), "pyproject.toml: add the extra"
+
+
 def test_one_version_is_told_everywhere():
     assert tomllib.loads(page("pyproject.toml"))["project"]["version"] == catstream.__version__
 
