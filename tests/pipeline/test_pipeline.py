@@ -21,25 +21,37 @@ from catstream.wire.sockets import Subscriber
 SETTINGS = Settings(window=16)
 
 
-def follow(video, settings=SETTINGS):
+@pytest.fixture(scope="module")
+def run(video):
+    """Tracks of a whole run, and its pipeline afterwards."""
     path, boxes = video
-    with Pipeline(path, boxes[0], settings) as pipeline:
+    with Pipeline(path, boxes[0], SETTINGS) as pipeline:
         return list(pipeline), pipeline
 
 
-def test_every_frame_gets_one_track_and_every_feature_is_stored(video):
-    tracks, pipeline = follow(video)
+def test_every_frame_gets_one_track_and_every_feature_is_stored(run):
+    tracks, pipeline = run
     assert [track.frame for track in tracks] == list(range(pipeline.frames))
     assert [track.seq for track in tracks] == list(range(1, pipeline.frames + 1))
     assert pipeline.totals == {"sent": pipeline.frames, "stored": pipeline.frames}
     assert pipeline.restarts == 0
+
+
+def test_the_object_is_followed_with_ever_newer_models(run, video):
+    tracks, _ = run
     truth = zip(tracks, video[1], strict=True)
-    found = [track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth]
-    assert sum(found) > 0.8 * len(found)
+    assert sum(track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth) > 0.8 * len(tracks)
     versions = [track.model_version for track in tracks]
     assert versions == sorted(versions)
     assert versions[0] == 0
     assert versions[-1] > 2
+
+
+def test_all_processes_tell_how_they_are(run):
+    _, pipeline = run
+    assert set(pipeline.health) == set(NAMES)
+    assert pipeline.health["compressor"]["leaves"] > 0
+    assert pipeline.health["detector"]["sent"] > 0
 
 
 def test_three_processes_run_while_it_is_open_and_none_afterwards(video, alive):
@@ -54,13 +66,6 @@ def test_three_processes_run_while_it_is_open_and_none_afterwards(video, alive):
             assert name in command
     assert not any(map(alive, pids.values()))
     assert not pipeline.pids
-
-
-def test_all_processes_tell_how_they_are(video):
-    _, pipeline = follow(video)
-    assert set(pipeline.health) == set(NAMES)
-    assert pipeline.health["compressor"]["leaves"] > 0
-    assert pipeline.health["detector"]["sent"] > 0
 
 
 @pytest.mark.parametrize("victim", NAMES)
@@ -106,7 +111,8 @@ def test_in_lockstep_the_tracks_are_those_of_one_process(video):
             else:
                 tracker.init(frame.image, boxes[0], frame.time)
             expected.append(tracker.track)
-    assert follow(video, settings)[0] == expected
+    with Pipeline(path, boxes[0], settings) as pipeline:
+        assert list(pipeline) == expected
 
 
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
