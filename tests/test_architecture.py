@@ -32,7 +32,7 @@ HOMES = {
     "cv2": ["catstream/detection", "catstream/video", "catstream/evaluation/peers.py", "services/__main__.py"],
     "numba": ["catstream/detection"],
     "filterpy": ["catstream/detection/motion.py", "catstream/training/motion_em.py"],
-    "sklearn": ["catstream/training/one_class.py", "catstream/video/demo.py"],
+    "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
     "safetensors": ["catstream/compression"],
     "av": ["catstream/video"],
     "zmq": ["catstream/wire/sockets.py"],

@@ -1,0 +1,103 @@
+"""The sparse collaborative model alone: its sparse codes, and what it follows."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from sklearn.decomposition import sparse_encode
+
+from catstream.box import Box
+from catstream.detection import scm
+from catstream.detection.scm import SparseCollaborativeModel
+from catstream.video import demo
+
+START = Box(60, 50, 48, 40)
+
+
+@pytest.fixture
+def scene(rng):
+    """A function that draws a frame with the object at (x, y), a share of it covered from the left."""
+
+    def texture(height, width, cell):
+        coarse = rng.integers(0, 256, (height // cell + 1, width // cell + 1, 3), np.uint8)
+        return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+    background, thing, cover = texture(240, 320, 20), texture(40, 48, 8), texture(40, 48, 4)
+
+    def draw(x, y, covered=0.0):
+        frame = background.copy()
+        frame[y : y + 40, x : x + 48] = thing
+        edge = round(48 * covered)
+        frame[y : y + 40, x : x + edge] = cover[:, :edge]
+        return frame
+
+    return draw
+
+
+def followed(frames, start, seed=0):
+    frames = iter(frames)
+    model = SparseCollaborativeModel(next(frames), start, np.random.default_rng(seed), particles=60)
+    return [model.step(frame) for frame in frames]
+
+
+@pytest.mark.parametrize("centre", [0.0, 1.0])
+def test_codes_are_those_of_scikit_learn(rng, centre):
+    """Also of atoms that are nearly alike, as patches of a picture are."""
+    atoms, rows = (scm._unit(rng.normal(centre, 0.5, size=(count, 36))) for count in (50, 40))
+    codes = scm._codes(rows, atoms)
+    exact = [array.astype(np.float64) for array in (rows, atoms)]
+    expected = sparse_encode(*exact, algorithm="lasso_cd", alpha=scm._PENALTY, positive=True, max_iter=100_000)
+    assert codes.min() == 0
+    np.testing.assert_allclose(codes, expected, atol=1e-3)
+
+
+def test_codes_of_equal_atoms_rebuild_the_row(rng):
+    atoms = np.repeat(scm._unit(rng.random((3, 36))), 4, axis=0)
+    codes = scm._codes(atoms[:1], atoms)
+    np.testing.assert_allclose(codes @ atoms, (1 - scm._PENALTY) * atoms[:1], atol=1e-4)
+
+
+def test_the_demos_object_is_followed():
+    frames, truth = zip(*demo.render(40, (320, 240)), strict=True)
+    found = followed(frames, truth[0])
+    assert min(each.box.overlap(box) for each, box in zip(found, truth[1:], strict=True)) > 0.5
+
+
+def test_an_object_half_covered_is_held(scene):
+    ways = [(60 + 2 * i, 50 + i, 0.4 if 4 <= i < 12 else 0.0) for i in range(16)]
+    found = followed(itertools.starmap(scene, ways), START)
+    assert min(each.box.overlap(Box(x, y, 48, 40)) for each, (x, y, _) in zip(found, ways[1:], strict=True)) > 0.5
+
+
+def test_the_score_falls_where_the_object_is_gone(scene):
+    there, gone = followed([scene(60, 50), scene(62, 51), scene(250, 180)], START)
+    assert there.score > 0.6 > 0.5 > gone.score
+
+
+def test_a_covered_object_teaches_nothing(scene, rng):
+    model = SparseCollaborativeModel(scene(60, 50), START, rng)._generative
+    before = model._histogram
+    model.update(rng.integers(0, 256, (32, 32), np.uint8))
+    assert model._histogram is before
+
+
+def test_grey_frames_are_followed_as_those_in_colour(scene):
+    frames = [scene(60 + 3 * i, 50 + 2 * i) for i in range(7)]
+    grey = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
+    assert followed(grey, START) == followed(frames, START)
+
+
+def test_the_same_seed_gives_the_same_boxes_and_another_others(scene):
+    frames = [scene(60 + 3 * i, 50 + 2 * i) for i in range(7)]
+    assert followed(frames, START, seed=1) == followed(frames, START, seed=1) != followed(frames, START, seed=2)
+
+
+def test_a_frame_without_any_contrast_is_survived():
+    (found,) = followed(np.zeros((2, 120, 160), np.uint8), START)
+    assert np.isfinite([found.score, *found.box]).all()
+
+
+def test_an_object_that_leaves_stays_a_box_in_the_frame(scene):
+    frames = [np.roll(scene(60, 50), -8 * i, axis=1)[:, :160] for i in range(12)]
+    assert all(0 <= each.box.centre[0] < 160 for each in followed(frames, START))
