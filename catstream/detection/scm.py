@@ -6,12 +6,13 @@ filter scores each particle twice, and the product decides ("Collaborative Model
 - H, by a classifier of the whole picture against the background, which changes: `_Discriminative`;
 - L, by a histogram of the object's patches, which tells where it is covered: `_Generative`.
 
-Numbers and notation are theirs. What differs: their particles are spread by pixels, ours by the size of the object; and
-shear is left out, as a box cannot show it.
+Numbers and notation are theirs. What differs: their particles are spread by pixels, ours by the size of the object;
+shear is left out, as a box cannot show it; and L is not found for particles whose H alone says that they cannot win.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import cv2
@@ -35,8 +36,8 @@ _EVERY = 5  # frames from one update to the next
 class SparseCollaborativeModel:
     """Follows one object from a box in the first frame, without a trainer.
 
-    The same images, box and generator give the same boxes. Costs the same for every
-    frame, in proportion to the particles.
+    The same images, box and generator give the same boxes. A frame costs at most in
+    proportion to the particles. The object is always said to be somewhere.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ class SparseCollaborativeModel:
         background's; and the box, without its rotation
         """
         grey = _grey(image)
-        size = np.sqrt(self._box.area)
+        size = math.sqrt(self._box.area)
         moves = self._rng.normal(size=(self._particles, 5)) * _SPREAD * [size, size, 1, 1, 1]
         moves[0] = 0
         states = self._state + moves
@@ -82,7 +83,7 @@ class SparseCollaborativeModel:
     @property
     def _box(self) -> Box:
         x, y, scale, aspect, _ = map(float, self._state)
-        w, h = self._first.w * np.exp(scale + aspect), self._first.h * np.exp(scale - aspect)
+        w, h = self._first.w * math.exp(scale + aspect), self._first.h * math.exp(scale - aspect)
         return Box(x - w / 2, y - h / 2, w, h)
 
     def _most_likely(self, cuts: np.ndarray) -> tuple[int, float]:
@@ -130,9 +131,9 @@ class _Discriminative:
         templates = _unit(np.concatenate([positives, negatives]).reshape(-1, _SIDE * _SIDE))
         labels = np.repeat([1.0, -1.0], [len(positives), len(negatives)])
         # Pixels are selected by a sparse regression of the labels ("Feature Selection").
-        regression = Lasso(self._SELECTION / len(labels), fit_intercept=False, tol=1e-3)
+        regression = Lasso(self._SELECTION / len(labels), fit_intercept=False)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a thousand sweeps select well enough
             weights = regression.fit(templates, labels).coef_
         self._selected = np.flatnonzero(weights) if weights.any() else np.arange(_SIDE * _SIDE)
         self._templates = templates[:, self._selected]
@@ -160,7 +161,7 @@ class _Generative:
 
         patches = self._patches(template[None])
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a plain object has fewer than 50 different patches
             self._atoms = _unit(KMeans(self._ATOMS, n_init=1, random_state=seed).fit(patches).cluster_centers_)
         self._first = self._histogram = self._coded(template[None])[0][0]
 

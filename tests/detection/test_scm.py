@@ -37,7 +37,7 @@ def scene(rng):
 
 def followed(frames, start, seed=0):
     frames = iter(frames)
-    model = SparseCollaborativeModel(next(frames), start, np.random.default_rng(seed), particles=60)
+    model = SparseCollaborativeModel(next(frames), start, np.random.default_rng(seed), particles=100)
     return [model.step(frame) for frame in frames]
 
 
