@@ -45,6 +45,7 @@ class Features:
     rows     float32 (k, d); k is 0 where the frame teaches nothing
     labels   float32 (k,): 1 the object, 0 background, between them a near miss
     weights  float32 (k,): how many ordinary rows each counts for, above 0
+    sizes    float32 (s, d): the object cut at s sizes, smallest first, its own in the middle; s is odd, or 0
     """
 
     seq: int
@@ -54,6 +55,7 @@ class Features:
     rows: np.ndarray
     labels: np.ndarray
     weights: np.ndarray
+    sizes: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +113,7 @@ class Sample:
     object      rows of the object (d columns)
     background  rows of everything else (d columns)
     loss        rows [x, 1, y] times the root of their weight (d + 2 columns)
+    size        rows [x, 1, y] of the object cut too small and too large, None before a leaf of them (d + 2 columns)
     centres     float64 (m, 2), object's centre in the last whole block of frames, pixels, NaN where absent
     """
 
@@ -119,6 +122,7 @@ class Sample:
     object: Summary
     background: Summary
     loss: Summary
+    size: Summary | None
     centres: np.ndarray
 
 
@@ -143,6 +147,8 @@ class Model:
     weights  float32 (d,)
     bias     score of a window = weights @ row + bias; 0 at the background's mean, 1 at the object's
     motion   parameters of the Kalman filter, or None before EM had enough centres
+    sizes    float32 (d,): of windows around one place, the one of the right size has the largest
+             sizes @ row; None before there was enough to learn them from
     """
 
     version: int
@@ -150,6 +156,7 @@ class Model:
     weights: np.ndarray
     bias: float
     motion: Motion | None = None
+    sizes: np.ndarray | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,6 +76,7 @@ class Settings:
     ] = "joint"
     ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 1.0
     loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
+    scale_ridge: Annotated[float, _about("Lambda of the least squares of the size tree.", gt=0)] = 0.1
     motion_frames: Annotated[
         int, _about("Frames in a block of centres, from which the Kalman filter's parameters are learned.", ge=8)
     ] = 64
@@ -88,8 +89,14 @@ class Settings:
 
     context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
     search_area: Annotated[float, _about("Side of the local search as a multiple of the window's.", ge=1.5, le=6)] = 2.5
-    scale_count: Annotated[int, _about("Scales that a search tries.", ge=1, le=15)] = 5
-    scale_step: Annotated[float, _about("Change of size between two scales.", gt=0, le=0.5)] = 0.03
+    scale_count: Annotated[int, _about("Sizes that a search tries, an odd number.", ge=1, le=15)] = 9
+    scale_step: Annotated[float, _about("Change of size from one to the next.", gt=0, le=0.5)] = 0.03
+    scale_weight: Annotated[
+        float, _about("Weight of the size model beside the appearance model where a size is chosen (0: none).", ge=0)
+    ] = 1.0
+    scale_sigma: Annotated[
+        float, _about("Distance, in steps of size, at which a wrong size is worth exp(-1/2) of the right one.", gt=0)
+    ] = 1.0
     scale_rate: Annotated[float, _about("Share of a change of size that is followed at once.", ge=0, le=1)] = 0.7
     scale_score: Annotated[float, _about("Score below which the size is held.")] = 0.5
     scale_penalty: Annotated[
@@ -107,7 +114,7 @@ class Settings:
     teach_score: Annotated[float, _about("Score below which a frame teaches nothing.")] = 0.4
     copies: Annotated[
         int, _about("Affine copies of the object a frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)
-    ] = 0
+    ] = 5
     object_weight: Annotated[
         float, _about("Ordinary rows that the object's row of a frame counts for in the loss tree.", gt=0)
     ] = 4.0
@@ -214,11 +221,11 @@ class Settings:
         return [f"{field.name}={text}" for field, text in texts if getattr(self, field.name) != field.default]
 
 
-_PAPER = {"classifier": "one-class", "detection": "full"}
+_PAPER = {"classifier": "one-class", "detection": "full", "scale_weight": 0.0, "scale_count": 5}
 
 #: What the paper set, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.
 PRESETS: dict[str, dict[str, Any]] = {
-    "one-class-paper": _PAPER,
+    "one-class-paper": _PAPER | {"copies": 4},
     "cat10": _PAPER | {"coreset_share": 0.10, "copies": 1},
     "cat25": _PAPER | {"coreset_share": 0.25, "copies": 0},
 }

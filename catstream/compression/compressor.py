@@ -1,8 +1,9 @@
 """The compressor: every frame's features in, now and then a sample to learn from out.
 
 It is the only owner of the coreset trees: one for the object (the paper's), one
-for the background, and one for the loss, whose rows [x, 1, y] times the root of
-their weight make `||A [w; b; -1]||^2` the squared error of any linear model.
+for the background, and two for losses, whose rows [x, 1, y] times the root of
+their weight make `||A [w; b; -1]||^2` the squared error of any linear model:
+of what is the object, and of which size it has.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from catstream.settings import Settings
 
 __all__ = ["Compressor"]
 
-_TREES = ("object", "background", "loss")
+_TREES = ("object", "background", "loss", "size")
 
 
 class Compressor:
@@ -67,10 +68,13 @@ class Compressor:
             )
         rows, labels = features.rows, features.labels
         if len(rows):
-            # Only rows of the right length get as far as the first tree, so that all three hold the same frames.
+            # Only rows of the right length get as far as the first tree, so that all hold the same frames.
             self.trees["loss"].insert(_loss_rows(rows, labels, features.weights))
             self.trees["object"].insert(rows[labels == 1])
             self.trees["background"].insert(rows[labels == 0])
+        if sizes := len(features.sizes):
+            off = (np.arange(sizes) - sizes // 2) / self.settings.scale_sigma
+            self.trees["size"].insert(_loss_rows(features.sizes, np.exp(-(off**2) / 2), np.ones(sizes)))
         self.seq, self.frame = features.seq, features.frame
         if features.box is not None:
             self.box = features.box
@@ -165,8 +169,11 @@ class Compressor:
         return self._made()
 
     def _made(self) -> Sample:
-        summaries = {name: tree.sample() for name, tree in self.trees.items()}
-        return Sample(self.version, self.frame, centres=self.centres, **summaries)
+        size = self.trees["size"]
+        others = {name: tree.sample() for name, tree in self.trees.items() if tree is not size}
+        return Sample(
+            self.version, self.frame, centres=self.centres, size=size.sample() if size.nodes else None, **others
+        )
 
 
 def _loss_rows(rows: np.ndarray, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:

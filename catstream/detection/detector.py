@@ -148,4 +148,4 @@ class Detector:
         frame = self.seq - 1
         box = None if self.state == "absent" else self._box.scaled(1 / self.settings.context)
         track = Track(self.seq, frame, time, self.state, box, float(score), self.model.version)
-        return track, Features(self.seq, frame, time, box, lesson.rows, lesson.labels, lesson.weights)
+        return track, Features(self.seq, frame, time, box, lesson.rows, lesson.labels, lesson.weights, lesson.sizes)

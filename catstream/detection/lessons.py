@@ -6,7 +6,7 @@ exp(-distance^2 / 2 sigma^2), so that the score falls smoothly beside the object
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,18 +25,18 @@ _MIDDLE = (_CELLS - WINDOW) // 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lesson:
-    """Rows with their labels and weights, as in `Features`."""
+    """Rows with their labels and weights, and the object at other sizes, as in `Features`."""
 
     rows: np.ndarray
     labels: np.ndarray
     weights: np.ndarray
+    sizes: np.ndarray
 
     @classmethod
     def of(cls, rows: list[np.ndarray], label: float, weight: float = 1.0) -> Lesson:
         """Rows of one kind."""
         k = len(rows)
-        array = np.array(rows, np.float32).reshape(k, row_length())
-        return cls(array, np.full(k, label, np.float32), np.full(k, weight, np.float32))
+        return cls(_array(rows), np.full(k, label, np.float32), np.full(k, weight, np.float32), _array([]))
 
     @classmethod
     def none(cls) -> Lesson:
@@ -48,6 +48,7 @@ class Lesson:
             np.concatenate([self.rows, other.rows]),
             np.concatenate([self.labels, other.labels]),
             np.concatenate([self.weights, other.weights]),
+            np.concatenate([self.sizes, other.sizes]),
         )
 
 
@@ -55,15 +56,16 @@ def first(image: np.ndarray, box: Box, rng: np.random.Generator, settings: Setti
     """What the first frame teaches: n affine copies of the box and n windows around it, a leaf of each tree."""
     copies = affine.copies(image, box, settings.coreset_size, rng)
     lesson = Lesson.of(list(copies), 1, settings.object_weight)
-    return lesson + _around(image, box, None, settings.coreset_size, rng, settings)
+    lesson += _around(image, box, None, settings.coreset_size, rng, settings)
+    return replace(lesson, sizes=_sizes(image, box, copies[0], settings))
 
 
 def near(image: np.ndarray, box: Box, model: Model, rng: np.random.Generator, settings: Settings) -> Lesson:
-    """What a later frame teaches: the object, affine copies of it, near misses, and the background around."""
+    """What a later frame teaches: the object, affine copies of it, near misses, the background around, and its size."""
     own = list(affine.copies(image, box, 1 + settings.copies, rng))
-    return Lesson.of(own, 1, settings.object_weight / len(own)) + _around(
-        image, box, model, settings.near_negatives, rng, settings
-    )
+    lesson = Lesson.of(own, 1, settings.object_weight / len(own))
+    lesson += _around(image, box, model, settings.near_negatives, rng, settings)
+    return replace(lesson, sizes=_sizes(image, box, own[0], settings))
 
 
 def far(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Lesson:
@@ -72,6 +74,19 @@ def far(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Lesson
     places = windows.peaks(scored.scores, settings.far_negatives + 1, WINDOW // 2)
     rows = [scored.row(*place) for place in places if scored.box(*place).overlap(box) < 0.2]
     return Lesson.of(rows[: settings.far_negatives], 0)
+
+
+def _sizes(image: np.ndarray, box: Box, own: np.ndarray, settings: Settings) -> np.ndarray:
+    """The object cut at each size that a search tries, its own in the middle; nothing where no size is learned."""
+    if not settings.scale_weight:
+        return _array([])
+    others = (windows.around(image, box.scaled(factor), WINDOW)[0] for factor in search.scales(settings) if factor != 1)
+    rows = [cells.reshape(-1) for cells in others]
+    return _array([*rows[: len(rows) // 2], own, *rows[len(rows) // 2 :]])
+
+
+def _array(rows: list[np.ndarray]) -> np.ndarray:
+    return np.array(rows, np.float32).reshape(len(rows), row_length())
 
 
 def _around(

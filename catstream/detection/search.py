@@ -19,7 +19,7 @@ from catstream.settings import Settings
 
 __all__ = ["Found", "local", "scales", "scored_around", "scored_whole", "whole"]
 
-_FINE_CELLS = WINDOW + 4  # cells searched at each other scale, around the peak of the first
+_FINE_CELLS = WINDOW + 2  # cells searched at each size, around the place found at the first
 _MOST_PIXELS = 4_000_000  # of a resized frame: what a whole search may cost for a tiny object in a large frame
 
 
@@ -32,37 +32,42 @@ class Found:
 
 
 def scales(settings: Settings) -> list[float]:
-    """Factors of the box's size to search at, 1 first.
+    """Factors of the box's size to search at, smallest first, 1 in the middle.
 
-    >>> [round(scale, 3) for scale in scales(Settings(scale_step=0.03))]
-    [1, 0.971, 1.03, 0.943, 1.061]
+    >>> [round(scale, 3) for scale in scales(Settings(scale_count=5, scale_step=0.03))]
+    [0.943, 0.971, 1.0, 1.03, 1.061]
     """
-    step = 1 + settings.scale_step
-    return [1, *(step**power for k in range(1, settings.scale_count // 2 + 1) for power in (-k, k))]
+    most = settings.scale_count // 2
+    return [(1 + settings.scale_step) ** power for power in range(-most, most + 1)]
 
 
 def local(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
-    """The best window near a box: first at its own scale, then at the others around the peak.
+    """The best window near a box: first where, at the box's own size, then how large.
 
-    Distance and change of scale cost a little of the score, so that of two equal windows the nearer wins.
+    Distance costs a little of the score, so that of two equal windows the nearer wins.
     """
     cells = WINDOW + 2 * round((settings.search_area - 1) * WINDOW / 2)
     scored = scored_around(image, box, cells, model)
-    middle = (cells - WINDOW) // 2
-    away = (np.arange(cells - WINDOW + 1) - middle) / WINDOW
-    penalty = settings.distance_penalty * (away[:, None] ** 2 + away**2)
-    row, column = np.unravel_index((scored.scores - penalty).argmax(), scored.scores.shape)
-    best = Found(float(scored.scores[row, column]), scored.box(*scored.refined(int(row), int(column))))
-    least = best.score
-    at = best.box.centre
-    for scale in scales(settings)[1:]:
-        scored = scored_around(image, box.centred(*at).scaled(scale), _FINE_CELLS, model)
-        row, column = np.unravel_index(scored.scores.argmax(), scored.scores.shape)
-        score = float(scored.scores[row, column])
-        if score - settings.scale_penalty * abs(np.log(scale)) > least:
-            least = score - settings.scale_penalty * abs(np.log(scale))
-            best = Found(score, scored.box(*scored.refined(int(row), int(column))))
-    return best
+    away = (np.arange(cells - WINDOW + 1) - (cells - WINDOW) // 2) / WINDOW
+    row, column = _highest(scored.scores - settings.distance_penalty * (away[:, None] ** 2 + away**2))
+    return _sized(image, scored.box(*scored.refined(row, column)), model, settings)
+
+
+def _sized(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
+    """The best window within a cell of a box, at the size that appearance and size model like best together.
+
+    The appearance model alone likes windows that are too small: they hold less background.
+    """
+    factors = scales(settings)
+    tried = [scored_around(image, box.scaled(factor), _FINE_CELLS, model) for factor in factors]
+    places = [_highest(scored.scores) for scored in tried]
+    values = np.array([scored.scores[place] for scored, place in zip(tried, places, strict=True)])
+    values -= settings.scale_penalty * np.abs(np.log(factors))
+    if model.sizes is not None:
+        values += settings.scale_weight * np.array([scored.row(1, 1) @ model.sizes for scored in tried])
+    i = int(values.argmax())
+    between = (1 + settings.scale_step) ** windows.vertex(values, i)
+    return Found(float(tried[i].scores[places[i]]), tried[i].box(*tried[i].refined(*places[i])).scaled(between))
 
 
 def whole(image: np.ndarray, box: Box, model: Model, factors: list[float], settings: Settings) -> Found:
@@ -70,11 +75,11 @@ def whole(image: np.ndarray, box: Box, model: Model, factors: list[float], setti
     best, least = Found(-np.inf, box), -np.inf
     for factor in factors:
         scored = scored_whole(image, box.scaled(factor), model)
-        row, column = np.unravel_index(scored.scores.argmax(), scored.scores.shape)
-        score = float(scored.scores[row, column])
+        place = _highest(scored.scores)
+        score = float(scored.scores[place])
         if score - settings.scale_penalty * abs(np.log(factor)) > least:
             least = score - settings.scale_penalty * abs(np.log(factor))
-            best = Found(score, scored.box(*scored.refined(int(row), int(column))))
+            best = Found(score, scored.box(*scored.refined(*place)))
     return best
 
 
@@ -102,3 +107,8 @@ def scored_whole(image: np.ndarray, box: Box, model: Model) -> Scored:
     features, origin, step = windows.whole(image, box)
     origin = origin[0] + left, origin[1] + top
     return Scored(features, windows.respond(features, model.weights, model.bias), origin, step)
+
+
+def _highest(scores: np.ndarray) -> tuple[int, int]:
+    row, column = np.unravel_index(scores.argmax(), scores.shape)
+    return int(row), int(column)

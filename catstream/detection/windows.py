@@ -15,7 +15,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.detection.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
 
-__all__ = ["Scored", "around", "cut", "peaks", "respond", "row_at", "whole"]
+__all__ = ["Scored", "around", "cut", "peaks", "respond", "row_at", "vertex", "whole"]
 
 _WINDOW_PIXELS = WINDOW * CELL
 
@@ -47,8 +47,8 @@ class Scored:
     def refined(self, row: int, column: int) -> tuple[float, float]:
         """The peak at (row, column) between the cells, by a parabola in each direction."""
         scores = self.scores
-        down = _vertex(scores[:, column], row)
-        across = _vertex(scores[row], column)
+        down = vertex(scores[:, column], row)
+        across = vertex(scores[row], column)
         return row + down, column + across
 
 
@@ -150,7 +150,7 @@ def peaks(scores: np.ndarray, most: int, apart: int, least: float = -np.inf) -> 
     return found
 
 
-def _vertex(values: np.ndarray, i: int) -> float:
+def vertex(values: np.ndarray, i: int) -> float:
     """Offset of the top of the parabola through three neighbours, -0.5 to 0.5."""
     if not 0 < i < len(values) - 1:
         return 0.0

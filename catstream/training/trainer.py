@@ -44,7 +44,8 @@ class Trainer:
             weights += direction / np.float32(contrast)
         weights /= np.float32(weights @ (mean - background_mean))
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
-        return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), motion)
+        sizes = ridge.fit(sample.size.rows, self.settings.scale_ridge) if sample.size is not None else None
+        return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), motion, sizes)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings

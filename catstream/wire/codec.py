@@ -40,11 +40,16 @@ _F32, _F64 = np.dtype("<f4"), np.dtype("<f8")
 
 #: Of each array: its dtype and shape. A letter stands for the same length throughout a message.
 _ARRAYS: dict[type, dict[str, tuple[np.dtype, tuple[int | str, ...]]]] = {
-    Features: {"rows": (_F32, ("k", "d")), "labels": (_F32, ("k",)), "weights": (_F32, ("k",))},
+    Features: {
+        "rows": (_F32, ("k", "d")),
+        "labels": (_F32, ("k",)),
+        "weights": (_F32, ("k",)),
+        "sizes": (_F32, ("s", "d")),
+    },
     Summary: {"rows": (_F32, ("r", "d")), "mean": (_F32, ("d",))},
     Sample: {"centres": (_F64, ("m", 2))},
     Motion: {"process": (_F64, (4, 4)), "observation": (_F64, (2, 2))},
-    Model: {"weights": (_F32, ("d",))},
+    Model: {"weights": (_F32, ("d",)), "sizes": (_F32, ("d",))},
 }
 
 #: Arrays in which NaN has a meaning.
@@ -163,9 +168,11 @@ def _check(message: Any) -> None:
         if len(labels) and not (labels.min() >= 0 and labels.max() <= 1 and weights.min() > 0):
             raise ProtocolError("features: expected labels from 0 to 1 and weights above 0")
     if isinstance(message, Sample):
-        widths = [len(tree.mean) for tree in (message.object, message.background, message.loss)]
-        if widths != [widths[0], widths[0], widths[0] + 2]:
-            raise ProtocolError(f"sample: expected trees of d, d and d + 2 columns, got {widths}")
+        d = len(message.object.mean)
+        trees = (message.background, message.loss, message.size)
+        widths = [len(tree.mean) if tree is not None else d + 2 for tree in trees]
+        if widths != [d, d + 2, d + 2]:
+            raise ProtocolError(f"sample: expected trees of d, d, d + 2 and d + 2 columns, got {[d, *widths]}")
 
 
 def _check_array(array: np.ndarray, kind: type, name: str, where: str, lengths: dict[str, int]) -> None:

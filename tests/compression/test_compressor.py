@@ -33,9 +33,14 @@ def messages(rng) -> Iterator[Features]:
             labels = np.array([1, 1, 0, 0, 0, 0.5], np.float32)
             weights = np.array([4, 4, 1, 1, 1, 1], np.float32)
             box = Box(frame, 10, 20, 30) if frame % 5 else None
-            yield Features(frame + 1, frame, frame / 25, box, rows, labels, weights)
+            yield Features(frame + 1, frame, frame / 25, box, rows, labels, weights, rows[:3])
 
     return stream()
+
+
+def without_rows(message):
+    none = {name: getattr(message, name)[:0] for name in ("rows", "labels", "weights", "sizes")}
+    return dataclasses.replace(message, **none)
 
 
 def take(compressor: Compressor, messages: Iterator[Features], count: int) -> list[Sample]:
@@ -104,9 +109,7 @@ def test_rows_of_another_length_are_refused_and_nothing_is_stored(settings, mess
 
 def test_frames_that_teach_nothing_count_as_seen(settings, messages):
     compressor, message = Compressor(settings), next(messages)
-    compressor.take(
-        dataclasses.replace(message, rows=message.rows[:0], labels=message.labels[:0], weights=message.weights[:0])
-    )
+    compressor.take(without_rows(message))
     assert (compressor.seq, compressor.frame, compressor.counters()["rows"]) == (1, 0, 0)
 
 
@@ -120,11 +123,7 @@ def test_a_sample_is_made_only_where_a_leaf_is_new(settings, messages):
     compressor, idle = Compressor(settings), 0
     take(compressor, messages, 40)
     for _ in range(40):
-        message = next(messages)
-        empty = dataclasses.replace(
-            message, rows=message.rows[:0], labels=message.labels[:0], weights=message.weights[:0]
-        )
-        idle += compressor.take(empty) is not None
+        idle += compressor.take(without_rows(next(messages))) is not None
     assert idle <= 1
 
 

@@ -27,11 +27,11 @@ def summary(columns: int) -> Summary:
 
 EXAMPLES = {
     "end": End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),
-    "features": Features(3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3)),
+    "features": Features(3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5)),
     "health": Health("trainer", 1.7e9, {"version": 4.0}),
-    "model": Model(4, 20, array(5), -0.25, Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))),
+    "model": Model(4, 20, array(5), -0.25, Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8")), array(5)),
     "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2),
-    "sample": Sample(4, 20, summary(5), summary(5), summary(7), np.array([[1.0, 2.0], [np.nan, np.nan]])),
+    "sample": Sample(4, 20, summary(5), summary(5), summary(7), summary(7), np.array([[1.0, 2.0], [np.nan, np.nan]])),
     "stored": Stored(5, 7, 2),
     "track": Track(3, 2, 0.08, "present", Box(4.5, 3.0, 20.0, 10.0), 0.75, 4),
 }
@@ -64,7 +64,7 @@ def test_a_message_arrives_as_it_was_sent(message):
     "message",
     [
         Track(1, 0, 0.0, "absent", None, -0.5, 0),
-        Features(1, 0, 0.0, None, np.empty((0, 5), "<f4"), array(0), array(0)),
+        Features(1, 0, 0.0, None, np.empty((0, 5), "<f4"), array(0), array(0), np.empty((0, 5), "<f4")),
         Model(1, 0, array(5), 0.0, None),
         Position(),
     ],
