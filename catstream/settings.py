@@ -66,6 +66,14 @@ class Settings:
     ] = 0.0
     train_frames: Annotated[int, _about("Frames at least between two samples that the trainer learns from.", ge=1)] = 5
 
+    bootstrap: Annotated[
+        Literal["copies", "scm"],
+        _about(
+            "What the first model is learned from: n affine copies of the first box (copies), or the boxes of the "
+            "sparse collaborative model, which follows the object until there are n, as in the paper (scm)."
+        ),
+    ] = "copies"
+
     # --- training --------------------------------------------------------------------------------
     classifier: Annotated[
         Literal["joint", "least-squares", "one-class"],
@@ -89,8 +97,8 @@ class Settings:
 
     context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
     search_area: Annotated[float, _about("Side of the local search as a multiple of the window's.", ge=1.5, le=6)] = 2.5
-    scale_count: Annotated[int, _about("Sizes that a search tries, an odd number.", ge=1, le=15)] = 9
-    scale_step: Annotated[float, _about("Change of size from one to the next.", gt=0, le=0.5)] = 0.03
+    scale_count: Annotated[int, _about("Sizes that a search tries, an odd number.", ge=1, le=15)] = 7
+    scale_step: Annotated[float, _about("Change of size from one to the next.", gt=0, le=0.5)] = 0.04
     scale_weight: Annotated[
         float, _about("Weight of the size model beside the appearance model where a size is chosen (0: none).", ge=0)
     ] = 1.0
@@ -221,7 +229,7 @@ class Settings:
         return [f"{field.name}={text}" for field, text in texts if getattr(self, field.name) != field.default]
 
 
-_PAPER = {"classifier": "one-class", "detection": "full", "scale_weight": 0.0, "scale_count": 5}
+_PAPER = {"classifier": "one-class", "detection": "full", "bootstrap": "scm", "scale_weight": 0.0}
 
 #: What the paper set, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.
 PRESETS: dict[str, dict[str, Any]] = {

@@ -48,6 +48,18 @@ def test_a_share_of_an_unknown_length_is_refused(video):
         Settings(coreset_share=0.1).for_length(None)
 
 
+def test_scm_follows_the_object_until_n_rows_make_a_model(video):
+    frames, boxes = video
+    tracker = Tracker(Settings(bootstrap="scm", coreset_size=36, copies=5))
+    tracker.init(frames[0], boxes[0])
+    states = []
+    for frame, truth in zip(frames[1:], boxes[1:], strict=True):
+        _, box = tracker.update(frame)
+        assert box.overlap(Box(*truth)) > 0.5
+        states.append(tracker.track.state)
+    assert states == ["bootstrapping"] * 5 + ["present"] * 14  # six rows a frame, in frames 0 to 5
+
+
 def test_the_same_frames_give_the_same_boxes(video):
     assert follow(video, Settings())[0] == follow(video, Settings())[0]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +15,11 @@ from catstream.errors import BoxError
 from catstream.messages import Features, Model, State, Track
 from catstream.settings import Settings
 
+if TYPE_CHECKING:
+    from catstream.detection.scm import SparseCollaborativeModel
+
 __all__ = ["Detector"]
 
-_FACTORS = [1.0, 0.8, 1.25]  # of the object's size, at which a lost object is searched for
 _GROWTH = 1.18  # factor of size that no object grows by in a frame
 
 
@@ -35,6 +38,7 @@ class Detector:
         self.state: State = "bootstrapping"
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
         self._centre: CentreFilter | None = None
+        self._scm: SparseCollaborativeModel | None = None
 
     def init(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
         """Start on a box.
@@ -52,8 +56,15 @@ class Detector:
         """
         height, width = image.shape[:2]
         # The window is wider than the object: the edge of an object tells most about where it is.
-        self._box = self._sure_box = Box(*map(float, box)).inside(width, height).scaled(self.settings.context)
-        lesson = lessons.first(image, self._box, self._random(), self.settings)
+        box = Box(*map(float, box)).inside(width, height)
+        self._box = self._sure_box = box.scaled(self.settings.context)
+        if self.settings.bootstrap == "scm":
+            from catstream.detection.scm import SparseCollaborativeModel  # compiles a kernel of its own
+
+            self._scm = SparseCollaborativeModel(image, box, self._random())
+            lesson = lessons.near(image, self._box, None, self._random(), self.settings)
+        else:
+            lesson = lessons.first(image, self._box, self._random(), self.settings)
         self.model = bootstrap.stand_in(lesson, self.settings)
         lesson += lessons.far(image, self._box, self.model, self.settings)
         self.model = bootstrap.stand_in(lesson, self.settings)
@@ -64,7 +75,7 @@ class Detector:
         """Go on with a model, unless it is older than the one in use."""
         if model.version <= self.model.version:
             return
-        self.model = model
+        self.model, self._scm = model, None
         if model.motion is not None and self.seq:
             if self._centre is None:
                 self._centre = CentreFilter(model.motion, self._box.centre)
@@ -92,11 +103,15 @@ class Detector:
         self.seq += 1
         if self._centre is not None:
             self._box = self._box.centred(*self._centre.predict())
+        height, width = image.shape[:2]
+        if self._scm is not None:
+            found = self._scm.step(image)  # it has no word for absent
+            self._box = found.box.scaled(settings.context).held_in(width, height)
+            return self._answer(time, found.score, self._lesson(image, found.score))
         found = self._find(image)
         there = found.score >= (settings.return_score if self.state == "absent" else settings.present_score)
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
-            height, width = image.shape[:2]
             self._box = self._resized(found).held_in(width, height)
             if found.score >= settings.sure_score:
                 self._sure_box = self._box
@@ -120,11 +135,11 @@ class Detector:
     def _find(self, image: np.ndarray) -> search.Found:
         settings = self.settings
         if settings.detection == "full":
-            return search.whole(image, self._box, self.model, search.scales(settings), settings)
+            return search.sized(image, search.whole(image, self._box, self.model, settings).box, self.model, settings)
         found = search.local(image, self._box, self.model, settings)
         lost = found.score < settings.lost_score
         if lost or (found.score < settings.sure_score and self.seq % settings.whole_frames == 0):
-            other = search.whole(image, self._sure_box.centred(*self._box.centre), self.model, _FACTORS, settings)
+            other = search.whole(image, self._sure_box.centred(*self._box.centre), self.model, settings)
             if other.score > settings.return_score and other.score > found.score + settings.jump_margin:
                 other = search.local(image, other.box, self.model, settings)
                 if other.score > found.score:

@@ -60,7 +60,7 @@ def first(image: np.ndarray, box: Box, rng: np.random.Generator, settings: Setti
     return replace(lesson, sizes=_sizes(image, box, copies[0], settings))
 
 
-def near(image: np.ndarray, box: Box, model: Model, rng: np.random.Generator, settings: Settings) -> Lesson:
+def near(image: np.ndarray, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings) -> Lesson:
     """What a later frame teaches: the object, affine copies of it, near misses, the background around, and its size."""
     own = list(affine.copies(image, box, 1 + settings.copies, rng))
     lesson = Lesson.of(own, 1, settings.object_weight / len(own))

@@ -17,9 +17,10 @@ from catstream.detection.windows import Scored
 from catstream.messages import Model
 from catstream.settings import Settings
 
-__all__ = ["Found", "local", "scales", "scored_around", "scored_whole", "whole"]
+__all__ = ["Found", "local", "scales", "scored_around", "scored_whole", "sized", "whole"]
 
 _FINE_CELLS = WINDOW + 2  # cells searched at each size, around the place found at the first
+_FAR_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _MOST_PIXELS = 4_000_000  # of a resized frame: what a whole search may cost for a tiny object in a large frame
 
 
@@ -50,10 +51,10 @@ def local(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Foun
     scored = scored_around(image, box, cells, model)
     away = (np.arange(cells - WINDOW + 1) - (cells - WINDOW) // 2) / WINDOW
     row, column = _highest(scored.scores - settings.distance_penalty * (away[:, None] ** 2 + away**2))
-    return _sized(image, scored.box(*scored.refined(row, column)), model, settings)
+    return sized(image, scored.box(*scored.refined(row, column)), model, settings)
 
 
-def _sized(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
+def sized(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
     """The best window within a cell of a box, at the size that appearance and size model like best together.
 
     The appearance model alone likes windows that are too small: they hold less background.
@@ -70,10 +71,10 @@ def _sized(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Fou
     return Found(float(tried[i].scores[places[i]]), tried[i].box(*tried[i].refined(*places[i])).scaled(between))
 
 
-def whole(image: np.ndarray, box: Box, model: Model, factors: list[float], settings: Settings) -> Found:
-    """The best window of a whole frame, at each factor of a box's size."""
+def whole(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
+    """The best window of a whole frame, at three sizes: that of a box, and a quarter less and more."""
     best, least = Found(-np.inf, box), -np.inf
-    for factor in factors:
+    for factor in _FAR_FACTORS:
         scored = scored_whole(image, box.scaled(factor), model)
         place = _highest(scored.scores)
         score = float(scored.scores[place])
