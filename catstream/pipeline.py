@@ -129,10 +129,10 @@ class Pipeline:
             self._health[health.process] = health
 
     def _wait(self) -> None:
-        """For the others to take in the last messages, and end."""
+        """For the detector to hear that its end is stored, though it may have to be told twice, and to end."""
         deadline = time.monotonic() + _FAREWELL_SECONDS
         while not self._supervisor.finished and time.monotonic() < deadline:
+            self._results.receive(0.01)
             self._listen()
             self._supervisor.check()
-            time.sleep(0.01)
         self._listen()

@@ -49,6 +49,15 @@ class Settings:
         bool,
         _about("Repeat a run bit for bit: the detector waits for each model before it goes on."),
     ] = False
+    lag_frames: Annotated[
+        int,
+        _about(
+            "Frames of a file that the detector may be ahead of learning: it waits for the model to which "
+            "the frame so long ago led (0: as lockstep).",
+            ge=0,
+            le=65536,
+        ),
+    ] = 25
     seed: Annotated[int, _about("Seed of everything random.", ge=0)] = 0
     window: Annotated[
         int,

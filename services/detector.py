@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from contextlib import ExitStack
 
 from catstream.box import Box
@@ -16,8 +15,9 @@ from catstream.wire.sockets import Publisher, Sender, Subscriber
 
 __all__ = ["main"]
 
-_FAREWELL_SECONDS = 10.0  # what the last messages may take to be stored
-_STOPPED_SECONDS = 0.5  # what the last tracks may take where the run was stopped: its owner may listen no more
+# What the last messages may take to be stored where the run was stopped.
+_FAREWELL_SECONDS = 10.0
+_OWNER_SECONDS = 0.5  # the owner may listen no more
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool) 
         position = line.position() if resume else Position()
         detector = Detector(process.settings)
         if position.seq and position.box is not None:
-            detector.resume(position.seq, position.box, line.model(0))
+            detector.resume(position.seq, position.box, line.model())
         # From the last frame that was stored, which is passed over: there may be none after it.
         frames = stack.enter_context(open_source(source, start=max(detector.seq - 1, 0)))
         reason, failed = "the source came to its end", False
@@ -52,7 +52,7 @@ def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool) 
                 else:
                     track, features = detector.init(frame.image, box, frame.time)
                 line.send(track, features)
-                if process.settings.lockstep and not process.ended:
+                if not frames.live:
                     line.wait(detector)
                 if process.ended:
                     reason = "it was stopped"
@@ -73,6 +73,7 @@ class _Line:
         self._tracks = stack.enter_context(Publisher("tracks", endpoint))
         self.models = stack.enter_context(Subscriber("models", endpoint))
         self._senders = [self._features] + ([self._results] if self._results else [])
+        self._lag = 0 if process.settings.lockstep else process.settings.lag_frames
         self._version = 0
 
     def position(self) -> Position:
@@ -89,13 +90,11 @@ class _Line:
             sender.resume(start.seq, position.seq)
         return start
 
-    def model(self, version: int) -> Model:
-        """The next model of at least this version, however long it takes."""
-        while True:
-            message = self.models.receive(0.05)
-            if message is not None and message.version >= version:
-                return message
+    def model(self) -> Model:
+        """The newest model, however long it takes."""
+        while (model := self.models.receive(0.05)) is None:
             self._turn()
+        return model
 
     def send(self, track: Track, features: Features) -> None:
         """Send what one frame gave; wait where a window is full."""
@@ -107,33 +106,39 @@ class _Line:
         self._process.beat(self._counters)
 
     def wait(self, detector: Detector) -> None:
-        """Wait until the frame is taken, and for the model that it led to."""
-        while self._features.taken < self._features.sent and not self._process.ended:
-            self._features.listen(0.02)
+        """Wait until the frame of `lag` frames ago is taken, and for the model that it led to, or a newer one."""
+        due = self._features.sent - self._lag
+        while not self._process.ended:
+            if self._features.taken < due:
+                self._features.listen(0.02)
+            elif detector.model.version < self._features.made(due):
+                if (model := self.models.receive(0.02)) is not None:
+                    detector.adopt(model)
+                self._features.listen(0)  # a compressor may have died with the sample: it needs what led to it
+            else:
+                break
             self._process.beat(self._counters)
-        if self._features.version > detector.model.version and not self._process.ended:
-            detector.adopt(self.model(self._features.version))
 
     def end(self, seq: int, reason: str, failed: bool) -> None:
-        """Say that nothing follows, once all before is stored."""
-        deadline = time.monotonic() + _FAREWELL_SECONDS
+        """Say that nothing follows, and wait until all is stored; where the run was stopped, not for long."""
         totals: dict[str, float] = {}
         for sender in self._senders:
-            if sender is self._results and self._process.ended:
-                deadline = min(deadline, time.monotonic() + _STOPPED_SECONDS)
-            self._deliver(sender, End(seq + 1, reason, failed, totals), deadline)
-            while sender.stored < sender.sent and time.monotonic() < deadline:
+            seconds = _OWNER_SECONDS if sender is self._results else _FAREWELL_SECONDS
+            self._deliver(sender, End(seq + 1, reason, failed, totals), seconds)
+            while sender.stored < sender.sent and not self._process.ended_for(seconds):
                 sender.listen(0.02)
+                self._process.beat(self._counters)
             if sender is self._features:
                 totals = {"sent": float(seq), "stored": float(min(sender.stored, seq))}
         self._tracks.send(End(seq + 1, reason, failed, totals))
         self._process.beat(self._counters, now=True)
 
-    def _deliver(self, sender: Sender, message: Track | Features | End, deadline: float = float("inf")) -> None:
+    def _deliver(self, sender: Sender, message: Track | Features | End, seconds: float = 0) -> None:
+        """Hand a message over; where the window stays full, until this long after the run was stopped."""
         while not sender.send(message):
             sender.listen(0.02)
             self._process.beat(self._counters)
-            if time.monotonic() > deadline or (self._process.ended and not isinstance(message, End)):
+            if self._process.ended_for(seconds):
                 _log.warning(
                     "message %d of %s could not be sent: its receiver is gone", message.seq, sender.channel.name
                 )

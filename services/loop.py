@@ -28,18 +28,26 @@ class Process:
     """What a process has, whichever it is.
 
     settings, endpoint : as all processes of this pipeline have them
-    ended : whether it was asked to end
     """
 
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
         self.settings = settings
         self.endpoint = Endpoint.parse(settings.endpoint)
-        self.ended = False
+        self._asked = float("inf")  # when it was asked to end
         self._health = Publisher("health", self.endpoint, sender=name)
         self._beat = 0.0
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._end)
+
+    @property
+    def ended(self) -> bool:
+        """Whether it was asked to end."""
+        return self.ended_for(0)
+
+    def ended_for(self, seconds: float) -> bool:
+        """Whether it was asked to end, at least so long ago."""
+        return time.monotonic() - self._asked >= seconds
 
     def beat(self, counters: Callable[[], dict[str, float]], now: bool = False) -> None:
         """Tell how it is, once a second; cheap to call in every turn of a loop."""
@@ -54,7 +62,7 @@ class Process:
         self._health.close()
 
     def _end(self, *_: object) -> None:
-        self.ended = True
+        self._asked = min(self._asked, time.monotonic())
 
 
 def run(name: str, main: Callable[[Process], None], settings: Settings, parent: int | None) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import random
 import signal
@@ -29,7 +30,10 @@ NAMES = ("detector", "compressor", "trainer")
 _RESTARTS, _PER_SECONDS = 5, 60.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 5.0
 _FAREWELL_SECONDS = 12.0
+_APART_SECONDS = 3.0  # between the ends of compressor and detector, where both have ended well
 _LAST_WORDS = 2000  # bytes of a child's log that may hold why it died
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
@@ -41,6 +45,7 @@ class _Child:
     process: subprocess.Popen[bytes] | None = None
     restarts: deque[float] = field(default_factory=deque)
     due: float = 0.0
+    seen: float = 0.0  # when it last ran
 
     @property
     def finished(self) -> bool:
@@ -85,28 +90,37 @@ class Supervisor:
 
     @property
     def finished(self) -> bool:
-        """Whether all is done: detector and compressor have ended well, and the trainer learns for nobody."""
-        return all(self._children[name].finished for name in ("detector", "compressor"))
+        """Whether all is done: the detector has ended well, which it does once all that it sent is stored."""
+        return self._children["detector"].finished
 
     def check(self) -> None:
-        """Restart who died.
+        """Restart who died, and log it.
 
         Raises
         ------
         ServiceError
             Where one would only die again; says why.
         """
+        if self.finished:
+            return
+        detector = self._children["detector"]
         for child in self._children.values():
+            now = time.monotonic()
             if child.process is None:
-                if time.monotonic() >= child.due:
+                if now >= child.due:
                     self._start(child)
                 continue
             code = child.process.poll()
-            if code is None or code == 0:
+            if code is None:
+                child.seen = now
+                continue
+            if code == 0:
+                # A detector that died after its end repeats it, to others that have left by then.
+                if child is not detector and detector.restarts and now - child.seen > _APART_SECONDS:
+                    self._start(child)
                 continue
             if code == REFUSED:
                 raise ServiceError(child.last_words())
-            now = time.monotonic()
             child.restarts.append(now)
             recent = sum(now - moment < _PER_SECONDS for moment in child.restarts)
             if recent > _RESTARTS:
@@ -114,6 +128,7 @@ class Supervisor:
                     f"the {child.name} died {recent} times in a minute, the last time with {_ending(code)}: "
                     f"{child.last_words()}"
                 )
+            _log.warning("the %s died with %s, and is restarted: %s", child.name, _ending(code), child.last_words())
             pause = min(_FIRST_PAUSE * 2 ** (recent - 1), _LONGEST_PAUSE) * random.uniform(0.5, 1)
             child.process, child.due = None, now + pause
 
@@ -144,6 +159,7 @@ class Supervisor:
             command += ["--owned"] * self._owned + ["--resume"] * bool(child.restarts)
         if child.name == "compressor":
             command += ["--state", str(self._folder)]
+        child.seen = time.monotonic()
         own = {name: value for name, value in os.environ.items() if not name.startswith("CATSTREAM_")}
         child.process = subprocess.Popen(
             command,

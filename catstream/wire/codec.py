@@ -26,7 +26,7 @@ from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import End, Features, Health, Model, Motion, Position, Sample, Stored, Summary, Track
 
-__all__ = ["KINDS", "VERSION", "decode", "encode"]
+__all__ = ["KINDS", "VERSION", "decode", "encode", "opening"]
 
 #: Of the envelope and of what the fields mean.
 VERSION = 1
@@ -70,6 +70,11 @@ def encode(message: Any) -> bytes:
     """
     _check(message)
     return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
+
+
+def opening(kind: type) -> bytes:
+    """What the bytes of every message of a kind begin with."""
+    return _ENCODER.encode((VERSION, kind.__name__.lower(), None))[:-1]  # nil is one byte
 
 
 def decode(data: bytes | memoryview, *kinds: type) -> Any:

@@ -26,7 +26,7 @@ from zmq.utils.monitor import recv_monitor_message
 from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import End, Position, Stored
 from catstream.wire.channels import CHANNELS, Channel
-from catstream.wire.codec import decode, encode
+from catstream.wire.codec import decode, encode, opening
 from catstream.wire.endpoint import Endpoint
 
 __all__ = ["Publisher", "Receiver", "Sender", "Subscriber"]
@@ -35,6 +35,7 @@ _HELLO = b""
 _PATIENCE = 0.2  # seconds of silence after which a sender asks where the receiver is, a publisher says it once more
 _LINGER = 2000  # milliseconds that a closed socket still has for its last messages
 _NEWEST = 8  # messages of a burst that are on their way at once where only the newest counts
+_SAMPLES = 65536  # that a sender remembers, at most one a message: as many as `lag_frames` may be
 _TRACKS = 1000  # messages that a slow reader of a channel that keeps every message may fall behind
 
 _log = logging.getLogger(__name__)
@@ -123,6 +124,8 @@ class Sender(_Socket):
     def __init__(self, channel: str, endpoint: Endpoint, window: int) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, depth=window + 1)
         self.sent = self.stored = self.taken = self.version = 0
+        self._made: deque[tuple[int, int]] = deque(maxlen=_SAMPLES)  # seq that led to a sample, and which
+        self._led_to = 0  # the sample that `made` told of last
         self._window = window
         self._waiting: deque[tuple[int, bytes]] = deque()  # not stored yet, oldest first
         self._on_the_way = 0  # how many of them were handed to the socket
@@ -143,6 +146,15 @@ class Sender(_Socket):
         """Go on after message `seq` of a sender before this one, of which the receiver has stored `known`."""
         self.sent = self.stored = self.taken = seq
         self._known = known
+
+    def made(self, seq: int) -> int:
+        """Newest sample that the messages up to `seq` led to; not to be asked again of those before.
+
+        Where the receiver did not answer one by one, a sample counts as of the first message that it may be of.
+        """
+        while self._made and self._made[0][0] <= seq:
+            self._led_to = self._made.popleft()[1]
+        return self._led_to
 
     def send(self, message: Any) -> bool:
         """Send a message with the next seq, without waiting; False where the window is full."""
@@ -176,7 +188,9 @@ class Sender(_Socket):
                 "it holds another stream, start it anew or this process with --resume"
             )
         self._heard = monotonic()
-        self.version = max(self.version, answer.version)
+        if answer.version > self.version:
+            self.version = answer.version
+            self._made.append((self.taken + 1, answer.version))
         while self._waiting and self._waiting[0][0] <= answer.seq:
             self._waiting.popleft()
             self._on_the_way = max(self._on_the_way - 1, 0)
@@ -296,15 +310,28 @@ class Publisher(_Socket):
 
 
 class Subscriber(_Socket):
-    """Receives what a channel's publishers send from now on, and where the newest counts their last."""
+    """Receives what a channel's publishers send from now on, and where the newest counts their last.
 
-    def __init__(self, channel: str, endpoint: Endpoint) -> None:
+    Parameters
+    ----------
+    only : the one kind of message to receive; all where None
+    """
+
+    def __init__(self, channel: str, endpoint: Endpoint, only: type | None = None) -> None:
         row = CHANNELS[channel]
         super().__init__(zmq.SUB, channel, endpoint, depth=_TRACKS if row.keeps == "every" else 16)
         if row.keeps == "newest" and len(row.senders) == 1:
             self._socket.conflate = True
-        self._socket.subscribe(b"")
+        self._socket.subscribe(b"" if only is None else opening(only))  # the publisher sends nothing else
         self._connect()
+
+    def fileno(self) -> int:
+        """Readable when something may have come since `pending` was last asked."""
+        return self._socket.fd
+
+    def pending(self) -> bool:
+        """Whether a message is here."""
+        return self._wait(0)
 
     def receive(self, seconds: float) -> Any:
         """The next message, or None where none came in time."""

@@ -115,6 +115,18 @@ def test_in_lockstep_the_tracks_are_those_of_one_process(video):
         assert list(pipeline) == expected
 
 
+def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(video):
+    path, boxes = video
+    lag = 5
+    with Pipeline(path, boxes[0], Settings(lag_frames=lag)) as pipeline:
+        tracks = list(pipeline)
+    with Pipeline(path, boxes[0], Settings(lockstep=True)) as pipeline:
+        due = [track.model_version for track in pipeline]
+    assert due[-1] > 2
+    late = [i for i in range(lag, len(tracks)) if tracks[i].model_version < due[i - lag]]
+    assert not late
+
+
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
 def test_a_second_pipeline_at_the_same_place_is_refused(video, transport, folder, tcp):
     path, boxes = video

@@ -108,6 +108,24 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_what_it_has_taken(endp
     assert taken == [1]
 
 
+def test_a_sender_knows_which_sample_its_messages_led_to(endpoint, until):
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+
+        def turn():
+            message = receiver.receive(0.05)
+            if message is not None:  # every other message leads to a sample
+                receiver.acknowledge(Position(message.seq, version=message.seq // 2))
+            sender.listen(0)
+
+        led_to = []
+        for seq in range(1, 8):
+            sender.send(track(seq))
+            until(lambda seq=seq: sender.taken == seq, turn)
+        for seq in range(1, 8):
+            led_to.append(sender.made(seq))
+    assert led_to == [0, 1, 1, 2, 2, 3, 3]
+
+
 def test_a_full_window_takes_no_more(endpoint, until):
     taken = []
     with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
