@@ -6,7 +6,8 @@
         for track in pipeline:
             print(track.frame, track.state, track.box, track.score)
 
-In one process, frame by frame: `catstream.Tracker`, used like a `cv2.Tracker`.
+In one process, frame by frame: `catstream.Tracker`, used like a `cv2.Tracker`. From another process, while a
+pipeline runs: `catstream.subscribe`.
 """
 
 from __future__ import annotations
@@ -20,9 +21,20 @@ if TYPE_CHECKING:
     from catstream.messages import Track
     from catstream.pipeline import Pipeline
     from catstream.settings import Settings
+    from catstream.subscription import Subscription, subscribe
     from catstream.tracker import Tracker
 
-__all__ = ["Box", "CatstreamError", "Pipeline", "Settings", "Track", "Tracker", "__version__"]
+__all__ = [
+    "Box",
+    "CatstreamError",
+    "Pipeline",
+    "Settings",
+    "Subscription",
+    "Track",
+    "Tracker",
+    "__version__",
+    "subscribe",
+]
 
 __version__ = "0.1.0"
 
@@ -31,8 +43,10 @@ _HOMES = {
     "CatstreamError": "errors",
     "Pipeline": "pipeline",
     "Settings": "settings",
+    "Subscription": "subscription",
     "Track": "messages",
     "Tracker": "tracker",
+    "subscribe": "subscription",
 }
 
 

@@ -5,7 +5,7 @@ line prints it as one line and exits with 1; a program catches
 `CatstreamError`, or one of its kinds.
 """
 
-__all__ = ["BoxError", "CatstreamError", "ProtocolError", "ServiceError", "SettingsError", "VideoError"]
+__all__ = ["BoxError", "CatstreamError", "ProtocolError", "ServiceError", "SettingsError", "SilenceError", "VideoError"]
 
 
 class CatstreamError(Exception):
@@ -30,3 +30,7 @@ class ProtocolError(CatstreamError, ValueError):
 
 class ServiceError(CatstreamError):
     """A process of the pipeline that failed, or that cannot start."""
+
+
+class SilenceError(ServiceError, TimeoutError):
+    """A pipeline from which nothing came in the time given."""

@@ -21,9 +21,11 @@ from urllib.parse import urlsplit
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS, Channel
 
-__all__ = ["Endpoint", "meeting_place", "private_folder"]
+__all__ = ["Endpoint", "find", "meeting_place", "private_folder", "running"]
 
 _LONGEST_PATH = 107  # bytes that the kernel takes for the name of a Unix socket
+_PREFIX = "catstream-"  # of private folders
+_NOTE = "endpoint"  # file in the private folder of a running pipeline that says where its processes meet
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +112,7 @@ def _file(channel: Channel, sender: str) -> str:
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
     """A fresh folder that only this user may enter, gone afterwards."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    folder = Path(tempfile.mkdtemp(prefix="catstream-", dir=runtime if os.access(runtime, os.W_OK) else None))
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=_homes()[0]))
     try:
         yield folder
     finally:
@@ -125,7 +126,7 @@ def meeting_place(text: str, default: Path) -> Iterator[Endpoint]:
     Parameters
     ----------
     text : the setting `endpoint`
-    default : the folder to use where that is empty
+    default : the pipeline's private folder, to use where that is empty; `running` finds the pipeline by it
 
     Raises
     ------
@@ -134,7 +135,8 @@ def meeting_place(text: str, default: Path) -> Iterator[Endpoint]:
     """
     endpoint = Endpoint.parse(text or str(default))
     if endpoint.folder is None:  # the kernel gives a port to one process only
-        yield endpoint
+        with _noted(endpoint, default):
+            yield endpoint
         return
     folder = endpoint.folder.absolute()
     try:
@@ -154,10 +156,74 @@ def meeting_place(text: str, default: Path) -> Iterator[Endpoint]:
                 "wait for it, or give another folder (--set endpoint=FOLDER)"
             ) from None
         try:
-            yield Endpoint.parse(str(folder))
+            endpoint = Endpoint.parse(str(folder))
+            with _noted(endpoint, default):
+                yield endpoint
         finally:
             for channel in CHANNELS.values():
                 for sender in channel.senders:
                     (folder / _file(channel, sender)).unlink(missing_ok=True)
     finally:
         os.close(handle)
+
+
+@contextlib.contextmanager
+def _noted(endpoint: Endpoint, folder: Path) -> Iterator[None]:
+    """Leave a note of where a pipeline is; it is locked for as long as the process lives, however that ends."""
+    path = folder / _NOTE
+    with path.open("w") as note:
+        fcntl.flock(note, fcntl.LOCK_EX)
+        note.write(str(endpoint))
+        note.flush()
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def running() -> list[Endpoint]:
+    """Where this user's pipelines run, in no order."""
+    endpoints = []
+    for home in set(_homes()):
+        for path in home.glob(f"{_PREFIX}*/{_NOTE}"):
+            with contextlib.suppress(OSError), path.open() as note:  # it may be gone by now, or another user's
+                text = note.read()
+                if text and os.fstat(note.fileno()).st_uid == os.geteuid() and _locked(note.fileno()):
+                    endpoints.append(Endpoint.parse(text))
+    return endpoints
+
+
+def find(text: str = "") -> Endpoint:
+    """The endpoint of a running pipeline: the one given, or where none is that of the only one of this user.
+
+    Raises
+    ------
+    ServiceError
+        Where there is none, or more than one.
+    """
+    if text:
+        return Endpoint.parse(text)
+    endpoints = running()
+    if not endpoints:
+        raise ServiceError(
+            "no pipeline of yours is running: start one (catstream track), or say where it is (--endpoint)"
+        )
+    if len(endpoints) > 1:
+        raise ServiceError(
+            f"{len(endpoints)} pipelines are running, say which (--endpoint): {', '.join(sorted(map(str, endpoints)))}"
+        )
+    return endpoints[0]
+
+
+def _homes() -> list[Path]:
+    """Where private folders are made, the best place first: a pipeline of a timer has no runtime folder."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    return [Path(home) for home in (runtime, tempfile.gettempdir()) if os.access(home, os.W_OK)]
+
+
+def _locked(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    return False

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import Endpoint, meeting_place, private_folder
+from catstream.wire.endpoint import Endpoint, find, meeting_place, private_folder, running
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
 
@@ -113,7 +115,7 @@ def test_one_pipeline_at_a_time_meets_in_a_folder(folder):
 
 def test_the_folder_of_a_killed_pipeline_is_free_again(folder):
     script = "import os, signal, sys; from pathlib import Path; from catstream.wire.endpoint import meeting_place\n"
-    script += "with meeting_place(sys.argv[1], Path()): os.kill(os.getpid(), signal.SIGKILL)"
+    script += "with meeting_place(sys.argv[1], Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
     assert subprocess.run([sys.executable, "-c", script, str(folder)]).returncode == -9
     with meeting_place(str(folder), folder) as endpoint:
         assert endpoint.folder == folder
@@ -124,3 +126,41 @@ def test_no_socket_file_is_left_of_a_pipeline(folder):
         for channel, sender in PLACES:
             Path(endpoint.address(channel, sender).removeprefix("ipc://")).touch()
     assert not list(folder.iterdir())
+
+
+def test_a_running_pipeline_is_found_until_it_ends(folder):
+    with private_folder() as private, meeting_place(str(folder / "run"), private) as endpoint:
+        assert endpoint in running()
+        assert find(str(endpoint)) == endpoint
+    assert endpoint not in running()
+
+
+@pytest.mark.parametrize("place", ["", "tcp://127.0.0.1:5999"], ids=["a folder of its own", "tcp"])
+def test_a_pipeline_is_found_wherever_it_meets(place):
+    with private_folder() as private, meeting_place(place, private) as endpoint:
+        assert endpoint in running()
+
+
+def test_a_killed_pipeline_is_not_found():
+    script = "import os, signal; from catstream.wire.endpoint import meeting_place, private_folder\n"
+    script += "with private_folder() as private, meeting_place('', private) as endpoint:\n"
+    script += "    print(endpoint, flush=True)\n    os.kill(os.getpid(), signal.SIGKILL)"
+    killed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    place = Path(killed.stdout.strip())
+    try:
+        assert (place / "endpoint").read_text() == str(place)
+        assert Endpoint.parse(str(place)) not in running()
+    finally:
+        shutil.rmtree(place)
+
+
+def test_without_a_place_there_must_be_just_one_pipeline(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # where no others run
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    with pytest.raises(ServiceError, match="no pipeline of yours is running"):
+        find()
+    places = (private_folder(), private_folder())
+    with places[0] as one, places[1] as two, meeting_place("", one) as first:
+        assert find() == first
+        with meeting_place("", two), pytest.raises(ServiceError, match="2 pipelines are running, say which"):
+            find()

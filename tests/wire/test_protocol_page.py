@@ -68,6 +68,7 @@ def test_the_limits_are_those_of_the_codec():
 def test_the_example_in_bytes_is_what_travels():
     example = re.search(r"^```\n((?:[0-9a-f]{2}[ \n])+)```", PAGE, re.MULTILINE)[1]
     assert bytes.fromhex(example) == codec.encode(Stored(5, 7, 2))
+    assert f"`{codec.opening(End).hex(' ')}` for `end`" in PAGE
 
 
 @pytest.mark.parametrize("text", ["run", "tcp://127.0.0.1:5700"])

@@ -1,0 +1,199 @@
+"""Attach to a running pipeline: its messages one by one, as they come.
+
+    import catstream
+
+    with catstream.subscribe("run", "tracks") as tracks:
+        for track in tracks:
+            print(track.frame, track.state, track.box)
+
+The pipeline never waits for who is attached: a slow one misses tracks, and `missed` counts them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import select
+from time import monotonic
+from typing import Generic, Literal, Self, TypeVar, overload
+
+from catstream.errors import ServiceError, SilenceError
+from catstream.messages import End, Health, Model, Sample, Track
+from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import find
+from catstream.wire.sockets import Subscriber
+
+__all__ = ["Subscription", "subscribe"]
+
+#: Seconds that the last messages have to come in after the end was heard: it travels by itself.
+_LAST_WORDS = 0.5
+
+_OPEN = [name for name, channel in CHANNELS.items() if not channel.acknowledged]
+
+Message = TypeVar("Message", bound=Track | Model | Health | Sample)
+
+
+class Subscription(Generic[Message]):
+    """Messages of one channel of a running pipeline, from now until its end; iterate it, with `for` or `async for`.
+
+    Tracks come one a frame, a restarted detector may repeat some. Of models, samples and the
+    health of each process the last one comes at once, then each that is the newest when it is
+    taken. Before the pipeline is there, and while it is away, it waits.
+
+    Attributes
+    ----------
+    missed : tracks that never came, as the gaps in `seq` tell: this reader was too slow, or away
+    refused : messages that were dropped because they were not what the channel carries
+    end : the pipeline's `End`, None before it
+    endpoint : where it is attached
+
+    Raises
+    ------
+    SilenceError
+        While iterating, where nothing came for as long as `timeout` says. It may be iterated on.
+    """
+
+    def __init__(self, endpoint: str, channel: str, *, timeout: float | None = None) -> None:
+        if channel not in _OPEN:
+            raise ServiceError(
+                f"one can subscribe to {', '.join(_OPEN)}, got {channel!r}: the others have one receiver"
+            )
+        place = find(endpoint)
+        self.endpoint, self.timeout = str(place), timeout
+        self.missed = 0
+        self.end: End | None = None
+        self._channel, self._seq = channel, 0
+        self._newest: dict[str, float] = {}  # of each process that sends: what was taken last
+        self._closing = float("inf")  # when to wait no more
+        self._messages = Subscriber(channel, place)
+        # By itself: a reader that is so slow that tracks are dropped would miss the end among them.
+        self._ends = Subscriber("tracks", place, only=End)
+
+    @property
+    def refused(self) -> int:
+        """Messages that were dropped because they were not what the channel carries."""
+        return self._messages.refused
+
+    def close(self) -> None:
+        """Attach no more."""
+        self._messages.close()
+        self._ends.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Message:
+        patience = self._patience()
+        while (message := self._take()) is None:
+            if self._ended():
+                raise StopIteration
+            poller = select.poll()
+            for socket in (self._messages, self._ends):
+                poller.register(socket.fileno(), select.POLLIN)
+            seconds = self._left(patience)
+            poller.poll(None if seconds is None else seconds * 1000)
+        return message
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Message:
+        patience = self._patience()
+        while (message := self._take()) is None:
+            if self._ended():
+                raise StopAsyncIteration
+            loop, came = asyncio.get_running_loop(), asyncio.Event()
+            handles = [socket.fileno() for socket in (self._messages, self._ends)]
+            seconds = self._left(patience)
+            for handle in handles:
+                loop.add_reader(handle, came.set)
+            try:
+                async with asyncio.timeout(seconds):
+                    await came.wait()
+            except TimeoutError:
+                pass
+            finally:
+                for handle in handles:
+                    loop.remove_reader(handle)
+        return message
+
+    def _take(self) -> Message | None:
+        """The next message, where it is here already."""
+        while self._messages.pending():
+            message = self._messages.receive(0)
+            if isinstance(message, End):
+                if self._channel == "tracks":  # nothing is on its way behind it
+                    self.end, self._closing = message, 0.0
+                    return None
+            elif message is not None and self._new(message):
+                return message
+        while self._ends.pending():
+            end = self._ends.receive(0)
+            if self.end is None and end is not None:
+                self.end, self._closing = end, monotonic() + _LAST_WORDS
+        return None
+
+    def _new(self, message: Message) -> bool:
+        """Whether it did not come before: a channel's last message is sent again when somebody new comes."""
+        if isinstance(message, Track):
+            self._count(message.seq)
+            return True
+        name, mark = (message.process, message.time) if isinstance(message, Health) else ("", message.version)
+        known = self._newest.get(name)
+        self._newest[name] = mark
+        return mark != known
+
+    def _count(self, seq: int) -> None:
+        if self._seq:  # who comes late has missed nothing; a restarted detector goes back
+            self.missed += max(0, seq - self._seq - 1)
+        self._seq = seq
+
+    def _ended(self) -> bool:
+        if self.end is None or monotonic() < self._closing:
+            return False
+        if self._channel == "tracks":
+            self._count(self.end.seq)
+        return True
+
+    def _patience(self) -> float:
+        return float("inf") if self.timeout is None else monotonic() + self.timeout
+
+    def _left(self, patience: float) -> float | None:
+        """Seconds to wait at most, None for any time; raises SilenceError where they are over."""
+        now = monotonic()
+        if now >= patience and self.end is None:
+            raise SilenceError(
+                f"no {self._channel} came from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
+            )
+        until = min(patience if self.end is None else float("inf"), self._closing)
+        return None if until == float("inf") else max(0.0, until - now)
+
+
+@overload
+def subscribe(endpoint: str, channel: Literal["tracks"], *, timeout: float | None = ...) -> Subscription[Track]: ...
+@overload
+def subscribe(endpoint: str, channel: Literal["models"], *, timeout: float | None = ...) -> Subscription[Model]: ...
+@overload
+def subscribe(endpoint: str, channel: Literal["health"], *, timeout: float | None = ...) -> Subscription[Health]: ...
+@overload
+def subscribe(endpoint: str, channel: Literal["samples"], *, timeout: float | None = ...) -> Subscription[Sample]: ...
+def subscribe(endpoint: str, channel: str, *, timeout: float | None = None) -> Subscription:
+    """Attach to a running pipeline.
+
+    Parameters
+    ----------
+    endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
+    channel : "tracks", "models", "health" or "samples"
+    timeout : seconds without a message after which iterating raises `SilenceError`; None to wait for ever
+
+    Raises
+    ------
+    ServiceError
+        Where there is no such channel, or `endpoint` is empty and not just one pipeline runs.
+    """
+    return Subscription(endpoint, channel, timeout=timeout)

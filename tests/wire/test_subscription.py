@@ -1,0 +1,183 @@
+"""Attached to a pipeline: what a reader gets, what it is told that it missed, and when it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+
+import numpy as np
+import pytest
+
+import catstream
+from catstream.box import Box
+from catstream.errors import ServiceError, SilenceError
+from catstream.messages import End, Health, Model, Track
+from catstream.wire.channels import CHANNELS
+from catstream.wire.sockets import Publisher
+
+
+def track(seq):
+    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1)
+
+
+def model(version):
+    return Model(version, 10 * version, np.full(5, version, np.float32), 0.5)
+
+
+@pytest.fixture
+def tracks(endpoint):
+    """The detector's side: sends tracks."""
+    with Publisher("tracks", endpoint) as publisher:
+        yield publisher
+
+
+def attached(endpoint, tracks, channel="tracks", **options):
+    """A subscription to which the publisher of tracks is connected: it got the track with seq 1."""
+    subscription = catstream.subscribe(str(endpoint), channel, timeout=0.05, **options)
+    for _ in range(400):
+        tracks.send(track(1))
+        with contextlib.suppress(SilenceError):
+            assert next(subscription).seq == 1
+            break
+    for _ in range(400):  # those of the same seq that were on their way
+        with contextlib.suppress(SilenceError):
+            next(subscription)
+            continue
+        break
+    subscription.timeout = 20
+    return subscription
+
+
+def test_tracks_come_in_order_until_the_end(endpoint, tracks):
+    with attached(endpoint, tracks) as subscription:
+        for seq in range(2, 50):
+            tracks.send(track(seq))
+        tracks.send(End(50, "the source came to its end", totals={"sent": 49.0}))
+        assert list(subscription) == [track(seq) for seq in range(2, 50)]
+        assert subscription.end.totals == {"sent": 49}
+        assert subscription.missed == 0
+        assert list(subscription) == [], "it stays ended"
+
+
+def test_each_gap_is_counted_also_the_one_before_the_end(endpoint, tracks):
+    with attached(endpoint, tracks) as subscription:
+        for seq in (2, 5, 6, 10):
+            tracks.send(track(seq))
+        tracks.send(End(13, "the source came to its end"))
+        assert [message.seq for message in subscription] == [2, 5, 6, 10]
+        assert subscription.missed == 2 + 3 + 2
+
+
+def test_who_comes_late_has_missed_nothing_and_a_restarted_detector_takes_nothing_away(endpoint, tracks):
+    with attached(endpoint, tracks) as subscription:
+        for seq in (2, 3, 4, 2, 3, 4, 5):
+            tracks.send(track(seq))
+        tracks.send(End(6, "the source came to its end"))
+        assert [message.seq for message in subscription] == [2, 3, 4, 2, 3, 4, 5]
+        assert subscription.missed == 0
+
+
+def test_a_reader_that_lost_the_end_among_its_tracks_still_ends(endpoint, tracks):
+    count = 30_000  # more than all buffers on the way hold
+    with attached(endpoint, tracks) as subscription:
+        for seq in range(2, count):
+            tracks.send(track(seq))
+        tracks.send(End(count, "the source came to its end"))
+        heard = [message.seq for message in subscription]
+        assert 0 < len(heard) < count - 2, "this reader was too slow"
+        assert len(heard) + subscription.missed == count - 2
+
+
+def test_a_model_comes_to_who_is_late_once_and_the_end_of_the_tracks_is_that_of_all(endpoint, tracks):
+    with Publisher("models", endpoint) as models:
+        models.send(model(1))
+        models.send(model(2))
+        ended, seen = threading.Event(), []
+
+        def publish():
+            while not ended.wait(0.01):
+                models.welcome()
+                if seen:  # the subscriber is there
+                    tracks.send(End(2, "the source came to its end"))
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            with catstream.subscribe(str(endpoint), "models", timeout=20) as subscription:
+                for message in subscription:
+                    seen.append(message.version)
+        finally:
+            ended.set()
+            thread.join()
+    assert seen == [2]
+    assert subscription.end.reason == "the source came to its end"
+
+
+def test_each_process_is_heard_and_nothing_twice(endpoint):
+    names = CHANNELS["health"].senders
+    with contextlib.ExitStack() as stack:
+        publishers = [stack.enter_context(Publisher("health", endpoint, name)) for name in names]
+        subscription = stack.enter_context(catstream.subscribe(str(endpoint), "health", timeout=0.3))
+        heard = []
+        for name, publisher in zip(names, publishers, strict=True):
+            publisher.send(Health(name, 1.0))
+        for _ in range(100):
+            for publisher in publishers:
+                publisher.welcome()
+            with contextlib.suppress(SilenceError):
+                heard.append(next(subscription).process)
+                continue
+            if len(heard) >= len(names):
+                break
+    assert sorted(heard) == sorted(names)
+
+
+def test_silence_is_an_error_after_the_time_given_and_one_may_go_on(endpoint, tracks):
+    with attached(endpoint, tracks) as subscription:
+        subscription.timeout = 0.1
+        with pytest.raises(SilenceError, match="is a pipeline running there"):
+            next(subscription)
+        with pytest.raises(TimeoutError):
+            next(subscription)
+        tracks.send(track(2))
+        subscription.timeout = 20
+        assert next(subscription).seq == 2
+
+
+def test_async_for_gives_the_same(endpoint, tracks):
+    async def read(subscription):
+        return [message.seq async for message in subscription]
+
+    async def both():
+        reading = asyncio.create_task(read(subscription))
+        for seq in range(2, 40):
+            tracks.send(track(seq))
+            await asyncio.sleep(0)
+        tracks.send(End(42, "the source came to its end"))
+        return await reading
+
+    with attached(endpoint, tracks) as subscription:
+        assert asyncio.run(both()) == list(range(2, 40))
+        assert subscription.missed == 2
+
+
+def test_a_waiting_task_can_be_cancelled_and_hears_silence(endpoint, tracks):
+    async def waits():
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(anext(subscription), 0.05)
+        subscription.timeout = 0.05
+        with pytest.raises(SilenceError):
+            await anext(subscription)
+        tracks.send(track(2))
+        subscription.timeout = 20
+        return await anext(subscription)
+
+    with attached(endpoint, tracks) as subscription:
+        assert asyncio.run(waits()).seq == 2
+
+
+@pytest.mark.parametrize("channel", ["features", "results", "frames"])
+def test_a_channel_for_one_receiver_is_refused(endpoint, channel):
+    with pytest.raises(ServiceError, match="one can subscribe to samples, models, tracks, health"):
+        catstream.subscribe(str(endpoint), channel)
