@@ -123,7 +123,15 @@ class Settings:
         float, _about("Score that a window's width of distance costs in the local search.", ge=0)
     ] = 0.1
     present_score: Annotated[float, _about("Score below which the object counts as absent.")] = 0.3
+    present_share: Annotated[
+        float,
+        _about("The same as a share of the score that the object usually has: the higher one counts.", ge=0, le=1),
+    ] = 0.45
     return_score: Annotated[float, _about("Score at which an absent object counts as present again.")] = 0.5
+    return_share: Annotated[
+        float,
+        _about("The same as a share of the score that the object usually has: the higher one counts.", ge=0, le=1),
+    ] = 0.65
     sure_score: Annotated[float, _about("Score below which the whole frame is searched now and then.")] = 0.55
     lost_score: Annotated[float, _about("Score below which the whole frame is searched in every frame.")] = 0.3
     jump_margin: Annotated[float, _about("Score by which a window elsewhere must be better than the one near.")] = 0.1
@@ -238,7 +246,14 @@ class Settings:
         return [f"{field.name}={text}" for field, text in texts if getattr(self, field.name) != field.default]
 
 
-_PAPER = {"classifier": "one-class", "detection": "full", "bootstrap": "scm", "scale_weight": 0.0}
+_PAPER = {
+    "classifier": "one-class",
+    "detection": "full",
+    "bootstrap": "scm",
+    "scale_weight": 0.0,
+    "present_share": 0.0,
+    "return_share": 0.0,
+}
 
 #: What the paper set, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.
 PRESETS: dict[str, dict[str, Any]] = {

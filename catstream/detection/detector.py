@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["Detector"]
 
 _GROWTH = 1.18  # factor of size that no object grows by in a frame
+_USUAL_RATE = 0.01  # share that a frame has in the score that the object usually has
 
 
 class Detector:
@@ -37,6 +38,7 @@ class Detector:
         self.seq = 0
         self.state: State = "bootstrapping"
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
+        self._usual_score = 0.0
         self._centre: CentreFilter | None = None
         self._scm: SparseCollaborativeModel | None = None
 
@@ -109,7 +111,7 @@ class Detector:
             self._box = found.box.scaled(settings.context).held_in(width, height)
             return self._answer(time, found.score, self._lesson(image, found.score))
         found = self._find(image)
-        there = found.score >= (settings.return_score if self.state == "absent" else settings.present_score)
+        there = self._there(found.score)
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
             self._box = self._resized(found).held_in(width, height)
@@ -120,6 +122,17 @@ class Detector:
         if self._centre is not None:
             self._centre.update(self._box.centre if there else None)
         return self._answer(time, found.score, self._lesson(image, found.score) if there else Lesson.none())
+
+    def _there(self, score: float) -> bool:
+        """Whether the best score in a frame is the object's: high enough, and for the score that this one usually has."""
+        settings = self.settings
+        if self.state == "absent":
+            there = score >= max(settings.return_score, settings.return_share * self._usual_score)
+        else:
+            there = score >= max(settings.present_score, settings.present_share * self._usual_score)
+        if there:
+            self._usual_score += _USUAL_RATE * (score - self._usual_score)
+        return there
 
     def _resized(self, found: search.Found) -> Box:
         """The box found, its size following slowly, and not at all where the score is low.

@@ -76,6 +76,16 @@ def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
     assert features.rows.shape == (0, row_length())
 
 
+@pytest.mark.parametrize(("share", "state"), [(0.0, "bootstrapping"), (0.9, "absent")])
+def test_a_score_is_judged_by_the_one_that_the_object_usually_has(scene, share, state):
+    detector, there = started(scene, present_share=share), scene((60, 50))
+    for _ in range(300):
+        detector.step(there)
+    track, _ = detector.step(cv2.addWeighted(there, 0.4, scene(), 0.6, 0))
+    assert 0.3 < track.score < 0.8
+    assert track.state == state
+
+
 def test_an_object_that_comes_back_elsewhere_is_found_in_the_whole_frame(scene):
     detector = started(scene)
     detector.step(scene())
