@@ -16,6 +16,8 @@ VERBS = {
     "track": "Follow an object through a video.",
     "demo": "See it work, on a video that is rendered for it.",
     "evaluate": "Measure accuracy on annotated sequences, beside other trackers.",
+    "watch": "Show what a running pipeline says, as it says it.",
+    "status": "Ask a running pipeline how it is.",
     "settings": "List all settings, with their defaults and meaning.",
 }
 

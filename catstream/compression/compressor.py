@@ -98,6 +98,7 @@ class Compressor:
             "version": self.version,
             "rows": sum(tree.rows_seen for tree in self.trees.values()),
             "leaves": self.leaves,
+            "level": max((node.level for tree in self.trees.values() for node in tree.nodes), default=0),
             "nodes": sum(len(tree.nodes) for tree in self.trees.values()),
             "bytes": sum(tree.nbytes for tree in self.trees.values()),
         }

@@ -29,10 +29,7 @@ def catstream():
         def start(*arguments, **options):
             process = subprocess.Popen(
                 [sys.executable, "-c", "from catstream.cli import main; main()", *map(str, arguments)],
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                **options,
+                **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options},
             )
             stack.callback(process.communicate)
             stack.callback(process.kill)

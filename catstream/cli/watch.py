@@ -1,0 +1,186 @@
+"""`catstream watch`: what a running pipeline says, as it says it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from functools import partial
+from typing import Any, Self
+
+import click
+import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from catstream.box import Box
+from catstream.messages import Health, Model, Sample, Track
+from catstream.subscription import Subscription, subscribe
+
+__all__ = ["watch"]
+
+_PATIENCE_SECONDS = 5.0  # each process of a running pipeline is heard once a second
+_RATE_SECONDS = 2.0  # that the rate is the mean of
+_ROWS = 16  # of the newest messages that a terminal shows
+_REFRESHES = 8  # a second
+_LEFT = {"state", "process", "counters", "levels"}  # columns of words
+
+
+def _track(message: Track) -> dict[str, str]:
+    return {
+        "frame": f"{message.frame}",
+        "seconds": f"{message.time:.2f}",
+        "state": message.state,
+        "box": "-" if message.box is None else ", ".join(f"{side:.0f}" for side in message.box),
+        "score": f"{message.score:+.2f}",
+        "model": f"{message.model_version}",
+    }
+
+
+def _model(message: Model) -> dict[str, str]:
+    return {
+        "version": f"{message.version}",
+        "frame": f"{message.frame}",
+        "|weights|": f"{np.linalg.norm(message.weights):.3f}",
+        "bias": f"{message.bias:+.3f}",
+        "motion": "no" if message.motion is None else "yes",
+        "sizes": "no" if message.sizes is None else "yes",
+    }
+
+
+def _sample(message: Sample) -> dict[str, str]:
+    trees = {"object": message.object, "background": message.background, "loss": message.loss, "size": message.size}
+    return {
+        "version": f"{message.version}",
+        "frame": f"{message.frame}",
+        "levels": " ".join(map(str, message.object.levels)),
+        **{name: "-" if tree is None else f"{len(tree.rows)} of {tree.count}" for name, tree in trees.items()},
+    }
+
+
+def _health(message: Health) -> dict[str, str]:
+    counters = (f"{name} {value:.0f}" for name, value in message.counters.items())
+    return {"process": message.process, "counters": "  ".join(counters)}
+
+
+#: Of each channel: what a person wants to see of a message, by the name of its column.
+_CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
+    "tracks": _track,
+    "models": _model,
+    "health": _health,
+    "samples": _sample,
+}
+
+
+@click.command()
+@click.argument("channel", type=click.Choice(list(_CELLS)))
+@click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
+@click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
+@click.option("--count", type=click.IntRange(min=1), help="End after so many messages.")
+def watch(channel: str, endpoint: str, as_json: bool, count: int | None) -> None:
+    """Show what a running pipeline says, until it ends or Ctrl-C.
+
+    The pipeline does not wait: what this reader was too slow for is counted as
+    missed. With --json an array is told by its dtype, its shape and its norm.
+
+    \b
+    CHANNEL
+      tracks    where the object is, frame by frame
+      models    what was learned: the last model, then the newest
+      health    what each process counts, once a second
+      samples   what the trainer learns from, and the levels of the object's tree
+
+    \b
+    EXAMPLES
+      catstream watch tracks
+      catstream watch tracks --json | jq .box
+      catstream watch models --endpoint run --count 1 --json
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    seen = 0
+    with subscribe(endpoint, channel) as messages:  # type: ignore[call-overload]
+        _knock(messages.endpoint)
+        with suppress(KeyboardInterrupt), ExitStack() as stack:
+            if as_json:
+                show = _print_json
+            elif Console().is_terminal:
+                show = stack.enter_context(_Screen(channel, messages)).add
+            else:
+                show = partial(_print_line, channel)
+            for message in messages:
+                show(message)
+                seen += 1
+                if seen == count:
+                    break
+        reason = f": {messages.end.reason}" if messages.end is not None else ""
+        click.echo(f"{seen} {channel}, {messages.missed} missed{reason}", err=True)
+
+
+def _knock(endpoint: str) -> None:
+    """Raise SilenceError where no pipeline runs: tracks and models may be silent for long where one does."""
+    with subscribe(endpoint, "health", timeout=_PATIENCE_SECONDS) as health:
+        next(health, None)
+
+
+def _print_json(message: Any) -> None:
+    click.echo(json.dumps(_plain(message)))
+
+
+def _plain(value: Any) -> Any:
+    """A message for JSON; an array by what it is."""
+    if isinstance(value, np.ndarray):
+        norm = float(np.linalg.norm(np.nan_to_num(value)))
+        return {"dtype": value.dtype.name, "shape": value.shape, "norm": round(norm, 6)}
+    if isinstance(value, Box):
+        return list(value)
+    if dataclasses.is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return value
+
+
+def _print_line(channel: str, message: Any) -> None:
+    click.echo("  ".join(f"{name} {cell}" for name, cell in _CELLS[channel](message).items()))
+
+
+class _Screen:
+    """A table of the newest messages, of health the newest of each process, drawn anew in a thread of its own."""
+
+    def __init__(self, channel: str, messages: Subscription) -> None:
+        self._cells, self._messages = _CELLS[channel], messages
+        # Replaced, never changed: the thread reads them.
+        self._rows: dict[object, dict[str, str]] = {}
+        self._moments: tuple[float, ...] = ()
+        self._live = Live(get_renderable=self._draw, refresh_per_second=_REFRESHES)
+
+    def add(self, message: Any) -> None:
+        self._moments = (*self._recent(), time.monotonic())
+        key = message.process if isinstance(message, Health) else object()
+        rows = {**self._rows, key: self._cells(message)}
+        self._rows = {key: rows[key] for key in list(rows)[-_ROWS:]}
+
+    def _recent(self) -> list[float]:
+        now = time.monotonic()
+        return [moment for moment in self._moments if now - moment <= _RATE_SECONDS]
+
+    def _draw(self) -> Group:
+        rows = list(self._rows.values())
+        table = Table(box=None, header_style="bold", pad_edge=False)
+        for name in rows[0] if rows else ():
+            table.add_column(name, justify="left" if name in _LEFT else "right")
+        for cells in rows:
+            table.add_row(*cells.values())
+        rate = len(self._recent()) / _RATE_SECONDS
+        line = f"{rate:.0f} a second   {self._messages.missed} missed   {self._messages.endpoint}"
+        return Group(table, Text(line, style="dim"))
+
+    def __enter__(self) -> Self:
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()

@@ -1,0 +1,138 @@
+"""`catstream watch` and `catstream status`, beside a pipeline that runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pty
+import select
+import signal
+import time
+
+import pytest
+
+from catstream.messages import Track
+from catstream.pipeline import Pipeline
+from catstream.services.supervisor import NAMES
+from catstream.settings import Settings
+
+SECONDS = 60  # that anything may take on a busy machine
+
+
+def pipeline(video):
+    """One that goes on only as its tracks are taken."""
+    source, box = video
+    return Pipeline(source, [float(side) for side in box.split(",")], Settings(window=1))
+
+
+@pytest.fixture(scope="module")
+def resting(video):
+    """A pipeline that has learned its first model, and waits."""
+    with pipeline(video) as running:
+        for track in running:
+            if track.model_version:
+                break
+        yield running
+
+
+def test_tracks_come_as_lines_of_json_until_the_pipeline_ends(video, catstream):
+    with pipeline(video) as running:
+        process = catstream("watch", "tracks", "--json", "--endpoint", running.endpoint)
+        for _ in running:
+            select.select([process.stdout], [], [], 0.3)  # while it starts, few pass
+        output, errors = process.communicate(timeout=SECONDS)
+    tracks = [json.loads(line) for line in output.splitlines()]
+    assert tracks[0].keys() == {field.name for field in dataclasses.fields(Track)}
+    assert [track["frame"] for track in tracks] == list(range(60 - len(tracks), 60))
+    assert process.returncode == 0
+    assert errors == f"{len(tracks)} tracks, 0 missed: the source came to its end\n"
+
+
+def test_a_late_one_gets_the_last_model_with_its_arrays_in_short(resting, said):
+    code, output, errors = said("watch", "models", "--count", 1, "--json", "--endpoint", resting.endpoint)
+    model = json.loads(output)
+    assert model["version"] >= 1
+    assert model["weights"].keys() == {"dtype", "shape", "norm"}
+    assert (model["weights"]["dtype"], model["weights"]["shape"]) == ("float32", [2176])
+    assert (code, errors) == (0, "1 models, 0 missed\n")
+
+
+@pytest.mark.parametrize(("channel", "word"), [("samples", "  levels "), ("health", "  counters ")])
+def test_what_is_no_terminal_gets_a_line_a_message(resting, said, channel, word):
+    code, output, _ = said("watch", channel, "--count", 1, "--endpoint", resting.endpoint)
+    assert code == 0
+    (line,) = output.splitlines()
+    assert word in line
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_terminal_shows_a_table_until_it_is_stopped_which_is_no_error(resting, catstream, number):
+    screen, terminal = pty.openpty()
+    process = catstream("watch", "health", "--endpoint", resting.endpoint, stdout=terminal, env=TERMINAL)
+    os.close(terminal)
+    shown = b""
+    deadline = time.monotonic() + SECONDS
+    while not all(word in shown for word in (b"process", b"counters", b"missed", *map(str.encode, NAMES))):
+        assert time.monotonic() < deadline, shown
+        if select.select([screen], [], [], 0.1)[0]:
+            shown += os.read(screen, 65536)
+    process.send_signal(number)
+    while select.select([screen], [], [], SECONDS)[0]:
+        try:
+            os.read(screen, 65536)
+        except OSError:  # nobody is on the other side any more
+            break
+    os.close(screen)
+    assert process.wait(SECONDS) == 0
+    assert "Traceback" not in process.stderr.read()
+
+
+TERMINAL = {**os.environ, "TERM": "xterm", "COLUMNS": "160"}
+
+
+@pytest.mark.parametrize("arguments", [("watch", "tracks"), ("status",)], ids=" ".join)
+def test_where_no_pipeline_runs_one_line_says_so(said, tmp_path, arguments):
+    nowhere = {**os.environ, "TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}
+    code, output, errors = said(*arguments, env=nowhere)
+    assert (code, output) == (1, "")
+    assert errors.startswith("catstream: no pipeline of yours is running: start one")
+    assert errors.count("\n") == 1
+
+
+def test_where_a_place_is_silent_one_line_says_so(said, tmp_path):
+    code, output, errors = said("watch", "tracks", "--endpoint", tmp_path)
+    assert (code, output) == (1, "")
+    assert errors == f"catstream: no health came from {tmp_path} within 5 s: is a pipeline running there?\n"
+
+
+def test_status_tells_of_all_processes(resting, said):
+    code, output, errors = said("status", "--endpoint", resting.endpoint, "--wait", SECONDS)
+    assert (code, errors) == (0, "")
+    assert [line.split()[0] for line in output.splitlines()] == [
+        "pipeline", "frames", "learning", "model", "trees", "refused", "heard",
+    ]  # fmt: skip
+    assert all(name in output for name in NAMES)
+
+
+def test_status_tells_programs_in_json(resting, said):
+    code, output, _ = said("status", "--endpoint", resting.endpoint, "--json", "--wait", SECONDS)
+    found = json.loads(output)
+    assert code == 0
+    assert found["ok"]
+    assert found["frames"] >= 1
+    assert found["model_version"] >= 1
+    assert found["leaves"] >= 4, "one in each tree"
+    assert found["frames_per_second"] == 0, "nobody takes its tracks"
+    assert found["processes"].keys() == set(NAMES)
+
+
+def test_status_names_a_process_that_is_silent_and_fails(resting, said):
+    os.kill(resting.pids["trainer"], signal.SIGSTOP)
+    try:
+        code, output, errors = said("status", "--endpoint", resting.endpoint, "--wait", 3)
+    finally:
+        os.kill(resting.pids["trainer"], signal.SIGCONT)
+    assert code == 1
+    assert "trainer" not in output
+    assert errors == f"catstream: not heard at {resting.endpoint} within 3 s: trainer\n"
