@@ -104,8 +104,8 @@ def watch(channel: str, endpoint: str, as_json: bool, count: int | None) -> None
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     seen = 0
     with subscribe(endpoint, channel) as messages:  # type: ignore[call-overload]
-        _knock(messages.endpoint)
         with suppress(KeyboardInterrupt), ExitStack() as stack:
+            _knock(messages.endpoint)
             if as_json:
                 show = _print_json
             elif Console().is_terminal:

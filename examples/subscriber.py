@@ -1,0 +1,83 @@
+"""A subscriber in plain Python, with pyzmq and msgpack and nothing of catstream.
+
+    catstream track walk.mp4 --box 120,80,64,48 --set endpoint=run
+    python examples/subscriber.py run
+
+Prints every track and each new model, until the pipeline ends. `docs/protocol.md` says what travels.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from array import array
+
+import msgpack
+import zmq
+
+PORTS = {"models": 2, "tracks": 3}  # counted from that of the endpoint
+
+
+def address(endpoint: str, channel: str) -> str:
+    """Of a channel; the endpoint is a folder of sockets, or tcp://127.0.0.1:PORT."""
+    if endpoint.startswith("tcp://"):
+        host, _, port = endpoint.rpartition(":")
+        return f"{host}:{int(port) + PORTS[channel]}"
+    return f"ipc://{endpoint}/{channel}"
+
+
+def attach(endpoint: str, channel: str, *, newest: bool) -> zmq.Socket:
+    """A socket that hears the channel from now on; with `newest` it holds no message but the last."""
+    socket = zmq.Context.instance().socket(zmq.SUB)
+    if newest:
+        socket.setsockopt(zmq.CONFLATE, 1)
+    socket.subscribe(b"")
+    socket.connect(address(endpoint, channel))  # the pipeline may come later
+    return socket
+
+
+def receive(socket: zmq.Socket) -> tuple[str, dict]:
+    """The next message: its kind and its fields."""
+    version, kind, fields = msgpack.unpackb(socket.recv())
+    if version != 1:
+        sys.exit("this catstream speaks another protocol")
+    return kind, fields
+
+
+def norm(weights: dict) -> float:
+    """Length of a vector as it travels: dtype "<f4", shape, and the bytes of its numbers."""
+    numbers = array("f", weights["data"])
+    if sys.byteorder == "big":
+        numbers.byteswap()
+    return math.hypot(*numbers)
+
+
+def main(endpoint: str) -> None:
+    tracks, models = attach(endpoint, "tracks", newest=False), attach(endpoint, "models", newest=True)
+    poller = zmq.Poller()
+    poller.register(tracks)
+    poller.register(models)
+    version = seq = missed = 0
+    while True:
+        ready = dict(poller.poll())
+        if models in ready:
+            _, model = receive(models)
+            if model["version"] != version:  # the last one may come twice
+                version = model["version"]
+                print(f"model {version} of frame {model['frame']}, norm {norm(model['weights']):.4f}", flush=True)
+        if tracks in ready:
+            kind, track = receive(tracks)
+            if seq:  # who comes late has missed nothing
+                missed += max(0, track["seq"] - seq - 1)
+            seq = track["seq"]
+            if kind == "end":
+                print(f"end: {track['reason']}, {missed} tracks missed")
+                return
+            box = "-" if track["box"] is None else ",".join(f"{side:.1f}" for side in track["box"])
+            print(f"track {track['frame']} {track['state']} {box} {track['score']:.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python subscriber.py ENDPOINT (a folder, or tcp://127.0.0.1:PORT)")
+    main(sys.argv[1])
