@@ -1,0 +1,214 @@
+"""What subscribers cost a pipeline: frames a second with many attached, some of them frozen, beside none attached.
+
+All runs follow the same rendered video. The readers run at the lowest priority: what is measured is the pipeline, not
+what readers do with a track.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import select
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from statistics import median
+from time import perf_counter
+from typing import Any, Self
+
+import psutil
+from sequences import rendered, video
+from table import Table, command, publish
+
+import catstream
+from catstream.messages import End
+from catstream.pipeline import Pipeline
+from catstream.settings import Settings
+from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.sockets import Subscriber
+
+SIZE = (320, 240)
+TOGETHER = 20  # readers in one process: a process each would be more than most machines hold
+LAST_WORDS_SECONDS = 20.0  # that readers have to take what is still on its way
+PAUSE_SECONDS = 2.0  # from one late joiner to the next
+
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+@dataclass(slots=True)
+class Run:
+    """What was seen of one run.
+
+    moments  seconds of each track
+    memory   of each process: resident megabytes, some fifty times
+    work     of each process: seconds of processor time, when last seen
+    joined   seconds until each late joiner had the last model
+    frozen   seconds for which the frozen readers were that
+    heard    tracks that each other reader heard
+    """
+
+    moments: list[float] = field(default_factory=list)
+    memory: dict[str, list[float]] = field(default_factory=dict)
+    work: dict[str, float] = field(default_factory=dict)
+    joined: list[float] = field(default_factory=list)
+    frozen: float = 0.0
+    heard: list[int] = field(default_factory=list)
+
+    @property
+    def rate(self) -> float:
+        """Frames a second from the first track to the last."""
+        return (len(self.moments) - 1) / (self.moments[-1] - self.moments[0])
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    frames, readers, frozen, runs = options.frames, options.readers, options.frozen, options.runs
+    if options.quick:
+        frames, readers, frozen, runs = 60, 6, 2, 1
+    alone, beside = [], []
+    for _ in range(runs):  # in turn, so that a machine that gets slower does so for both
+        alone.append(travel(frames, 0, 0))
+        beside.append(travel(frames, readers, frozen))
+
+    columns = ("subscribers", "frozen", "for s", "frames", "frames/s", "slowest run", "ratio")
+    base, rows = median(run.rate for run in alone), []
+    for all_runs, attached, stopped in ((alone, 0, 0), (beside, readers, frozen)):
+        rate, seconds = median(run.rate for run in all_runs), median(run.frozen for run in all_runs)
+        rows.append((attached, stopped, seconds, frames, rate, min(run.rate for run in all_runs), rate / base))
+    yield Table("Frames a second", columns, rows, f"median of {runs} runs each, made in turn")
+
+    columns = ("subscribers", "process", "MB at a quarter", "MB at the end", "most", "CPU ms a frame")
+    rows = [
+        (attached, name, seen[len(seen) // 4], seen[-1], max(seen), 1000 * run.work[name] / frames)
+        for attached, run in ((0, alone[-1]), (readers, beside[-1]))
+        for name, seen in run.memory.items()
+    ]
+    yield Table("Processes", columns, rows, "of the last runs; the coreset trees grow with the logarithm of the frames")
+
+    joined = [1000 * seconds for run in beside for seconds in run.joined]
+    columns = ("late joiners", "median ms", "longest ms")
+    rows = [(len(joined), median(joined) if joined else None, max(joined, default=None))]
+    yield Table("Until a late joiner has the last model", columns, rows, "its sockets included")
+
+    heard = [count for run in beside for count in run.heard]
+    columns = ("readers", "frames", "median", "least")
+    rows = [(len(heard), frames, median(heard), min(heard))]
+    yield Table(
+        "Tracks heard by readers that were not frozen", columns, rows, "they attach while the first frames pass"
+    )
+
+
+def travel(frames: int, readers: int, frozen: int) -> Run:
+    """Run a pipeline to the end of the video, with readers that attach as it starts."""
+    sequence, run, ended = rendered(frames, SIZE), Run(), threading.Event()
+    with private_folder() as folder, Crowd(str(folder), readers, frozen) as crowd:
+        late = threading.Thread(target=join, args=(str(folder), ended, run.joined))
+        with Pipeline(video(sequence), sequence.boxes[0], Settings(endpoint=str(folder))) as pipeline:
+            try:
+                for track in pipeline:
+                    run.moments.append(perf_counter())
+                    if readers and track.model_version and late.ident is None:
+                        late.start()
+                    if track.frame % (frames // 50 + 1) == 0:
+                        crowd.freeze()
+                        for name, pid in pipeline.pids.items():
+                            look(run, name, pid)
+            finally:
+                ended.set()
+                if late.ident is not None:
+                    late.join()
+        run.frozen, run.heard = crowd.frozen, crowd.heard()
+    return run
+
+
+def look(run: Run, name: str, pid: int) -> None:
+    with suppress(psutil.NoSuchProcess):  # it has just ended
+        process = psutil.Process(pid)
+        run.memory.setdefault(name, []).append(process.memory_info().rss / 1e6)
+        run.work[name] = sum(process.cpu_times()[:2])
+
+
+def join(endpoint: str, ended: threading.Event, seconds: list[float]) -> None:
+    """Attach to the models again and again, and time how long the last one takes to come."""
+    while not ended.is_set():
+        begin = perf_counter()
+        with catstream.subscribe(endpoint, "models", timeout=10) as models:
+            if next(models, None) is not None:
+                seconds.append(perf_counter() - begin)
+        ended.wait(PAUSE_SECONDS)
+
+
+class Crowd:
+    """Readers of tracks, in processes of their own; some of them are frozen once they hear.
+
+    frozen   seconds for which they have been
+    """
+
+    def __init__(self, endpoint: str, readers: int, frozen: int) -> None:
+        self._counts = _SPAWN.RawArray("l", readers + 1)  # tracks that each has heard; the last one is nobody's
+        self._awake, self._since = readers - frozen, 0.0
+        self._processes: list[Any] = []
+        self._sleepers: list[Any] = []
+        for start, end, processes in ((0, self._awake, self._processes), (self._awake, readers, self._sleepers)):
+            for first in range(start, end, TOGETHER):
+                numbers = range(first, min(first + TOGETHER, end))
+                processes.append(_SPAWN.Process(target=listen, args=(endpoint, numbers, self._counts)))
+
+    @property
+    def frozen(self) -> float:
+        return perf_counter() - self._since if self._since else 0.0
+
+    def freeze(self) -> None:
+        """Stop those that are to be frozen, once all of them have heard a track."""
+        if not self._since and self._sleepers and all(self._counts[self._awake : -1]):
+            for process in self._sleepers:
+                os.kill(process.pid, signal.SIGSTOP)
+            self._since = perf_counter()
+
+    def heard(self) -> list[int]:
+        """Tracks that each of the others has heard, when all is over."""
+        deadline = perf_counter() + LAST_WORDS_SECONDS
+        for process in self._processes:
+            process.join(max(0.0, deadline - perf_counter()))
+        return self._counts[: self._awake]
+
+    def __enter__(self) -> Self:
+        for process in self._processes + self._sleepers:
+            process.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._processes + self._sleepers:
+            process.kill()
+            process.join()
+
+
+def listen(endpoint: str, numbers: range, counts: Any) -> None:
+    """Be some of the readers, until the end."""
+    os.nice(19)
+    poller, readers = select.poll(), {}
+    for number in numbers:
+        reader = Subscriber("tracks", Endpoint.parse(endpoint))
+        readers[reader.fileno()] = number, reader
+        poller.register(reader.fileno(), select.POLLIN)
+    while readers:
+        for handle, _ in poller.poll():
+            number, reader = readers[handle]
+            for message in reader.waiting():
+                if isinstance(message, End):
+                    poller.unregister(handle)
+                    del readers[handle]
+                else:
+                    counts[number] += 1
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--frames", type=int, default=4_000, help="of each run (default: %(default)s)")
+    parser.add_argument("--readers", type=int, default=200, help="subscribers attached (default: %(default)s)")
+    parser.add_argument("--frozen", type=int, default=20, help="of them frozen (default: %(default)s)")
+    parser.add_argument("--runs", type=int, default=2, help="with and without each (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)
