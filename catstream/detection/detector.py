@@ -124,7 +124,7 @@ class Detector:
         return self._answer(time, found.score, self._lesson(image, found.score) if there else Lesson.none())
 
     def _there(self, score: float) -> bool:
-        """Whether the best score in a frame is the object's: high enough, and for the score that this one usually has."""
+        """Whether the best score in a frame is the object's: high enough, also for what this one usually scores."""
         settings = self.settings
         if self.state == "absent":
             there = score >= max(settings.return_score, settings.return_share * self._usual_score)
