@@ -34,9 +34,9 @@ class Box(NamedTuple):
         """Square pixels."""
         return self.w * self.h
 
-    def scaled(self, factor: float) -> Box:
-        """The box with the same centre and `factor` times the width and the height."""
-        w, h = self.w * factor, self.h * factor
+    def scaled(self, across: float, down: float | None = None) -> Box:
+        """The box with the same centre and `across` times the width, `down` times the height (as much where None)."""
+        w, h = self.w * across, self.h * (across if down is None else down)
         return Box(self.x + (self.w - w) / 2, self.y + (self.h - h) / 2, w, h)
 
     def centred(self, x: float, y: float) -> Box:

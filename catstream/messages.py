@@ -45,7 +45,8 @@ class Features:
     rows     float32 (k, d); k is 0 where the frame teaches nothing
     labels   float32 (k,): 1 the object, 0 background, between them a near miss
     weights  float32 (k,): how many ordinary rows each counts for, above 0
-    sizes    float32 (s, d): the object cut at s sizes, smallest first, its own in the middle; s is odd, or 0
+    extents  float32 (s, d): the object cut as it is, too small, too large, too wide and too narrow; s may be 0
+    fits     float32 (s,): how well each of those fits, 1 as it is, towards 0 far from it
     """
 
     seq: int
@@ -55,7 +56,8 @@ class Features:
     rows: np.ndarray
     labels: np.ndarray
     weights: np.ndarray
-    sizes: np.ndarray
+    extents: np.ndarray
+    fits: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +115,7 @@ class Sample:
     object      rows of the object (d columns)
     background  rows of everything else (d columns)
     loss        rows [x, 1, y] times the root of their weight (d + 2 columns)
-    size        rows [x, 1, y] of the object cut too small and too large, None before a leaf of them (d + 2 columns)
+    extent      rows [x, 1, y] of the object cut well and badly, None before a leaf of them (d + 2 columns)
     centres     float64 (m, 2), object's centre in the last whole block of frames, pixels, NaN where absent
     """
 
@@ -122,7 +124,7 @@ class Sample:
     object: Summary
     background: Summary
     loss: Summary
-    size: Summary | None
+    extent: Summary | None
     centres: np.ndarray
 
 
@@ -147,8 +149,8 @@ class Model:
     weights  float32 (d,)
     bias     score of a window = weights @ row + bias; 0 at the background's mean, 1 at the object's
     motion   parameters of the Kalman filter, or None before EM had enough centres
-    sizes    float32 (d,): of windows around one place, the one of the right size has the largest
-             sizes @ row; None before there was enough to learn them from
+    extent   float32 (d,): of windows around one place, the one that fits the object best has the
+             largest extent @ row; None before there was enough to learn it from
     """
 
     version: int
@@ -156,7 +158,7 @@ class Model:
     weights: np.ndarray
     bias: float
     motion: Motion | None = None
-    sizes: np.ndarray | None = None
+    extent: np.ndarray | None = None
 
 
 @dataclass(frozen=True, slots=True)

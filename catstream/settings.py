@@ -93,7 +93,7 @@ class Settings:
     ] = "joint"
     ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 1.0
     loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
-    scale_ridge: Annotated[float, _about("Lambda of the least squares of the size tree.", gt=0)] = 0.1
+    extent_ridge: Annotated[float, _about("Lambda of the least squares of the extent tree.", gt=0)] = 0.1
     motion_frames: Annotated[
         int, _about("Frames in a block of centres, from which the Kalman filter's parameters are learned.", ge=8)
     ] = 64
@@ -108,17 +108,30 @@ class Settings:
     search_area: Annotated[float, _about("Side of the local search as a multiple of the window's.", ge=1.5, le=6)] = 2.5
     scale_count: Annotated[int, _about("Sizes that a search tries, an odd number.", ge=1, le=15)] = 7
     scale_step: Annotated[float, _about("Change of size from one to the next.", gt=0, le=0.5)] = 0.04
-    scale_weight: Annotated[
-        float, _about("Weight of the size model beside the appearance model where a size is chosen (0: none).", ge=0)
-    ] = 1.0
-    scale_sigma: Annotated[
-        float, _about("Distance, in steps of size, at which a wrong size is worth exp(-1/2) of the right one.", gt=0)
-    ] = 1.0
     scale_rate: Annotated[float, _about("Share of a change of size that is followed at once.", ge=0, le=1)] = 0.7
-    scale_score: Annotated[float, _about("Score below which the size is held.")] = 0.5
-    scale_penalty: Annotated[
-        float, _about("Score that a change of size costs, times the logarithm of its factor.", ge=0)
+    aspect_count: Annotated[
+        int, _about("Ratios of width to height that a search tries, an odd number (1: it never changes).", ge=1, le=15)
+    ] = 5
+    aspect_step: Annotated[float, _about("Change of this ratio from one to the next.", gt=0, le=0.5)] = 0.08
+    aspect_rate: Annotated[float, _about("Share of a change of this ratio that is followed at once.", ge=0, le=1)] = 0.2
+    extent_score: Annotated[float, _about("Score below which size and ratio are held.")] = 0.5
+    extent_penalty: Annotated[
+        float, _about("Score that a change of size or ratio costs, times the logarithm of its factor.", ge=0)
     ] = 0.3
+    extent_prior: Annotated[
+        float,
+        _about(
+            "Score that being of another size or ratio than the first box costs, times the square of the logarithm "
+            "of its factor.",
+            ge=0,
+        ),
+    ] = 0.3
+    extent_weight: Annotated[
+        float, _about("Weight of the extent model beside the appearance model where size and ratio are chosen.", ge=0)
+    ] = 1.0
+    extent_sigma: Annotated[
+        float, _about("Steps of size or ratio at which a window fits exp(-1/2) as well as the right one.", gt=0)
+    ] = 1.0
     distance_penalty: Annotated[
         float, _about("Score that a window's width of distance costs in the local search.", ge=0)
     ] = 0.1
@@ -250,7 +263,8 @@ _PAPER = {
     "classifier": "one-class",
     "detection": "full",
     "bootstrap": "scm",
-    "scale_weight": 0.0,
+    "extent_weight": 0.0,
+    "extent_prior": 0.0,
     "present_share": 0.0,
     "return_share": 0.0,
 }

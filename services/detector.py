@@ -37,7 +37,7 @@ def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool) 
         position = line.position() if resume else Position()
         detector = Detector(process.settings)
         if position.seq and position.box is not None:
-            detector.resume(position.seq, position.box, line.model())
+            detector.resume(position.seq, box, position.box, line.model())
         # From the last frame that was stored, which is passed over: there may be none after it.
         frames = stack.enter_context(open_source(source, start=max(detector.seq - 1, 0)))
         reason, failed = "the source came to its end", False

@@ -49,12 +49,12 @@ def _model(message: Model) -> dict[str, str]:
         "|weights|": f"{np.linalg.norm(message.weights):.3f}",
         "bias": f"{message.bias:+.3f}",
         "motion": "no" if message.motion is None else "yes",
-        "sizes": "no" if message.sizes is None else "yes",
+        "extent": "no" if message.extent is None else "yes",
     }
 
 
 def _sample(message: Sample) -> dict[str, str]:
-    trees = {"object": message.object, "background": message.background, "loss": message.loss, "size": message.size}
+    trees = {"object": message.object, "background": message.background, "loss": message.loss, "extent": message.extent}
     return {
         "version": f"{message.version}",
         "frame": f"{message.frame}",

@@ -21,7 +21,7 @@ from catstream.settings import Settings
 
 __all__ = ["Compressor"]
 
-_TREES = ("object", "background", "loss", "size")
+_TREES = ("object", "background", "loss", "extent")
 
 
 class Compressor:
@@ -72,9 +72,8 @@ class Compressor:
             self.trees["loss"].insert(_loss_rows(rows, labels, features.weights))
             self.trees["object"].insert(rows[labels == 1])
             self.trees["background"].insert(rows[labels == 0])
-        if sizes := len(features.sizes):
-            off = (np.arange(sizes) - sizes // 2) / self.settings.scale_sigma
-            self.trees["size"].insert(_loss_rows(features.sizes, np.exp(-(off**2) / 2), np.ones(sizes)))
+        if extents := len(features.extents):
+            self.trees["extent"].insert(_loss_rows(features.extents, features.fits, np.ones(extents)))
         self.seq, self.frame = features.seq, features.frame
         if features.box is not None:
             self.box = features.box
@@ -170,11 +169,8 @@ class Compressor:
         return self._made()
 
     def _made(self) -> Sample:
-        size = self.trees["size"]
-        others = {name: tree.sample() for name, tree in self.trees.items() if tree is not size}
-        return Sample(
-            self.version, self.frame, centres=self.centres, size=size.sample() if size.nodes else None, **others
-        )
+        summaries = {name: tree.sample() if tree.nodes else None for name, tree in self.trees.items()}
+        return Sample(self.version, self.frame, centres=self.centres, **summaries)  # type: ignore[arg-type]
 
 
 def _loss_rows(rows: np.ndarray, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:

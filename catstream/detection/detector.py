@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from catstream.box import Box
-from catstream.detection import bootstrap, lessons, search
+from catstream.detection import bootstrap, extent, lessons, search
 from catstream.detection.lessons import Lesson
 from catstream.detection.motion import CentreFilter
+from catstream.detection.search import Found
 from catstream.errors import BoxError
 from catstream.messages import Features, Model, State, Track
 from catstream.settings import Settings
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Detector"]
 
-_GROWTH = 1.18  # factor of size that no object grows by in a frame
 _USUAL_RATE = 0.01  # share that a frame has in the score that the object usually has
 
 
@@ -59,7 +58,7 @@ class Detector:
         height, width = image.shape[:2]
         # The window is wider than the object: the edge of an object tells most about where it is.
         box = Box(*map(float, box)).inside(width, height)
-        self._box = self._sure_box = box.scaled(self.settings.context)
+        self._box = self._sure_box = self._first_box = box.scaled(self.settings.context)
         if self.settings.bootstrap == "scm":
             from catstream.detection.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
@@ -84,16 +83,18 @@ class Detector:
             else:
                 self._centre.adopt(model.motion)
 
-    def resume(self, seq: int, box: Box, model: Model) -> None:
+    def resume(self, seq: int, first: Box, box: Box, model: Model) -> None:
         """Go on after message `seq` of a stream that another detector began.
 
         Parameters
         ----------
         seq : the last Features that is stored
-        box : where the object was last, in pixels
+        first : the object in the first frame, in pixels
+        box : where it was last
         model : the newest there is
         """
         self.seq, self.state = seq, "present"
+        self._first_box = first.scaled(self.settings.context)
         self._box = self._sure_box = box.scaled(self.settings.context)
         self.adopt(model)
 
@@ -114,7 +115,7 @@ class Detector:
         there = self._there(found.score)
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
-            self._box = self._resized(found).held_in(width, height)
+            self._box = extent.followed(self._box, found, settings).held_in(width, height)
             if found.score >= settings.sure_score:
                 self._sure_box = self._box
         else:
@@ -134,30 +135,22 @@ class Detector:
             self._usual_score += _USUAL_RATE * (score - self._usual_score)
         return there
 
-    def _resized(self, found: search.Found) -> Box:
-        """The box found, its size following slowly, and not at all where the score is low.
-
-        A far larger change is no growth of the object, but another place: it is taken over whole.
-        """
-        growth = math.sqrt(found.box.area / self._box.area)
-        if not 1 / _GROWTH < growth < _GROWTH:
-            return found.box
-        followed = self.settings.scale_rate if found.score >= self.settings.scale_score else 0.0
-        return found.box.scaled(growth ** (followed - 1))
-
-    def _find(self, image: np.ndarray) -> search.Found:
+    def _find(self, image: np.ndarray) -> Found:
         settings = self.settings
         if settings.detection == "full":
-            return search.sized(image, search.whole(image, self._box, self.model, settings).box, self.model, settings)
-        found = search.local(image, self._box, self.model, settings)
+            return self._fitted(image, search.whole(image, self._box, self.model, settings))
+        found = self._fitted(image, search.local(image, self._box, self.model, settings))
         lost = found.score < settings.lost_score
         if lost or (found.score < settings.sure_score and self.seq % settings.whole_frames == 0):
             other = search.whole(image, self._sure_box.centred(*self._box.centre), self.model, settings)
             if other.score > settings.return_score and other.score > found.score + settings.jump_margin:
-                other = search.local(image, other.box, self.model, settings)
+                other = self._fitted(image, search.local(image, other.box, self.model, settings))
                 if other.score > found.score:
                     return other
         return found
+
+    def _fitted(self, image: np.ndarray, found: Found) -> Found:
+        return extent.fitted(image, found.box, self._first_box, self.model, self.settings)
 
     def _lesson(self, image: np.ndarray, score: float) -> Lesson:
         settings = self.settings
@@ -176,4 +169,6 @@ class Detector:
         frame = self.seq - 1
         box = None if self.state == "absent" else self._box.scaled(1 / self.settings.context)
         track = Track(self.seq, frame, time, self.state, box, float(score), self.model.version)
-        return track, Features(self.seq, frame, time, box, lesson.rows, lesson.labels, lesson.weights, lesson.sizes)
+        return track, Features(
+            self.seq, frame, time, box, lesson.rows, lesson.labels, lesson.weights, lesson.extents, lesson.fits
+        )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from catstream.box import Box
-from catstream.detection import affine, search, windows
+from catstream.detection import affine, extent, search, windows
 from catstream.detection.hog import WINDOW, row_length
 from catstream.messages import Model
 from catstream.settings import Settings
@@ -25,18 +25,20 @@ _MIDDLE = (_CELLS - WINDOW) // 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lesson:
-    """Rows with their labels and weights, and the object at other sizes, as in `Features`."""
+    """Rows with their labels and weights, and cuts that show how large the object is, as in `Features`."""
 
     rows: np.ndarray
     labels: np.ndarray
     weights: np.ndarray
-    sizes: np.ndarray
+    extents: np.ndarray
+    fits: np.ndarray
 
     @classmethod
     def of(cls, rows: list[np.ndarray], label: float, weight: float = 1.0) -> Lesson:
         """Rows of one kind."""
         k = len(rows)
-        return cls(_array(rows), np.full(k, label, np.float32), np.full(k, weight, np.float32), _array([]))
+        none = np.empty(0, np.float32)
+        return cls(_array(rows), np.full(k, label, np.float32), np.full(k, weight, np.float32), _array([]), none)
 
     @classmethod
     def none(cls) -> Lesson:
@@ -48,7 +50,8 @@ class Lesson:
             np.concatenate([self.rows, other.rows]),
             np.concatenate([self.labels, other.labels]),
             np.concatenate([self.weights, other.weights]),
-            np.concatenate([self.sizes, other.sizes]),
+            np.concatenate([self.extents, other.extents]),
+            np.concatenate([self.fits, other.fits]),
         )
 
 
@@ -57,15 +60,15 @@ def first(image: np.ndarray, box: Box, rng: np.random.Generator, settings: Setti
     copies = affine.copies(image, box, settings.coreset_size, rng)
     lesson = Lesson.of(list(copies), 1, settings.object_weight)
     lesson += _around(image, box, None, settings.coreset_size, rng, settings)
-    return replace(lesson, sizes=_sizes(image, box, copies[0], settings))
+    return _with_extents(lesson, image, box, copies[0], settings)
 
 
 def near(image: np.ndarray, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings) -> Lesson:
-    """What a later frame teaches: the object, affine copies of it, near misses, the background around, and its size."""
+    """What a later frame teaches: the object, affine copies of it, near misses, background, and its extent."""
     own = list(affine.copies(image, box, 1 + settings.copies, rng))
     lesson = Lesson.of(own, 1, settings.object_weight / len(own))
     lesson += _around(image, box, model, settings.near_negatives, rng, settings)
-    return replace(lesson, sizes=_sizes(image, box, own[0], settings))
+    return _with_extents(lesson, image, box, own[0], settings)
 
 
 def far(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Lesson:
@@ -76,13 +79,9 @@ def far(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Lesson
     return Lesson.of(rows[: settings.far_negatives], 0)
 
 
-def _sizes(image: np.ndarray, box: Box, own: np.ndarray, settings: Settings) -> np.ndarray:
-    """The object cut at each size that a search tries, its own in the middle; nothing where no size is learned."""
-    if not settings.scale_weight:
-        return _array([])
-    others = (windows.around(image, box.scaled(factor), WINDOW)[0] for factor in search.scales(settings) if factor != 1)
-    rows = [cells.reshape(-1) for cells in others]
-    return _array([*rows[: len(rows) // 2], own, *rows[len(rows) // 2 :]])
+def _with_extents(lesson: Lesson, image: np.ndarray, box: Box, own: np.ndarray, settings: Settings) -> Lesson:
+    rows, fits = extent.cuts(image, box, own, settings)
+    return replace(lesson, extents=_array(rows), fits=np.array(fits, np.float32))
 
 
 def _array(rows: list[np.ndarray]) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Search: where in a frame the model scores highest.
 
 Near the place where the object is expected, or in the whole frame. A search at
-several scales resizes the frame, not the model.
+another size resizes the frame, not the model.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from catstream.detection.windows import Scored
 from catstream.messages import Model
 from catstream.settings import Settings
 
-__all__ = ["Found", "local", "scales", "scored_around", "scored_whole", "sized", "whole"]
+__all__ = ["Found", "highest", "local", "scored_around", "scored_whole", "whole"]
 
-_FINE_CELLS = WINDOW + 2  # cells searched at each size, around the place found at the first
 _FAR_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _MOST_PIXELS = 4_000_000  # of a resized frame: what a whole search may cost for a tiny object in a large frame
 
@@ -32,43 +31,16 @@ class Found:
     box: Box
 
 
-def scales(settings: Settings) -> list[float]:
-    """Factors of the box's size to search at, smallest first, 1 in the middle.
-
-    >>> [round(scale, 3) for scale in scales(Settings(scale_count=5, scale_step=0.03))]
-    [0.943, 0.971, 1.0, 1.03, 1.061]
-    """
-    most = settings.scale_count // 2
-    return [(1 + settings.scale_step) ** power for power in range(-most, most + 1)]
-
-
 def local(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
-    """The best window near a box: first where, at the box's own size, then how large.
+    """The best window near a box, of its size.
 
     Distance costs a little of the score, so that of two equal windows the nearer wins.
     """
     cells = WINDOW + 2 * round((settings.search_area - 1) * WINDOW / 2)
     scored = scored_around(image, box, cells, model)
     away = (np.arange(cells - WINDOW + 1) - (cells - WINDOW) // 2) / WINDOW
-    row, column = _highest(scored.scores - settings.distance_penalty * (away[:, None] ** 2 + away**2))
-    return sized(image, scored.box(*scored.refined(row, column)), model, settings)
-
-
-def sized(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
-    """The best window within a cell of a box, at the size that appearance and size model like best together.
-
-    The appearance model alone likes windows that are too small: they hold less background.
-    """
-    factors = scales(settings)
-    tried = [scored_around(image, box.scaled(factor), _FINE_CELLS, model) for factor in factors]
-    places = [_highest(scored.scores) for scored in tried]
-    values = np.array([scored.scores[place] for scored, place in zip(tried, places, strict=True)])
-    values -= settings.scale_penalty * np.abs(np.log(factors))
-    if model.sizes is not None:
-        values += settings.scale_weight * np.array([scored.row(1, 1) @ model.sizes for scored in tried])
-    i = int(values.argmax())
-    between = (1 + settings.scale_step) ** windows.vertex(values, i)
-    return Found(float(tried[i].scores[places[i]]), tried[i].box(*tried[i].refined(*places[i])).scaled(between))
+    place = highest(scored.scores - settings.distance_penalty * (away[:, None] ** 2 + away**2))
+    return Found(float(scored.scores[place]), scored.box(*scored.refined(*place)))
 
 
 def whole(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
@@ -76,10 +48,11 @@ def whole(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Foun
     best, least = Found(-np.inf, box), -np.inf
     for factor in _FAR_FACTORS:
         scored = scored_whole(image, box.scaled(factor), model)
-        place = _highest(scored.scores)
+        place = highest(scored.scores)
         score = float(scored.scores[place])
-        if score - settings.scale_penalty * abs(np.log(factor)) > least:
-            least = score - settings.scale_penalty * abs(np.log(factor))
+        worth = score - settings.extent_penalty * abs(np.log(factor))
+        if worth > least:
+            least = worth
             best = Found(score, scored.box(*scored.refined(*place)))
     return best
 
@@ -110,6 +83,7 @@ def scored_whole(image: np.ndarray, box: Box, model: Model) -> Scored:
     return Scored(features, windows.respond(features, model.weights, model.bias), origin, step)
 
 
-def _highest(scores: np.ndarray) -> tuple[int, int]:
+def highest(scores: np.ndarray) -> tuple[int, int]:
+    """Row and column of the highest window."""
     row, column = np.unravel_index(scores.argmax(), scores.shape)
     return int(row), int(column)

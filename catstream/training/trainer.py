@@ -44,8 +44,8 @@ class Trainer:
             weights += direction / np.float32(contrast)
         weights /= np.float32(weights @ (mean - background_mean))
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
-        sizes = ridge.fit(sample.size.rows, self.settings.scale_ridge) if sample.size is not None else None
-        return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), motion, sizes)
+        extent = ridge.fit(sample.extent.rows, self.settings.extent_ridge) if sample.extent is not None else None
+        return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), motion, extent)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings

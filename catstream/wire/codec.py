@@ -44,12 +44,13 @@ _ARRAYS: dict[type, dict[str, tuple[np.dtype, tuple[int | str, ...]]]] = {
         "rows": (_F32, ("k", "d")),
         "labels": (_F32, ("k",)),
         "weights": (_F32, ("k",)),
-        "sizes": (_F32, ("s", "d")),
+        "extents": (_F32, ("s", "d")),
+        "fits": (_F32, ("s",)),
     },
     Summary: {"rows": (_F32, ("r", "d")), "mean": (_F32, ("d",))},
     Sample: {"centres": (_F64, ("m", 2))},
     Motion: {"process": (_F64, (4, 4)), "observation": (_F64, (2, 2))},
-    Model: {"weights": (_F32, ("d",)), "sizes": (_F32, ("d",))},
+    Model: {"weights": (_F32, ("d",)), "extent": (_F32, ("d",))},
 }
 
 #: Arrays in which NaN has a meaning.
@@ -169,12 +170,12 @@ def _check(message: Any) -> None:
         else:
             _check_numbers(value, where)
     if isinstance(message, Features):
-        labels, weights = message.labels, message.weights
-        if len(labels) and not (labels.min() >= 0 and labels.max() <= 1 and weights.min() > 0):
-            raise ProtocolError("features: expected labels from 0 to 1 and weights above 0")
+        shares = np.concatenate([message.labels, message.fits])
+        if not ((shares >= 0).all() and (shares <= 1).all() and (message.weights > 0).all()):
+            raise ProtocolError("features: expected labels and fits from 0 to 1 and weights above 0")
     if isinstance(message, Sample):
         d = len(message.object.mean)
-        trees = (message.background, message.loss, message.size)
+        trees = (message.background, message.loss, message.extent)
         widths = [len(tree.mean) if tree is not None else d + 2 for tree in trees]
         if widths != [d, d + 2, d + 2]:
             raise ProtocolError(f"sample: expected trees of d, d, d + 2 and d + 2 columns, got {[d, *widths]}")

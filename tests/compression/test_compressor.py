@@ -33,13 +33,13 @@ def messages(rng) -> Iterator[Features]:
             labels = np.array([1, 1, 0, 0, 0, 0.5], np.float32)
             weights = np.array([4, 4, 1, 1, 1, 1], np.float32)
             box = Box(frame, 10, 20, 30) if frame % 5 else None
-            yield Features(frame + 1, frame, frame / 25, box, rows, labels, weights, rows[:3])
+            yield Features(frame + 1, frame, frame / 25, box, rows, labels, weights, rows[:3], labels[:3])
 
     return stream()
 
 
 def without_rows(message):
-    none = {name: getattr(message, name)[:0] for name in ("rows", "labels", "weights", "sizes")}
+    none = {name: getattr(message, name)[:0] for name in ("rows", "labels", "weights", "extents", "fits")}
     return dataclasses.replace(message, **none)
 
 
@@ -51,7 +51,7 @@ def take(compressor: Compressor, messages: Iterator[Features], count: int) -> li
 def assert_same(sample: Sample, other: Sample) -> None:
     assert (sample.version, sample.frame) == (other.version, other.frame)
     assert_array_equal(sample.centres, other.centres)
-    for name in ("object", "background", "loss"):
+    for name in ("object", "background", "loss", "extent"):
         summary, expected = getattr(sample, name), getattr(other, name)
         assert_array_equal(summary.rows, expected.rows)
         assert_array_equal(summary.mean, expected.mean)

@@ -114,7 +114,7 @@ def test_another_detector_goes_on_where_one_stopped(scene):
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
     track, features = detector.step(scene((64, 52)))
-    other.resume(features.seq, track.box, model)
+    other.resume(features.seq, START, track.box, model)
     track, _ = other.step(scene((68, 54)))
     assert (track.seq, track.state) == (3, "present")
     assert track.box.overlap(Box(68, 54, 48, 40)) > 0.8
@@ -124,7 +124,7 @@ def test_a_frame_teaches_the_same_whatever_came_before(scene):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
-    other.resume(1, START, model)
+    other.resume(1, START, START, model)
     one, two = (stage.step(scene((60, 50)))[1] for stage in (detector, other))
     np.testing.assert_allclose(one.rows, two.rows, atol=1e-5)
 

@@ -27,7 +27,7 @@ def summary(columns: int) -> Summary:
 
 EXAMPLES = {
     "end": End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),
-    "features": Features(3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5)),
+    "features": Features(3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5), array(1)),
     "health": Health("trainer", 1.7e9, {"version": 4.0}),
     "model": Model(4, 20, array(5), -0.25, Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8")), array(5)),
     "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2),
@@ -64,7 +64,7 @@ def test_a_message_arrives_as_it_was_sent(message):
     "message",
     [
         Track(1, 0, 0.0, "absent", None, -0.5, 0),
-        Features(1, 0, 0.0, None, np.empty((0, 5), "<f4"), array(0), array(0), np.empty((0, 5), "<f4")),
+        Features(1, 0, 0.0, None, np.empty((0, 5), "<f4"), array(0), array(0), np.empty((0, 5), "<f4"), array(0)),
         Model(1, 0, array(5), 0.0, None),
         Position(),
     ],
@@ -111,6 +111,7 @@ REFUSED = {
     "infinity in an array": packed("model", weights=plain("<f4", [1], struct.pack("<f", np.inf))),
     "NaN as a number": packed("track", score=np.nan),
     "infinity as a counter": packed("health", counters={"rate": np.inf}),
+    "a fit below 0": packed("features", fits=plain("<f4", [1], struct.pack("<f", -0.5))),
     "a label above 1": packed("features", labels=plain("<f4", [3], struct.pack("<3f", 0, 1, 1.5))),
     "a weight of 0": packed("features", weights=plain("<f4", [3], bytes(12))),
     "a tree of another width": packed("sample", loss=msgpack.unpackb(packed("sample"))[2]["object"]),

@@ -1,0 +1,119 @@
+"""Extent: how large the object is, and how wide for its height, at a place that a search found.
+
+The appearance model alone likes windows that are too small: they hold less background. A second
+one learns how well a window fits from the object cut as it is, and cut badly.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from catstream.box import Box
+from catstream.detection import search, windows
+from catstream.detection.hog import WINDOW
+from catstream.detection.search import Found
+from catstream.messages import Model
+from catstream.settings import Settings
+
+__all__ = ["cuts", "fitted", "followed"]
+
+_FINE_CELLS = WINDOW + 2  # cells searched at each size: the place found at another size may be a cell off
+_GROWTH = 1.18  # factor of size that no object grows by in a frame
+
+
+def fitted(image: np.ndarray, box: Box, first: Box, model: Model, settings: Settings) -> Found:
+    """The best window within a cell of a box, at the size and the aspect that both models like best together.
+
+    Parameters
+    ----------
+    first : the window of the first frame, whose extent is likelier than others
+    """
+    sizes = _sizes(settings)
+    tried = [search.scored_around(image, box.scaled(_size(k, settings)), _FINE_CELLS, model) for k in sizes]
+    places = [search.highest(scored.scores) for scored in tried]
+    scores = np.array([scored.scores[place] for scored, place in zip(tried, places, strict=True)])
+    now = math.log(box.area / first.area) / 2
+    values = scores - _cost(np.array(sizes) * math.log(1 + settings.scale_step), now, settings)
+    if model.extent is not None:
+        values += settings.extent_weight * np.array([scored.row(1, 1) @ model.extent for scored in tried])
+    i = int(values.argmax())
+    between = _size(windows.vertex(values, i), settings)
+    found = Found(float(scores[i]), tried[i].box(*tried[i].refined(*places[i])).scaled(between))
+    return found if model.extent is None else _widened(image, found, first, model, settings)
+
+
+def _widened(image: np.ndarray, found: Found, first: Box, model: Model, settings: Settings) -> Found:
+    """The same place, size and score, at the best aspect."""
+    aspects = _aspects(settings)
+    boxes = [found.box.scaled(*_stretch(k, settings)) for k in aspects]
+    tried = [search.scored_around(image, box, WINDOW, model) for box in boxes]
+    values = np.array(
+        [scored.scores[0, 0] + settings.extent_weight * (scored.row(0, 0) @ model.extent) for scored in tried]
+    )
+    now = math.log(found.box.w / found.box.h * first.h / first.w)
+    values -= _cost(np.array(aspects) * math.log(1 + settings.aspect_step), now, settings)
+    i = int(values.argmax())
+    return Found(found.score, found.box.scaled(*_stretch(aspects[i] + windows.vertex(values, i), settings)))
+
+
+def followed(before: Box, found: Found, settings: Settings) -> Box:
+    """The box found, its size and aspect following slowly, and not at all where the score is low.
+
+    A far larger change is no growth of the object, but another place: it is taken over whole.
+    """
+    growth = math.sqrt(found.box.area / before.area)
+    if not 1 / _GROWTH < growth < _GROWTH:
+        return found.box
+    if found.score < settings.extent_score:
+        return before.centred(*found.box.centre)
+    size = growth**settings.scale_rate
+    stretch = math.sqrt(found.box.w / found.box.h * before.h / before.w) ** settings.aspect_rate
+    return before.scaled(size * stretch, size / stretch).centred(*found.box.centre)
+
+
+def cuts(image: np.ndarray, box: Box, own: np.ndarray, settings: Settings) -> tuple[list[np.ndarray], list[float]]:
+    """The object cut as it is and badly, and how well each cut fits; nothing where extent is not learned.
+
+    Parameters
+    ----------
+    own : feature row of the object's own box, float32 (d,)
+
+    Returns
+    -------
+    feature rows, and 1 for a cut as it is, exp(-k^2 / 2 sigma^2) for one k steps off
+    """
+    if not settings.extent_weight:
+        return [], []
+    trials = [(k, box.scaled(_size(k, settings))) for k in _sizes(settings) if k]
+    trials += [(k, box.scaled(*_stretch(k, settings))) for k in _aspects(settings) if k]
+    rows = [windows.around(image, trial, WINDOW)[0].reshape(-1) for _, trial in trials]
+    fits = [math.exp(-((k / settings.extent_sigma) ** 2) / 2) for k, _ in trials]
+    return [own, *rows], [1.0, *fits]
+
+
+def _cost(changes: np.ndarray, now: float, settings: Settings) -> np.ndarray:
+    """What changes of a logarithm cost, where it is off by `now` already."""
+    return settings.extent_penalty * np.abs(changes) + settings.extent_prior * (changes + now) ** 2
+
+
+def _sizes(settings: Settings) -> range:
+    """Steps of size to try, smallest first."""
+    return range(-(settings.scale_count // 2), settings.scale_count // 2 + 1)
+
+
+def _aspects(settings: Settings) -> range:
+    """Steps of aspect to try, narrowest first."""
+    return range(-(settings.aspect_count // 2), settings.aspect_count // 2 + 1)
+
+
+def _size(step: float, settings: Settings) -> float:
+    """Factor of both sides."""
+    return (1 + settings.scale_step) ** step
+
+
+def _stretch(step: float, settings: Settings) -> tuple[float, float]:
+    """Factors of width and height: of another aspect, and the same area."""
+    root = (1 + settings.aspect_step) ** (step / 2)
+    return root, 1 / root
