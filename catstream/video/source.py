@@ -10,15 +10,19 @@ What the text may be:
     a folder            its images in natural order (2.png before 10.png), or those of its `img`, `color` or `rgb`
                         folder, or its one video: so the sequence folders of the benchmarks open as they are
     a pattern           images/%05d.png or images/*.png
+    a camera            0 or /dev/video0
+    a stream            rtsp://HOST/PATH, or http://HOST/PATH for MJPEG
 
-A source is read to its last frame and none is skipped. Where it breaks, its
-good frames come first and the `VideoError` after them.
+Files and images are read to their last frame and none is skipped. Where they
+break, their good frames come first and the `VideoError` after them. Cameras and
+streams are live: see `catstream.video.live`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +33,7 @@ import numpy as np
 
 from catstream.errors import VideoError
 
-__all__ = ["Frame", "Source", "image_files", "natural_order", "open_source"]
+__all__ = ["Frame", "Source", "image_files", "is_live", "natural_order", "open_source", "reason", "upright"]
 
 #: Frames a second of a source that does not say: images have no clock.
 RATE = 25.0
@@ -37,7 +41,8 @@ RATE = 25.0
 _IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 _VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
 _FOLDERS = ("img", "imgs", "color", "rgb")
-_HELP = "give a video file, a folder of images, or a pattern like images/%05d.png"
+_HELP = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
+_LIVE = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+")
 
 #: A video that ends this much before its container says was cut off: rounding and audio explain less.
 _SHORT_SECONDS = 0.5
@@ -47,8 +52,8 @@ _SHORT_SECONDS = 0.5
 class Frame:
     """One image of a source.
 
-    number  0, 1, 2 ... from the start of the source
-    time    seconds since the first frame
+    number  0, 1, 2 ... from the start of the source; of a live one, those that were taken
+    time    seconds since the first frame; of a live one, when this one came
     image   uint8 (h, w, 3), blue green red; grey is expanded
     """
 
@@ -57,7 +62,7 @@ class Frame:
     image: np.ndarray
 
 
-class Source:
+class Source(ABC):
     """Frames in order, once, and what is known of them before they are read.
 
     name    what results are called: the stem of a file, the name of a folder
@@ -66,41 +71,28 @@ class Source:
     size    (width, height) of the first frame in pixels
     live    whether frames pass by whether they are read or not
 
-    Opening decodes the first frame. Close it, or use it in a `with`.
-
-    Raises
-    ------
-    VideoError
-        From the constructor where there is no first frame, from the iterator
-        where the source breaks, after its good frames.
+    Close it, or use it in a `with`.
     """
 
-    def __init__(
-        self, name: str, stream: Iterator[Frame], *, frames: int | None, rate: float, live: bool = False
-    ) -> None:
-        self.name, self.frames, self.rate, self.live = name, frames, rate, live
-        self._stream = stream
-        self._first: Frame | None = next(stream, None)
-        if self._first is None:
-            raise VideoError(f"{name} has no frame to start with: check the source and the first frame asked for")
-        height, width = self._first.image.shape[:2]
-        self.size = (width, height)
+    live = False
+
+    def __init__(self, name: str, frames: int | None, rate: float, size: tuple[int, int]) -> None:
+        self.name, self.frames, self.rate, self.size = name, frames, rate, size
+
+    @property
+    def counters(self) -> dict[str, float]:
+        """What a source that may lose frames counts: name -> number."""
+        return {}
 
     def __iter__(self) -> Iterator[Frame]:
         return self
 
-    def __next__(self) -> Frame:
-        if self._first is not None:
-            frame, self._first = self._first, None
-            return frame
-        return next(self._stream)
+    @abstractmethod
+    def __next__(self) -> Frame: ...
 
+    @abstractmethod
     def close(self) -> None:
-        """Let the file go. Iterating afterwards ends at once."""
-        self._first = None
-        close: Callable[[], None] | None = getattr(self._stream, "close", None)
-        if close is not None:
-            close()
+        """Let the source go. Iterating afterwards ends at once."""
 
     def __enter__(self) -> Self:
         return self
@@ -109,19 +101,70 @@ class Source:
         self.close()
 
 
-def open_source(text: str | Path, start: int = 0) -> Source:
-    """Open a video file, a folder or a pattern of images.
+class _Recording(Source):
+    """A source of which every frame is read. Opening decodes the first one.
+
+    Raises
+    ------
+    VideoError
+        From the constructor where there is no first frame, from the iterator
+        where the source breaks, after its good frames.
+    """
+
+    def __init__(self, name: str, stream: Iterator[Frame], *, frames: int | None, rate: float) -> None:
+        self._stream = stream
+        self._first: Frame | None = next(stream, None)
+        if self._first is None:
+            raise VideoError(f"{name} has no frame to start with: check the source and the first frame asked for")
+        height, width = self._first.image.shape[:2]
+        super().__init__(name, frames, rate, (width, height))
+
+    def __next__(self) -> Frame:
+        if self._first is not None:
+            frame, self._first = self._first, None
+            return frame
+        return next(self._stream)
+
+    def close(self) -> None:
+        self._first = None
+        close: Callable[[], None] | None = getattr(self._stream, "close", None)
+        if close is not None:
+            close()
+
+
+def is_live(text: str | Path) -> bool:
+    """Whether this names a camera or a stream. A number is a camera: a folder of that name is ./0.
+
+    >>> [is_live(text) for text in ("0", "/dev/video2", "rtsp://10.0.0.7/stream", "./0", "walk.mp4")]
+    [True, True, True, False, False]
+    """
+    return _LIVE.fullmatch(str(text)) is not None
+
+
+def open_source(
+    text: str | Path, start: int = 0, *, since: float | None = None, idle: Callable[[], bool] | None = None
+) -> Source:
+    """Open what `text` names, see the module.
 
     Parameters
     ----------
-    text : what and where, see the module
-    start : number of the first frame wanted; those before it are decoded, never guessed at
+    text : what and where
+    start : number of the first frame wanted. Of a file those before it are decoded, never guessed at; a live
+        source counts from there
+    since : moment of `time.monotonic` that the times of a live source count from, its first frame where None
+    idle : called ten times a second while a live source gives no frame; where it returns True, iterating ends.
+        Who gives one waits for the first frame too, however long it takes: opening then never fails, and the
+        size is known with the first frame
 
     Raises
     ------
     VideoError
         Where there is nothing, or nothing readable; says what was expected.
     """
+    if is_live(text):
+        from catstream.video.live import LiveSource  # here, as it is built on this module
+
+        return LiveSource(str(text), start, since=since, idle=idle)
     path = Path(text)
     try:
         if path.is_dir():
@@ -176,7 +219,7 @@ def _folder(path: Path, start: int) -> Source:
 
 
 def _images(name: str, files: list[Path], start: int) -> Source:
-    return Source(name, _read_images(files, start), frames=len(files), rate=RATE)
+    return _Recording(name, _read_images(files, start), frames=len(files), rate=RATE)
 
 
 def _read_images(files: list[Path], start: int) -> Iterator[Frame]:
@@ -208,7 +251,7 @@ def _video(path: Path, start: int) -> Source:
         raise VideoError(f"there is no video in {str(path)!r}: {_HELP}")
     stream = streams[0]
     rate = float(stream.average_rate or stream.guessed_rate or RATE)
-    return Source(path.stem, _read_video(path, container, rate, start), frames=stream.frames or None, rate=rate)
+    return _Recording(path.stem, _read_video(path, container, rate, start), frames=stream.frames or None, rate=rate)
 
 
 def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator[Frame]:
@@ -220,8 +263,7 @@ def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator
             zero = frame.pts if zero is None else zero
             time = number / rate if frame.pts is None else float((frame.pts - zero) * stream.time_base)
             if number >= start:
-                # Phones store upright videos lying down, and the turn beside them.
-                image = np.ascontiguousarray(np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90))
+                image = upright(frame)
                 if shape is not None and image.shape != shape:
                     raise VideoError(
                         f"{str(path)!r} changes from {shape[1]}x{shape[0]} to {image.shape[1]}x{image.shape[0]} "
@@ -230,6 +272,11 @@ def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator
                 shape = image.shape
                 yield Frame(number, time, image)
             number += 1
+
+
+def upright(frame: Any) -> np.ndarray:
+    """The image of a frame that PyAV decoded: phones store upright videos lying down, and the turn beside them."""
+    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90))
 
 
 def _good_frames(path: Path, container: Any, stream: Any, rate: float) -> Iterator[Any]:
@@ -243,7 +290,7 @@ def _good_frames(path: Path, container: Any, stream: Any, rate: float) -> Iterat
             try:
                 frames = stream.codec_context.decode(packet)
             except av.FFmpegError as error:
-                problem = _reason(error)
+                problem = reason(error)
         if problem:  # the good frames that wait in the decoder for their turn
             with contextlib.suppress(av.FFmpegError):
                 frames = stream.codec_context.decode(None)
@@ -269,7 +316,7 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
         try:
             packet = next(packets)
         except av.FFmpegError as error:
-            yield None, _reason(error)
+            yield None, reason(error)
             return
         if packet.dts is None and not packet.size:
             short = stated - end > max(_SHORT_SECONDS, 2 / rate)
@@ -280,7 +327,8 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
         yield packet, "data is missing" if packet.is_corrupt else ""
 
 
-def _reason(error: Any) -> str:
+def reason(error: Any) -> str:
+    """What FFmpeg says went wrong, in its words."""
     return (error.strerror or str(error)).lower()
 
 
