@@ -129,7 +129,7 @@ class Sender(_Socket):
         self._window = window
         self._waiting: deque[tuple[int, bytes]] = deque()  # not stored yet, oldest first
         self._on_the_way = 0  # how many of them were handed to the socket
-        self._known = 0  # what the receiver had stored when this sender took over
+        self._known = 0  # what the receiver can have stored from the sender before this one
         self._heard = monotonic()
         self._socket.immediate = True  # nothing is handed over before somebody is there
         self._connect()
@@ -145,7 +145,7 @@ class Sender(_Socket):
     def resume(self, seq: int, known: int) -> None:
         """Go on after message `seq` of a sender before this one, of which the receiver has stored `known`."""
         self.sent = self.stored = self.taken = seq
-        self._known = known
+        self._known = known + self._window  # what the sender before this one had on its way may be stored by now
 
     def made(self, seq: int) -> int:
         """Newest sample that the messages up to `seq` led to; not to be asked again of those before.

@@ -202,6 +202,31 @@ def test_a_restarted_sender_repeats_nothing_that_was_taken(endpoint, until):
     assert taken == list(range(1, 10))
 
 
+def test_a_restarted_sender_may_hear_that_more_was_stored_since_it_asked(endpoint, until):
+    taken, found = [], []
+    with Receiver("results", endpoint, Position(), 10) as receiver:
+        with Sender("results", endpoint, 10) as sender:
+            for seq in range(1, 6):
+                sender.send(track(seq))
+            until(lambda: len(taken) == 5, lambda: (sender.listen(0), take(receiver, taken, store=False)))
+        with Sender("results", endpoint, 10) as sender:
+            until(
+                lambda: found and found[-1] is not None,
+                lambda: (found.append(sender.position()), take(receiver, taken, store=False)),
+            )
+            sender.resume(0, found[-1].seq)
+            receiver.acknowledge(Position(5))
+
+            def on():
+                sender.listen(0)
+                if sender.sent < 9:
+                    sender.send(track(sender.sent + 1))
+                take(receiver, taken, store=True)
+
+            until(lambda: sender.stored == 9, on)
+    assert taken == list(range(1, 10))
+
+
 def test_a_receiver_of_another_stream_is_noticed(endpoint, until):
     with Receiver("results", endpoint, Position(99), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
         sender.send(track(1))
