@@ -7,6 +7,7 @@ with catstream.Pipeline("walk.mp4", (120, 80, 64, 48)) as pipeline:
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -14,11 +15,11 @@ from dataclasses import replace
 from typing import Self
 
 from catstream.box import Box
-from catstream.errors import ServiceError, VideoError
+from catstream.errors import ServiceError, SettingsError, VideoError
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.video.source import open_source
+from catstream.video.source import is_live, open_source
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.sockets import Receiver, Subscriber
 
@@ -27,27 +28,32 @@ __all__ = ["Pipeline"]
 _CHECK_SECONDS = 0.1
 _FAREWELL_SECONDS = 12.0
 
+_log = logging.getLogger(__name__)
+
 
 class Pipeline:
     """Runs the processes while it is open; iterate it for one `Track` a frame, none missing.
 
     A process that dies is restarted, and the run goes on. Who takes tracks slowly slows a
-    file down: the detector waits.
+    file down: the detector waits. A live source never waits: the frames that pass meanwhile are
+    skipped and counted. It has no end, and is opened again whenever it is lost.
 
     Parameters
     ----------
-    source : a video file, a folder of images, a pattern: see `catstream.video.source`
+    source : a video file, a folder of images, a pattern, a camera, a stream: see `catstream.video.source`
     box : x, y, w, h of the object in the first frame, in pixels
     settings : all defaults where None
 
     Attributes
     ----------
-    name, frames, rate, size : of the source, as `catstream.video.source.Source` has them
+    name, frames, rate, size, live : of the source, as `catstream.video.source.Source` has them
 
     Raises
     ------
     BoxError, VideoError
         From the constructor, for a box that is not in the frame or a source that cannot be read.
+    SettingsError
+        From the constructor, for settings that the source cannot be followed with: a live one in lockstep.
     ServiceError
         On entering, where the endpoint is in use. While iterating, where a process cannot be kept alive.
     VideoError
@@ -59,8 +65,12 @@ class Pipeline:
         self._source, self._box = str(source), Box(*map(float, box))
         self._end: End | None = None
         self._health: dict[str, Health] = {}
+        if self.settings.lockstep and is_live(self._source):
+            raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
+        # The detector opens the source once more: a camera shows its picture to one at a time.
         with open_source(self._source) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
+            self.live = first.live
         self._box.inside(*self.size)
         self.settings = self.settings.for_length(self.frames)
 
@@ -118,9 +128,17 @@ class Pipeline:
         """How often a process died and was restarted."""
         return self._supervisor.restarts
 
+    @property
+    def lost_seconds(self) -> float:
+        """For how long a live source has been lost, 0 while it is not."""
+        return self.health.get("detector", {}).get("lost_seconds", 0.0)
+
     def _watch(self) -> None:
         self._listen()
         self._supervisor.check()
+        if self.live:  # when it is lost, why, and when it is back
+            for line in self._supervisor.news("detector"):
+                _log.warning("%s", line)
         if self._supervisor.finished:
             raise ServiceError("the processes ended before the video did: this should not happen, please report it")
 

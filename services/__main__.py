@@ -51,16 +51,19 @@ _box = click.option("--box", required=True, metavar="X,Y,W,H", help="The object 
 @_box
 @click.option("--resume", is_flag=True, help="Go on where a detector before this one stopped.")
 @click.option("--owned", is_flag=True, help="Somebody takes every track from the channel `results`.")
+@click.option("--since", type=float, hidden=True, help="Moment that the times of a live source count from.")
 @with_settings
 @click.pass_obj
-def detector(parent: int | None, settings: Settings, source: str, box: str, resume: bool, owned: bool) -> None:
+def detector(
+    parent: int | None, settings: Settings, source: str, box: str, resume: bool, owned: bool, since: float | None
+) -> None:
     """Frames in; tracks and features out, with the newest model there is."""
     import cv2
 
     from catstream.services import detector
 
     cv2.setNumThreads(1)
-    action = partial(detector.main, source=source, box=Box.parse(box), resume=resume, owned=owned)
+    action = partial(detector.main, source=source, box=Box.parse(box), resume=resume, owned=owned, since=since)
     sys.exit(run("detector", action, settings, parent))
 
 

@@ -10,7 +10,7 @@ from catstream.detection.detector import Detector
 from catstream.errors import VideoError
 from catstream.messages import End, Features, Model, Position, Track
 from catstream.services.loop import Process
-from catstream.video.source import open_source
+from catstream.video.source import Source, open_source
 from catstream.wire.sockets import Publisher, Sender, Subscriber
 
 __all__ = ["main"]
@@ -22,7 +22,7 @@ _OWNER_SECONDS = 0.5  # the owner may listen no more
 _log = logging.getLogger(__name__)
 
 
-def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool) -> None:
+def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool, since: float | None = None) -> None:
     """Follow the object to the last frame.
 
     Parameters
@@ -31,6 +31,7 @@ def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool) 
     box : of the object in the first frame
     resume : go on where a detector before this one stopped
     owned : somebody takes every track from the channel `results`
+    since : as `open_source` takes it
     """
     with ExitStack() as stack:
         line = _Line(process, stack, owned)
@@ -39,7 +40,8 @@ def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool) 
         if position.seq and position.box is not None:
             detector.resume(position.seq, box, position.box, line.model())
         # From the last frame that was stored, which is passed over: there may be none after it.
-        frames = stack.enter_context(open_source(source, start=max(detector.seq - 1, 0)))
+        frames = stack.enter_context(open_source(source, max(detector.seq - 1, 0), since=since, idle=line.idle))
+        line.source = frames
         reason, failed = "the source came to its end", False
         try:
             for frame in frames:
@@ -55,15 +57,19 @@ def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool) 
                 if not frames.live:
                     line.wait(detector)
                 if process.ended:
-                    reason = "it was stopped"
                     break
+            if process.ended:
+                reason = "it was stopped"
         except VideoError as error:
             reason, failed = str(error), True
         line.end(detector.seq, reason, failed)
 
 
 class _Line:
-    """The detector's channels, as one."""
+    """The detector's channels, as one.
+
+    source : where the frames come from, once it is open; what it counts is told with the detector's health
+    """
 
     def __init__(self, process: Process, stack: ExitStack, owned: bool) -> None:
         window, endpoint = process.settings.window, process.endpoint
@@ -75,6 +81,7 @@ class _Line:
         self._senders = [self._features] + ([self._results] if self._results else [])
         self._lag = 0 if process.settings.lockstep else process.settings.lag_frames
         self._version = 0
+        self.source: Source | None = None
 
     def position(self) -> Position:
         """Where to go on: after the last frame that all receivers have; from the start where there is no model yet."""
@@ -119,6 +126,13 @@ class _Line:
                 break
             self._process.beat(self._counters)
 
+    def idle(self) -> bool:
+        """Stay in touch while the source gives no frame; returns whether to wait no more."""
+        for sender in self._senders:
+            sender.listen(0)
+        self._process.beat(self._counters)
+        return self._process.ended
+
     def end(self, seq: int, reason: str, failed: bool) -> None:
         """Say that nothing follows, and wait until all is stored; where the run was stopped, not for long."""
         totals: dict[str, float] = {}
@@ -155,4 +169,5 @@ class _Line:
             "taken": self._features.taken,
             "stored": self._features.stored,
             "model_version": self._version,
+            **(self.source.counters if self.source else {}),
         }

@@ -32,6 +32,7 @@ _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 5.0
 _FAREWELL_SECONDS = 12.0
 _APART_SECONDS = 3.0  # between the ends of compressor and detector, where both have ended well
 _LAST_WORDS = 2000  # bytes of a child's log that may hold why it died
+_NEWS = 65536  # bytes of it that are looked through at once
 
 _log = logging.getLogger(__name__)
 
@@ -46,10 +47,19 @@ class _Child:
     restarts: deque[float] = field(default_factory=deque)
     due: float = 0.0
     seen: float = 0.0  # when it last ran
+    told: int = 0  # bytes of the log that were news
 
     @property
     def finished(self) -> bool:
         return self.process is not None and self.process.poll() == 0
+
+    def news(self) -> list[str]:
+        """The lines that it logged since the last time, without what Python says by itself."""
+        # Its place in the file is the child's, which writes there: it stays.
+        whole, end, _ = os.pread(self.log.fileno(), _NEWS, self.told).rpartition(b"\n")
+        self.told += len(whole) + len(end)
+        lines, mark = whole.decode(errors="replace").splitlines(), f"{self.name}: "
+        return [line.removeprefix(mark) for line in lines if line.startswith(mark)]
 
     def last_words(self) -> str:
         """The last line that it logged."""
@@ -73,6 +83,7 @@ class Supervisor:
 
     def __init__(self, source: str, box: Box, settings: Settings, folder: Path, *, owned: bool) -> None:
         self._source, self._box, self._settings, self._folder, self._owned = source, box, settings, folder, owned
+        self._since = time.monotonic()  # a restarted detector goes on with the times of a live source
         self._children = {name: _Child(name, (folder / f"{name}.log").open("w+b")) for name in NAMES}
         for child in self._children.values():
             self._start(child)
@@ -92,6 +103,10 @@ class Supervisor:
     def finished(self) -> bool:
         """Whether all is done: the detector has ended well, which it does once all that it sent is stored."""
         return self._children["detector"].finished
+
+    def news(self, name: str) -> list[str]:
+        """What a child logged since the last time that this was asked."""
+        return self._children[name].news()
 
     def check(self) -> None:
         """Restart who died, and log it.
@@ -155,7 +170,7 @@ class Supervisor:
         for pair in self._settings.changed():
             command += ["--set", pair]
         if child.name == "detector":
-            command += [self._source, "--box", ",".join(map(repr, self._box))]
+            command += [self._source, "--box", ",".join(map(repr, self._box)), "--since", repr(self._since)]
             command += ["--owned"] * self._owned + ["--resume"] * bool(child.restarts)
         if child.name == "compressor":
             command += ["--state", str(self._folder)]

@@ -1,5 +1,14 @@
 """What all tests share."""
 
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
 import numpy as np
 import pytest
 
@@ -8,3 +17,63 @@ import pytest
 def rng():
     """Random numbers, the same in every run."""
     return np.random.default_rng(20260101)
+
+
+class Camera:
+    """A camera on the network: MJPEG over HTTP, 40 images a second.
+
+    sent   how many images were sent
+    sends  cleared to freeze it
+    """
+
+    def __init__(self, image: Callable[[int], np.ndarray], port: int = 0) -> None:
+        self.sent, self.sends, self._gone = 0, threading.Event(), False
+        self.sends.set()
+        camera = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                with suppress(OSError):
+                    camera._stream(self.wfile)
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self._image = image
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        self._server.daemon_threads = True
+        self.port = self._server.server_port
+        self.url = f"http://127.0.0.1:{self.port}/cam/one.mjpg"
+        threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
+
+    def _stream(self, file) -> None:
+        while not self._gone:
+            if self.sends.wait(0.02):
+                jpeg = cv2.imencode(".jpg", self._image(self.sent))[1].tobytes()
+                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                file.write(head.encode() + jpeg + b"\r\n")
+                self.sent += 1
+                time.sleep(0.025)
+
+    def leave(self) -> None:
+        """Close all connections, and take no more."""
+        self._gone = True
+        self._server.shutdown()
+        self._server.server_close()
+
+
+@pytest.fixture
+def camera():
+    """Starts cameras that show `image(0)`, `image(1)` ...; on the port of an earlier one if wanted."""
+    cameras: list[Camera] = []
+
+    def start(image: Callable[[int], np.ndarray], port: int = 0) -> Camera:
+        cameras.append(Camera(image, port))
+        return cameras[-1]
+
+    yield start
+    for one in cameras:
+        one.leave()

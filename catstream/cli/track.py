@@ -11,7 +11,8 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.text import Text
 
 from catstream.box import Box
 from catstream.messages import Track
@@ -19,6 +20,7 @@ from catstream.pipeline import Pipeline
 from catstream.services.options import with_settings
 from catstream.settings import Settings
 from catstream.video.results import ResultsWriter
+from catstream.video.source import is_live
 
 __all__ = ["track"]
 
@@ -42,9 +44,14 @@ def track(
 ) -> None:
     """Follow an object through a video, from its box in the first frame.
 
-    SOURCE is a video file, a folder of images, or a pattern like
-    images/%05d.png. A detector, a compressor and a trainer run as processes
-    of their own; Ctrl-C ends them, and the results so far are kept.
+    SOURCE is a video file, a folder of images, a pattern like
+    images/%05d.png, a camera (0 or /dev/video0), or a stream (rtsp://... or
+    http://... for MJPEG). Cameras and streams are live: each time the newest
+    frame is followed, the others are skipped and counted, and one that is lost
+    is opened again until it is back.
+
+    A detector, a compressor and a trainer run as processes of their own;
+    Ctrl-C ends them, and the results so far are kept.
 
     \b
     Writes
@@ -59,9 +66,12 @@ def track(
       catstream track walk.mp4 --box 120,80,64,48 --output out --video
       catstream track frames/ --box 120,80,64,48 --output out --set coreset_size=128
       catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
+      catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
     """
     if video and output is None:
         raise click.UsageError("--video needs --output, the folder to write it to")
+    if video and is_live(source):
+        raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
     if lockstep:
         settings = Settings.of({**settings.values(), "lockstep": True})
     pipeline = Pipeline(source, Box.parse(box), settings)
@@ -113,6 +123,18 @@ class _Sinks:
             self._video.write(next(self._frames).image, found)
 
 
+class _StateColumn(ProgressColumn):
+    """The state of the track, or for how long a live source has been lost: no track comes then to say so."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        super().__init__()
+        self._pipeline = pipeline
+
+    def render(self, task: Task) -> Text:
+        lost = self._pipeline.lost_seconds
+        return Text(f"{f'lost {lost:.0f} s' if lost else task.fields['state']:13}")
+
+
 class _Run:
     """What a person wants to see of a run, while it goes on and afterwards."""
 
@@ -126,7 +148,7 @@ class _Run:
 
     def progress(self, console: Console) -> Progress:
         columns = (
-            TextColumn("{task.fields[state]:13}"),
+            _StateColumn(self._pipeline),
             BarColumn(bar_width=24),
             MofNCompleteColumn(),
             TextColumn("{task.fields[line]}"),
@@ -150,6 +172,8 @@ class _Run:
             f"{self._rate(now):.0f} frames/s   score {found.score:+.2f}   "
             f"model {found.model_version}   {leaves:.0f} leaves in the trees"
         )
+        if self._pipeline.live:
+            line += f"   {self._detector('skipped'):.0f} skipped"
         progress.update(self._task, completed=self.frames, state=found.state, line=line)
 
     def summary(self, output: Path | None) -> str:
@@ -157,6 +181,11 @@ class _Run:
             f"{self.frames} frames, present in {self.present}, {self._rate(time.perf_counter()):.0f} frames/s, "
             f"first track after {self._first:.2f} s, model version {self.version}"
         ]
+        if self._pipeline.live:
+            lines.append(
+                f"live: {self._detector('skipped'):.0f} frames skipped, "
+                f"lost and opened again {self._detector('reopened'):.0f} times"
+            )
         if totals := self._pipeline.totals:
             lines.append(f"features: {totals['sent']} messages sent, {totals['stored']} stored in the coreset trees")
         if self._pipeline.restarts:
@@ -164,6 +193,9 @@ class _Run:
         if output is not None:
             lines.append(f"results: {output}")
         return "\n".join(lines)
+
+    def _detector(self, counter: str) -> float:
+        return self._pipeline.health.get("detector", {}).get(counter, 0)
 
     def _rate(self, now: float) -> float:
         return (self.frames - 1) / max(now - self._started - self._first, 1e-9)

@@ -162,6 +162,8 @@ class LiveSource(Source):
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
             due = monotonic() + _OPEN_SECONDS
             for packet in container.demux(stream):
+                if self._closed or monotonic() > due:  # of a packet that a time-out ended, half is missing
+                    return
                 decoded: list[Any] = []
                 with contextlib.suppress(av.FFmpegError):  # of a damaged packet; the next may be whole
                     decoded = stream.codec_context.decode(packet)
@@ -169,8 +171,6 @@ class LiveSource(Source):
                     if not frame.is_corrupt:
                         due = monotonic() + _SILENT_SECONDS
                         yield frame
-                if self._closed or monotonic() > due:
-                    return
 
     def _keep(self, moment: float, decoded: Any) -> None:
         with self._news:
@@ -178,7 +178,7 @@ class LiveSource(Source):
                 return
             if self._problem:
                 self.reopened += 1
-                _log.warning("%s is back after %.1f s", self.name, moment - self._heard)
+                _log.warning("the source %s is back after %.1f s", self.name, moment - self._heard)
             self.skipped += self._newest is not None
             self._newest, self._heard, self._problem = (moment, decoded), moment, ""
             self._news.notify()
@@ -186,7 +186,7 @@ class LiveSource(Source):
     def _lose(self, problem: str) -> None:
         """Say why, where that is news: a source may be away for days."""
         if problem != self._problem and not self._closed:
-            _log.warning("%s is lost (%s), and is opened again until it is back", self.name, problem)
+            _log.warning("the source %s is lost (%s), and is opened again until it is back", self.name, problem)
         self._problem = problem
 
 

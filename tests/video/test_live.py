@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import suppress
 from functools import partial
-from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import av
-import cv2
 import numpy as np
 import pytest
 
@@ -18,7 +16,7 @@ from catstream.video import live
 from catstream.video.source import open_source
 
 
-def numbered(number: int, width: int) -> np.ndarray:
+def numbered(number: int, width: int = 128) -> np.ndarray:
     """Twelve bits of the number as the greys of both halves, which survive JPEG."""
     image = np.full((96, width, 3), 4 * (number % 64), np.uint8)
     image[:, width // 2 :] = 4 * (number // 64)
@@ -32,63 +30,6 @@ def number_of(image: np.ndarray) -> int:
     return low + 64 * high
 
 
-class Camera:
-    """A camera on the network: numbered frames as MJPEG over HTTP, 50 a second, to one viewer at a time."""
-
-    def __init__(self, port: int = 0) -> None:
-        self.sent, self.width = 0, 128
-        self.sends = threading.Event()
-        self.sends.set()
-        self._gone = False
-        camera = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                self.send_response(200)
-                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-                self.end_headers()
-                with suppress(OSError):
-                    camera._stream(self.wfile)
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
-        self._server.daemon_threads = True
-        self.port = self._server.server_port
-        self.url = f"http://127.0.0.1:{self.port}/cam/one.mjpg"
-        threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
-
-    def _stream(self, file) -> None:
-        while not self._gone:
-            if self.sends.wait(0.02):
-                jpeg = cv2.imencode(".jpg", numbered(self.sent, self.width))[1].tobytes()
-                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                file.write(head.encode() + jpeg + b"\r\n")
-                self.sent += 1
-                time.sleep(0.02)
-
-    def leave(self) -> None:
-        """Close all connections, and take no more."""
-        self._gone = True
-        self._server.shutdown()
-        self._server.server_close()
-
-
-@pytest.fixture
-def camera():
-    """Starts cameras, on the port of an earlier one if wanted."""
-    cameras = []
-
-    def start(port: int = 0) -> Camera:
-        cameras.append(Camera(port))
-        return cameras[-1]
-
-    yield start
-    for one in cameras:
-        one.leave()
-
-
 def until(condition):
     deadline = time.monotonic() + 30
     while not condition():
@@ -97,12 +38,12 @@ def until(condition):
 
 
 def test_a_stream_says_what_it_is(camera):
-    with open_source(camera().url) as source:
+    with open_source(camera(numbered).url) as source:
         assert (source.name, source.frames, source.size, source.live) == ("one", None, (128, 96), True)
 
 
 def test_every_frame_is_taken_or_counted_as_skipped_and_the_last_taken_is_the_newest(camera):
-    cam, taken = camera(), []
+    cam, taken = camera(numbered), []
     with open_source(cam.url) as source:
         for frame in source:
             taken.append(number_of(frame.image))
@@ -119,7 +60,7 @@ def test_every_frame_is_taken_or_counted_as_skipped_and_the_last_taken_is_the_ne
 
 
 def test_frames_count_up_and_their_times_pass_as_the_clock_does(camera):
-    with open_source(camera().url, start=7) as source:
+    with open_source(camera(numbered).url, start=7) as source:
         began = time.monotonic()
         frames = [next(source) for _ in range(10)]
         passed = time.monotonic() - began
@@ -131,17 +72,17 @@ def test_frames_count_up_and_their_times_pass_as_the_clock_does(camera):
 
 
 def test_times_count_from_the_moment_that_is_given(camera):
-    with open_source(camera().url, since=time.monotonic() - 1000) as source:
+    with open_source(camera(numbered).url, since=time.monotonic() - 1000) as source:
         assert 1000 <= next(source).time < 1030
 
 
 def test_a_camera_that_leaves_and_returns_is_opened_again(camera):
-    cam = camera()
+    cam = camera(numbered)
     with open_source(cam.url) as source:
         next(source)
         cam.leave()
         until(lambda: source.counters["lost_seconds"] > 0)
-        camera(cam.port)
+        camera(numbered, cam.port)
         before = source.reopened
         frames = [next(source) for _ in range(3)]
         until(lambda: source.reopened == before + 1)
@@ -151,7 +92,7 @@ def test_a_camera_that_leaves_and_returns_is_opened_again(camera):
 
 def test_a_camera_that_is_silent_is_opened_again(camera, monkeypatch, caplog):
     monkeypatch.setattr(live, "_SILENT_SECONDS", 0.5)
-    cam = camera()
+    cam = camera(numbered)
     with open_source(cam.url) as source:
         next(source)
         cam.sends.clear()
@@ -165,7 +106,7 @@ def test_a_camera_that_is_silent_is_opened_again(camera, monkeypatch, caplog):
 
 def test_why_it_is_lost_is_logged_once(camera, monkeypatch, caplog):
     monkeypatch.setattr(live, "_LONGEST_PAUSE", 0.01)
-    cam, tried = camera(), []
+    cam, tried = camera(numbered), []
 
     def refuse(text):
         tried.append(text)
@@ -180,18 +121,18 @@ def test_why_it_is_lost_is_logged_once(camera, monkeypatch, caplog):
 
 
 def test_a_camera_that_returns_with_other_pixels_is_scaled_to_the_first(camera):
-    cam = camera()
+    cam = camera(numbered)
     with open_source(cam.url) as source:
         next(source)
         cam.leave()
-        camera(cam.port).width = 256
+        camera(lambda number: numbered(number, width=256), cam.port)
         while source.reopened == 0:
             frame = next(source)
         assert frame.image.shape == (96, 128, 3)
 
 
 def test_what_was_never_there_is_refused_and_its_password_not_shown(camera):
-    cam = camera()
+    cam = camera(numbered)
     cam.leave()
     with pytest.raises(VideoError, match=r"cannot open 'http://127.*connection refused.*check") as error:
         open_source(cam.url.replace("//", "//me:secr@t@"))
@@ -204,7 +145,7 @@ def test_a_camera_that_this_machine_has_not_is_refused():
 
 
 def test_who_has_something_to_do_meanwhile_waits_for_the_first_frame_too(camera):
-    cam, turns = camera(), []
+    cam, turns = camera(numbered), []
     cam.leave()
 
     def idle() -> bool:
@@ -213,13 +154,13 @@ def test_who_has_something_to_do_meanwhile_waits_for_the_first_frame_too(camera)
 
     with open_source(cam.url, idle=idle) as source:
         assert list(source) == []
-        camera(cam.port)
+        camera(numbered, cam.port)
         assert next(source).number == 0
         assert source.size == (128, 96)
 
 
 def test_a_closed_source_has_no_frames_and_leaves_no_thread(camera):
-    source = open_source(camera().url)
+    source = open_source(camera(numbered).url)
     source.close()
     assert list(source) == []
     assert not [thread for thread in threading.enumerate() if thread.name == "reader of one"]
@@ -231,7 +172,7 @@ def test_a_recording_behind_a_url_is_refused(tmp_path):
         stream = container.add_stream("mpeg4", rate=25)
         stream.width, stream.height = 128, 96
         for number in range(50):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number, 128), format="bgr24")))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
         container.mux(stream.encode(None))
     folder = partial(SimpleHTTPRequestHandler, directory=tmp_path)
     with ThreadingHTTPServer(("127.0.0.1", 0), folder) as server:

@@ -1,0 +1,167 @@
+"""`catstream track` on streams that never end: followed until Ctrl-C, whatever happens to them."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import subprocess
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import cv2
+import psutil
+import pytest
+
+from catstream.box import Box
+from catstream.subscription import subscribe
+from catstream.video.demo import render
+
+PYTHON = Path("/usr/bin/python3")  # the one that Debian's packages are for
+SERVER = Path(__file__).with_name("rtsp_server.py")
+HOW_TO_GET_IT = (
+    "no real RTSP server: apt-get install --no-install-recommends python3-gi gir1.2-gst-rtsp-server-1.0 "
+    "gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-ugly"
+)
+
+
+@pytest.fixture(scope="module")
+def story():
+    """The demo's first images and boxes, forwards and backwards: a loop without a jump."""
+    frames = list(render(60, (320, 240)))
+    return frames + frames[-2:0:-1]
+
+
+@pytest.fixture
+def rtsp(story, tmp_path):
+    """Starts RTSP servers that show the story: the process and the port."""
+    folder = tmp_path / "story"
+    folder.mkdir()
+    for number, (image, _) in enumerate(story):
+        cv2.imwrite(str(folder / f"{number:05d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    with ExitStack() as stack:
+
+        def start(port=0):
+            if not PYTHON.exists():
+                pytest.skip(HOW_TO_GET_IT)
+            process = subprocess.Popen([PYTHON, SERVER, folder, str(port)], stdout=subprocess.PIPE, text=True)
+            stack.callback(process.communicate)
+            stack.callback(process.kill)
+            if said := process.stdout.readline():
+                return process, int(said)
+            assert process.wait() == 3, "the RTSP server does not start"
+            pytest.skip(HOW_TO_GET_IT)
+
+        yield start
+
+
+class Run:
+    """A run of `catstream track`, seen from outside."""
+
+    def __init__(self, process, output, health):
+        self.process, self.output, self._health = process, output, health
+
+    def until(self, condition):
+        """Wait until the detector's counters are so."""
+        for report, _ in zip(self._health, range(180), strict=False):
+            if report.process == "detector" and condition(report.counters):
+                return report.counters
+        raise AssertionError(f"it did not happen in time: {self.process.poll()}")
+
+    def stopped(self):
+        """Its rows and what it said, after Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+        errors = self.process.communicate(timeout=60)[1]
+        assert self.process.returncode == 130
+        rows = list(csv.DictReader((self.output / "tracks.csv").read_text().splitlines()))
+        assert len((self.output / "one.txt").read_text().splitlines()) == len(rows)
+        return rows, errors
+
+
+@pytest.fixture
+def following(catstream, story, tmp_path):
+    """Follows the object of the story in a stream."""
+
+    @contextmanager
+    def start(url):
+        output, place = tmp_path / "out", tmp_path / "run"
+        with subscribe(str(place), "health", timeout=60) as health:
+            box = ",".join(map(str, story[0][1]))
+            command = ("track", url, "--box", box, "--output", output, "--set", f"endpoint={place}")
+            yield Run(catstream(*command), output, health)
+
+    return start
+
+
+def found(row, story):
+    """Whether the box of a row is where the object is in some image of the story."""
+    box = row["x"] and Box(*(float(row[name]) for name in "xywh"))
+    return bool(box) and max(box.overlap(truth) for _, truth in story) > 0.6
+
+
+def test_a_server_that_freezes_and_dies_is_followed_again_with_what_was_learned(rtsp, following, story):
+    server, port = rtsp()
+    with following(f"rtsp://127.0.0.1:{port}/one") as run:
+        run.until(lambda counters: counters["model_version"] >= 5)
+        server.send_signal(signal.SIGSTOP)
+        run.until(lambda counters: counters["lost_seconds"] > 0)
+        server.send_signal(signal.SIGCONT)
+        run.until(lambda counters: counters["reopened"] == 1)
+        server.kill()
+        server.wait()
+        learned = run.until(lambda counters: counters["lost_seconds"] > 0)["model_version"]
+        rtsp(port)
+        run.until(lambda counters: counters["reopened"] == 2 and counters["model_version"] >= learned + 5)
+        rows, errors = run.stopped()
+    assert "the source one is lost (no picture comes)" in errors
+    assert errors.count("the source one is back after") == 2
+    assert "lost and opened again 2 times" in errors
+    assert [int(row["frame"]) for row in rows] == list(range(len(rows)))
+    versions = [int(row["model_version"]) for row in rows]
+    assert versions == sorted(versions), "what was learned is kept"
+    assert all(found(row, story) for row in rows[-20:])
+
+
+def test_a_stream_over_http_is_followed_by_a_restarted_detector_too(camera, following, story):
+    with following(camera(lambda number: story[number % len(story)][0]).url) as run:
+        run.until(lambda counters: counters["model_version"] >= 3)
+        frames = len((run.output / "tracks.csv").read_text().splitlines())
+        (detector,) = (child for child in psutil.Process(run.process.pid).children() if "detector" in child.cmdline())
+        detector.kill()
+        run.until(lambda counters: counters["sent"] > frames + 40)
+        rows, errors = run.stopped()
+    assert "processes restarted: 1" in errors
+    assert "frames skipped" in errors
+    assert [int(row["frame"]) for row in rows] == list(range(len(rows)))
+    seconds = [float(row["seconds"]) for row in rows]
+    assert seconds == sorted(seconds)
+    assert sum(found(row, story) for row in rows) > 0.8 * len(rows)
+
+
+def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, story, tmp_path):
+    cam = camera(lambda number: story[number % len(story)][0])
+    with following(cam.url) as run, subscribe(str(tmp_path / "run"), "tracks", timeout=60) as tracks:
+        next(tracks)
+        cam.leave()
+        run.until(lambda counters: counters["lost_seconds"] > 0)
+        rows, errors = run.stopped()
+        assert len(list(tracks)) < len(rows)
+        assert (tracks.end.reason, tracks.end.failed) == ("it was stopped", False)
+    assert "the source one is lost" in errors
+    assert "the results so far are kept" in errors
+
+
+LIVE = "http://127.0.0.1:1/one"
+REFUSED = {
+    "in lockstep": (["--lockstep"], "leave lockstep away"),
+    "its frames once more": (["--output", "out", "--video"], "leave it away"),
+    "not there": ([], "connection refused"),
+}
+
+
+@pytest.mark.parametrize(("options", "words"), REFUSED.values(), ids=REFUSED)
+def test_what_a_stream_cannot_give_is_refused_before_anything_starts(said, tmp_path, options, words):
+    code, _, errors = said("track", LIVE, "--box", "10,10,20,20", *options, cwd=tmp_path)
+    assert code in (1, 2)
+    assert "Traceback" not in errors
+    assert words in " ".join(errors.split())
+    assert not list(tmp_path.iterdir())
