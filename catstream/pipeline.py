@@ -19,7 +19,7 @@ from catstream.errors import ServiceError, SettingsError, VideoError
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.video.source import is_live, open_source
+from catstream.video.source import WHOLE, is_live, open_source
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.sockets import Receiver, Subscriber
 
@@ -43,6 +43,7 @@ class Pipeline:
     source : a video file, a folder of images, a pattern, a camera, a stream: see `catstream.video.source`
     box : x, y, w, h of the object in the first frame, in pixels
     settings : all defaults where None
+    part : which frames of a file or folder there are to follow, `slice(100, 200, 2)` for 100, 102 ... 198
 
     Attributes
     ----------
@@ -60,15 +61,17 @@ class Pipeline:
         While iterating, where the source breaks, after its last good frame.
     """
 
-    def __init__(self, source: str, box: Sequence[float], settings: Settings | None = None) -> None:
+    def __init__(
+        self, source: str, box: Sequence[float], settings: Settings | None = None, *, part: slice = WHOLE
+    ) -> None:
         self.settings = settings or Settings()
-        self._source, self._box = str(source), Box(*map(float, box))
+        self._source, self._box, self._part = str(source), Box(*map(float, box)), part
         self._end: End | None = None
         self._health: dict[str, Health] = {}
         if self.settings.lockstep and is_live(self._source):
             raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
         # The detector opens the source once more: a camera shows its picture to one at a time.
-        with open_source(self._source) as first:
+        with open_source(self._source, part=part) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
         self._box.inside(*self.size)
@@ -82,7 +85,7 @@ class Pipeline:
             self._results = stack.enter_context(Receiver("results", endpoint, Position(), self.settings.window))
             self._reports = stack.enter_context(Subscriber("health", endpoint))
             settings = replace(self.settings, endpoint=self.endpoint)
-            self._supervisor = Supervisor(self._source, self._box, settings, folder, owned=True)
+            self._supervisor = Supervisor(self._source, self._box, settings, folder, owned=True, part=self._part)
             stack.callback(self._supervisor.stop)
             self._stack = stack.pop_all()
         return self

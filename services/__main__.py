@@ -14,13 +14,14 @@ for _library in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
 from catstream.box import Box
 from catstream.errors import CatstreamError
 from catstream.services.loop import run
-from catstream.services.options import with_settings
+from catstream.services.options import with_part, with_settings
 from catstream.settings import Settings
 
 
@@ -52,18 +53,17 @@ _box = click.option("--box", required=True, metavar="X,Y,W,H", help="The object 
 @click.option("--resume", is_flag=True, help="Go on where a detector before this one stopped.")
 @click.option("--owned", is_flag=True, help="Somebody takes every track from the channel `results`.")
 @click.option("--since", type=float, hidden=True, help="Moment that the times of a live source count from.")
+@with_part
 @with_settings
 @click.pass_obj
-def detector(
-    parent: int | None, settings: Settings, source: str, box: str, resume: bool, owned: bool, since: float | None
-) -> None:
+def detector(parent: int | None, settings: Settings, source: str, box: str, **options: Any) -> None:
     """Frames in; tracks and features out, with the newest model there is."""
     import cv2
 
     from catstream.services import detector
 
     cv2.setNumThreads(1)
-    action = partial(detector.main, source=source, box=Box.parse(box), resume=resume, owned=owned, since=since)
+    action = partial(detector.main, source=source, box=Box.parse(box), **options)
     sys.exit(run("detector", action, settings, parent))
 
 
@@ -91,12 +91,13 @@ def trainer(parent: int | None, settings: Settings) -> None:
 @main.command()
 @_source
 @_box
+@with_part
 @with_settings
-def supervisor(settings: Settings, source: str, box: str) -> None:
+def supervisor(settings: Settings, source: str, box: str, part: slice) -> None:
     """Start the other three on a source, and keep them running."""
     from catstream.services import supervisor
 
-    supervisor.main(source, Box.parse(box), settings)
+    supervisor.main(source, Box.parse(box), settings, part)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from catstream.detection.detector import Detector
 from catstream.errors import VideoError
 from catstream.messages import End, Features, Model, Position, Track
 from catstream.services.loop import Process
-from catstream.video.source import Source, open_source
+from catstream.video.source import WHOLE, Source, open_source
 from catstream.wire.sockets import Publisher, Sender, Subscriber
 
 __all__ = ["main"]
@@ -22,7 +22,16 @@ _OWNER_SECONDS = 0.5  # the owner may listen no more
 _log = logging.getLogger(__name__)
 
 
-def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool, since: float | None = None) -> None:
+def main(
+    process: Process,
+    source: str,
+    box: Box,
+    *,
+    resume: bool,
+    owned: bool,
+    part: slice = WHOLE,
+    since: float | None = None,
+) -> None:
     """Follow the object to the last frame.
 
     Parameters
@@ -31,7 +40,7 @@ def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool, 
     box : of the object in the first frame
     resume : go on where a detector before this one stopped
     owned : somebody takes every track from the channel `results`
-    since : as `open_source` takes it
+    part, since : as `open_source` takes them
     """
     with ExitStack() as stack:
         line = _Line(process, stack, owned)
@@ -40,7 +49,8 @@ def main(process: Process, source: str, box: Box, *, resume: bool, owned: bool, 
         if position.seq and position.box is not None:
             detector.resume(position.seq, box, position.box, line.model())
         # From the last frame that was stored, which is passed over: there may be none after it.
-        frames = stack.enter_context(open_source(source, max(detector.seq - 1, 0), since=since, idle=line.idle))
+        first = max(detector.seq - 1, 0)
+        frames = stack.enter_context(open_source(source, first, part=part, since=since, idle=line.idle))
         line.source = frames
         reason, failed = "the source came to its end", False
         try:

@@ -1,4 +1,4 @@
-"""The options that every command takes to gather its settings."""
+"""Options that several commands take: settings, and which frames of a source."""
 
 from __future__ import annotations
 
@@ -11,7 +11,20 @@ import click
 
 from catstream.settings import PRESETS, Settings
 
-__all__ = ["with_settings"]
+__all__ = ["with_part", "with_settings"]
+
+
+def with_part(command: Callable[..., None]) -> Callable[..., None]:
+    """Add `--start`, `--end` and `--stride`; the command gets them as one argument `part`, a slice."""
+
+    @click.option("--start", type=click.IntRange(0), metavar="N", help="The first frame, of a file or folder.")
+    @click.option("--end", type=click.IntRange(0), metavar="N", help="The frame to stop before.")
+    @click.option("--stride", type=click.IntRange(1), metavar="N", help="Follow each N-th frame only.")
+    @wraps(command)
+    def wrapped(start: int | None, end: int | None, stride: int | None, **options: Any) -> None:
+        command(part=slice(start, end, stride), **options)
+
+    return wrapped
 
 
 def with_settings(command: Callable[..., None]) -> Callable[..., None]:

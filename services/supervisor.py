@@ -20,6 +20,7 @@ from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.services.loop import REFUSED
 from catstream.settings import Settings
+from catstream.video.source import WHOLE
 from catstream.wire.endpoint import meeting_place, private_folder
 
 __all__ = ["NAMES", "Supervisor", "main"]
@@ -79,10 +80,14 @@ class Supervisor:
     settings : with the endpoint where the processes meet
     folder : where checkpoints and logs are kept while the pipeline runs
     owned : whether somebody takes every track from the channel `results`
+    part : which frames of the source there are to follow
     """
 
-    def __init__(self, source: str, box: Box, settings: Settings, folder: Path, *, owned: bool) -> None:
+    def __init__(
+        self, source: str, box: Box, settings: Settings, folder: Path, *, owned: bool, part: slice = WHOLE
+    ) -> None:
         self._source, self._box, self._settings, self._folder, self._owned = source, box, settings, folder, owned
+        self._part = {"--start": part.start, "--end": part.stop, "--stride": part.step}
         self._since = time.monotonic()  # a restarted detector goes on with the times of a live source
         self._children = {name: _Child(name, (folder / f"{name}.log").open("w+b")) for name in NAMES}
         for child in self._children.values():
@@ -171,6 +176,8 @@ class Supervisor:
             command += ["--set", pair]
         if child.name == "detector":
             command += [self._source, "--box", ",".join(map(repr, self._box)), "--since", repr(self._since)]
+            for option, number in self._part.items():
+                command += [] if number is None else [option, str(number)]
             command += ["--owned"] * self._owned + ["--resume"] * bool(child.restarts)
         if child.name == "compressor":
             command += ["--state", str(self._folder)]
@@ -185,13 +192,13 @@ class Supervisor:
         )
 
 
-def main(source: str, box: Box, settings: Settings) -> None:
+def main(source: str, box: Box, settings: Settings, part: slice = WHOLE) -> None:
     """Run a pipeline for whoever subscribes, until the source ends or a signal comes."""
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     with private_folder() as folder, meeting_place(settings.endpoint, folder) as endpoint:
-        supervisor = Supervisor(source, box, replace(settings, endpoint=str(endpoint)), folder, owned=False)
+        supervisor = Supervisor(source, box, replace(settings, endpoint=str(endpoint)), folder, owned=False, part=part)
         try:
             while not supervisor.finished and not ended.wait(0.05):
                 supervisor.check()

@@ -17,7 +17,7 @@ from rich.text import Text
 from catstream.box import Box
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
-from catstream.services.options import with_settings
+from catstream.services.options import with_part, with_settings
 from catstream.settings import Settings
 from catstream.video.results import ResultsWriter
 from catstream.video.source import is_live
@@ -33,9 +33,11 @@ _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 @click.option("--output", type=click.Path(path_type=Path), help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
+@with_part
 @with_settings
 def track(
     settings: Settings,
+    part: slice,
     source: str,
     box: str,
     output: Path | None,
@@ -66,6 +68,7 @@ def track(
       catstream track walk.mp4 --box 120,80,64,48 --output out --video
       catstream track frames/ --box 120,80,64,48 --output out --set coreset_size=128
       catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
+      catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
     """
     if video and output is None:
@@ -74,7 +77,7 @@ def track(
         raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
     if lockstep:
         settings = Settings.of({**settings.values(), "lockstep": True})
-    pipeline = Pipeline(source, Box.parse(box), settings)
+    pipeline = Pipeline(source, Box.parse(box), settings, part=part)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console(stderr=True, soft_wrap=True)
     run = _Run(pipeline)
@@ -86,7 +89,7 @@ def track(
             sinks = None
             for found in pipeline:
                 # Not before there is something to write: a run that cannot start leaves older results alone.
-                sinks = sinks or _Sinks(stack, pipeline, source, output, video)
+                sinks = sinks or _Sinks(stack, pipeline, source, part, output, video)
                 sinks.write(found)
                 run.show(progress, found)
     except KeyboardInterrupt:
@@ -102,7 +105,9 @@ def track(
 class _Sinks:
     """Where tracks go: results files, and a video of the same frames read once more."""
 
-    def __init__(self, stack: ExitStack, pipeline: Pipeline, source: str, output: Path | None, video: bool) -> None:
+    def __init__(
+        self, stack: ExitStack, pipeline: Pipeline, source: str, part: slice, output: Path | None, video: bool
+    ) -> None:
         self._results = stack.enter_context(ResultsWriter(output, pipeline.name)) if output is not None else None
         self._video: Any = None
         self._moment = time.perf_counter()
@@ -110,7 +115,7 @@ class _Sinks:
             from catstream.video.annotate import AnnotatedVideo
             from catstream.video.source import open_source
 
-            self._frames = stack.enter_context(open_source(source))
+            self._frames = stack.enter_context(open_source(source, part=part))
             path = output / f"{pipeline.name}.mp4"
             self._video = stack.enter_context(AnnotatedVideo(path, pipeline.rate, pipeline.size))
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -33,7 +34,10 @@ import numpy as np
 
 from catstream.errors import VideoError
 
-__all__ = ["Frame", "Source", "image_files", "is_live", "natural_order", "open_source", "reason", "upright"]
+__all__ = ["WHOLE", "Frame", "Source", "image_files", "is_live", "natural_order", "open_source", "reason", "upright"]
+
+#: All frames of a source.
+WHOLE = slice(None)
 
 #: Frames a second of a source that does not say: images have no clock.
 RATE = 25.0
@@ -52,8 +56,8 @@ _SHORT_SECONDS = 0.5
 class Frame:
     """One image of a source.
 
-    number  0, 1, 2 ... from the start of the source; of a live one, those that were taken
-    time    seconds since the first frame; of a live one, when this one came
+    number  0, 1, 2 ... of the frames that the source gives, which are not all of a live one, or of a part
+    time    seconds since the start of the video; of a live source, when this frame came
     image   uint8 (h, w, 3), blue green red; grey is expanded
     """
 
@@ -142,15 +146,21 @@ def is_live(text: str | Path) -> bool:
 
 
 def open_source(
-    text: str | Path, start: int = 0, *, since: float | None = None, idle: Callable[[], bool] | None = None
+    text: str | Path,
+    start: int = 0,
+    *,
+    part: slice = WHOLE,
+    since: float | None = None,
+    idle: Callable[[], bool] | None = None,
 ) -> Source:
     """Open what `text` names, see the module.
 
     Parameters
     ----------
     text : what and where
-    start : number of the first frame wanted. Of a file those before it are decoded, never guessed at; a live
-        source counts from there
+    start : number of the first frame wanted, of those in the part. In a file those before it are decoded, never
+        guessed at; a live source counts from there
+    part : which frames of a file or folder there are for whoever reads, `slice(100, 200, 2)` for 100, 102 ... 198
     since : moment of `time.monotonic` that the times of a live source count from, its first frame where None
     idle : called ten times a second while a live source gives no frame; where it returns True, iterating ends.
         Who gives one waits for the first frame too, however long it takes: opening then never fails, and the
@@ -161,18 +171,22 @@ def open_source(
     VideoError
         Where there is nothing, or nothing readable; says what was expected.
     """
+    if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
+        raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
     if is_live(text):
+        if part != WHOLE:
+            raise VideoError("of a live source only the newest frame can be had: leave start, end and stride away")
         from catstream.video.live import LiveSource  # here, as it is built on this module
 
         return LiveSource(str(text), start, since=since, idle=idle)
     path = Path(text)
     try:
         if path.is_dir():
-            return _folder(path, start)
+            return _folder(path, part, start)
         if path.is_file():
-            return _video(path, start)
+            return _video(path, part, start)
         if re.search(r"%0?\d*d|[*?\[]", path.name):
-            return _images(path.parent.resolve().name, image_files(path), start)
+            return _images(path.parent.resolve().name, image_files(path), part, start)
     except OSError as error:
         raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {_HELP}") from None
     raise VideoError(f"there is no video or folder {str(text)!r}: {_HELP}")
@@ -206,25 +220,27 @@ def natural_order(path: Path) -> list[Any]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _folder(path: Path, start: int) -> Source:
+def _folder(path: Path, part: slice, start: int) -> Source:
     name = path.resolve().name
     for folder in (*(path / inner for inner in _FOLDERS), path):
         if folder.is_dir() and any(file.suffix.lower() in _IMAGES for file in folder.iterdir()):
-            return _images(name, image_files(folder), start)
+            return _images(name, image_files(folder), part, start)
     videos = sorted(file for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
     if len(videos) == 1:
-        return _video(videos[0], start)
+        return _video(videos[0], part, start)
     held = f"{len(videos)} videos" if videos else "neither images nor a video"
     raise VideoError(f"the folder {str(path)!r} holds {held}: {_HELP}")
 
 
-def _images(name: str, files: list[Path], start: int) -> Source:
-    return _Recording(name, _read_images(files, start), frames=len(files), rate=RATE)
+def _images(name: str, files: list[Path], part: slice, start: int) -> Source:
+    wanted = range(len(files))[part]
+    rate = RATE / wanted.step
+    return _Recording(name, _read_images(files, wanted, start), frames=len(wanted), rate=rate)
 
 
-def _read_images(files: list[Path], start: int) -> Iterator[Frame]:
+def _read_images(files: list[Path], wanted: range, start: int) -> Iterator[Frame]:
     shape: tuple[int, ...] | None = None
-    for number in range(start, len(files)):
+    for count, number in enumerate(wanted[start:], start):
         image = cv2.imread(str(files[number]), cv2.IMREAD_COLOR)
         if image is None:
             raise VideoError(f"cannot read the image {str(files[number])!r} (frame {number}): replace or remove it")
@@ -234,10 +250,10 @@ def _read_images(files: list[Path], start: int) -> Iterator[Frame]:
                 f"{image.shape[1]}x{image.shape[0]}, those before it {shape[1]}x{shape[0]}"
             )
         shape = image.shape
-        yield Frame(number, number / RATE, image)
+        yield Frame(count, number / RATE, image)
 
 
-def _video(path: Path, start: int) -> Source:
+def _video(path: Path, part: slice, start: int) -> Source:
     import av  # here, as it costs 0.1 s and folders do without
 
     try:
@@ -251,10 +267,12 @@ def _video(path: Path, start: int) -> Source:
         raise VideoError(f"there is no video in {str(path)!r}: {_HELP}")
     stream = streams[0]
     rate = float(stream.average_rate or stream.guessed_rate or RATE)
-    return _Recording(path.stem, _read_video(path, container, rate, start), frames=stream.frames or None, rate=rate)
+    wanted, frames = range(sys.maxsize)[part], len(range(stream.frames)[part]) or None
+    images = _read_video(path, container, rate, wanted, start)
+    return _Recording(path.stem, images, frames=frames, rate=rate / wanted.step)
 
 
-def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator[Frame]:
+def _read_video(path: Path, container: Any, rate: float, wanted: range, start: int) -> Iterator[Frame]:
     stream = container.streams.video[0]
     stream.thread_type = "NONE"  # the processes are the parallelism
     number, time, zero, shape = 0, 0.0, None, None
@@ -262,7 +280,7 @@ def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator
         for frame in _good_frames(path, container, stream, rate):
             zero = frame.pts if zero is None else zero
             time = number / rate if frame.pts is None else float((frame.pts - zero) * stream.time_base)
-            if number >= start:
+            if number in wanted[start:]:
                 image = upright(frame)
                 if shape is not None and image.shape != shape:
                     raise VideoError(
@@ -270,8 +288,10 @@ def _read_video(path: Path, container: Any, rate: float, start: int) -> Iterator
                         f"pixels at frame {number}: split it there"
                     )
                 shape = image.shape
-                yield Frame(number, time, image)
+                yield Frame(wanted.index(number), time, image)
             number += 1
+            if number >= wanted.stop:  # what comes after the part may be broken
+                return
 
 
 def upright(frame: Any) -> np.ndarray:

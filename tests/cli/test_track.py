@@ -49,6 +49,20 @@ def test_it_writes_five_files_with_a_row_a_frame(video, said, tmp_path):
         assert sum(1 for _ in film) == 60
 
 
+def test_a_part_has_a_row_for_each_frame_that_was_followed(video, said, tmp_path):
+    source, box = video
+    part = ["--start", "10", "--end", "50", "--stride", "4"]
+    code, _, errors = said("track", source, "--box", box, *part, "--output", tmp_path, "--video")
+    assert code == 0, errors
+    rows = table(tmp_path / "tracks.csv")
+    assert [int(row["frame"]) for row in rows] == list(range(10))
+    assert [float(row["seconds"]) for row in rows] == pytest.approx([k / 30 for k in range(10, 50, 4)], abs=1e-3)
+    with open_source(tmp_path / "demo.mp4") as film, open_source(source, part=slice(10, 50, 4)) as story:
+        for drawn, frame in zip(film, story, strict=True):
+            difference = cv2.absdiff(drawn.image, frame.image)[: -frame.image.shape[0] // 5]  # above the line of text
+            assert np.median(difference) < 8
+
+
 def test_two_lockstep_runs_write_the_same_bytes(video, said, tmp_path):
     source, box = video
     for folder in ("one", "two"):

@@ -154,6 +154,7 @@ LIVE = "http://127.0.0.1:1/one"
 REFUSED = {
     "in lockstep": (["--lockstep"], "leave lockstep away"),
     "its frames once more": (["--output", "out", "--video"], "leave it away"),
+    "from a later frame": (["--start", "9"], "leave start, end and stride away"),
     "not there": ([], "connection refused"),
 }
 

@@ -85,6 +85,20 @@ def test_a_process_that_is_killed_costs_no_frame(video, victim, alive):
     assert not any(map(alive, [killed, *pids.values()]))
 
 
+def test_a_part_is_followed_whole_though_the_detector_dies(video):
+    path, boxes = video
+    part = slice(20, 140, 2)
+    wanted, tracks = range(len(boxes))[part], []
+    with Pipeline(path, boxes[20], SETTINGS, part=part) as pipeline:
+        for track in pipeline:
+            tracks.append(track)
+            if track.frame == 25:
+                os.kill(pipeline.pids["detector"], signal.SIGKILL)
+        assert pipeline.frames == len(wanted)
+    assert [track.frame for track in tracks] == list(range(len(wanted)))
+    assert [track.time for track in tracks] == pytest.approx([number / 30 for number in wanted], abs=0.002)
+
+
 def test_a_restarted_trainer_goes_on_learning(video, until):
     path, boxes = video
     with Pipeline(path, boxes[0], SETTINGS) as pipeline:

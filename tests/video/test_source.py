@@ -116,6 +116,29 @@ def test_a_later_start_gives_the_same_frames_as_reading_up_to_it(video, name):
             np.testing.assert_array_equal(frame.image, other.image)
 
 
+PARTS = pytest.mark.parametrize("part", [slice(7, 31, 3), slice(90, None), slice(None, 200, 11)], ids=str)
+
+
+@PARTS
+@pytest.mark.parametrize("name", ["a.mp4", "a.mpg"])
+def test_a_part_of_a_video_has_its_frames_at_their_times(video, name, part):
+    wanted = range(100)[part]
+    with open_source(video(name), part=part) as source:
+        assert source.frames in (len(wanted), None)
+        assert source.rate == 25 / wanted.step
+        frames = list(source)
+    assert [number_of(frame.image) for frame in frames] == list(wanted)
+    assert [frame.number for frame in frames] == list(range(len(wanted)))
+    assert [frame.time for frame in frames] == pytest.approx([number / 25 for number in wanted], abs=0.002)
+
+
+def test_what_is_broken_after_a_part_does_not_matter(video):
+    path = video("a.mpg")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    good, _ = broken(path)
+    assert numbers(open_source(path, part=slice(5, len(good)))) == good[5:]
+
+
 @KINDS
 @pytest.mark.parametrize("share", [0.31, 0.6, 0.83])
 def test_a_truncated_video_gives_its_good_frames_and_then_says_where_it_breaks(video, name, share):
@@ -227,6 +250,27 @@ def test_a_later_start_in_a_folder(images):
     source = open_source(images("walk", [f"{number}.png" for number in range(9)]), start=4)
     with source:
         assert [(frame.number, number_of(frame.image)) for frame in source] == [(n, n) for n in range(4, 9)]
+
+
+@PARTS
+def test_a_part_of_a_folder_has_its_images_from_any_start(images, part):
+    folder, wanted = images("walk", [f"{number}.png" for number in range(100)]), range(100)[part]
+    with open_source(folder, start=2, part=part) as source:
+        assert source.frames == len(wanted)
+        found = [(frame.number, number_of(frame.image)) for frame in source]
+    assert found == list(enumerate(wanted))[2:]
+
+
+@pytest.mark.parametrize("part", [slice(-1, None), slice(None, -1), slice(0, 9, 0), slice(9, 0, -1)], ids=str)
+def test_a_part_that_counts_backwards_is_refused(images, part):
+    with pytest.raises(VideoError, match="frames count from 0"):
+        open_source(images("walk", ["0.png"]), part=part)
+
+
+@pytest.mark.parametrize("part", [slice(5, 5), slice(9, None)], ids=str)
+def test_a_part_without_a_frame_is_refused(images, part):
+    with pytest.raises(VideoError, match="no frame to start with"):
+        open_source(images("walk", [f"{number}.png" for number in range(9)]), part=part)
 
 
 def test_grey_images_are_expanded(tmp_path):
