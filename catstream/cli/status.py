@@ -35,6 +35,7 @@ def status(endpoint: str, as_json: bool, wait: float) -> None:
       learning   messages that the compressor has not taken yet, or not stored
       model      the version that the detector uses
       trees      the coreset trees of the compressor
+      source     whether a camera or a stream is there, and the frames skipped
       refused    messages that were not what their channel carries
       heard      each process, and how long ago it said so
 
@@ -95,6 +96,9 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
         "leaves": whole(compressor, "leaves"),
         "nodes": whole(compressor, "nodes"),
         "bytes": whole(compressor, "bytes"),
+        "skipped": whole(detector, "skipped"),
+        "reopened": whole(detector, "reopened"),
+        "lost_seconds": detector.get("lost_seconds"),
         "refused": {name: int(counters[name].get("refused", 0)) for name in reports},
         "processes": {
             name: {"seconds_ago": round(max(0.0, time.time() - heard[-1].time), 2), "counters": heard[-1].counters}
@@ -117,6 +121,8 @@ def _text(found: dict[str, Any]) -> str:
 
     heard = (f"{name} {of['seconds_ago']:.1f} s ago" for name, of in found["processes"].items())
     size = "-" if found["bytes"] is None else f"{found['bytes'] / 1e6:.1f}"
+    lost = f"lost for {found['lost_seconds']:.0f} s" if found["lost_seconds"] else "there"
+    source = f"source     {lost}, {shown('skipped')} frames skipped, came back {shown('reopened')} times"
     return "\n".join(
         (
             f"pipeline   {found['endpoint']}",
@@ -124,6 +130,7 @@ def _text(found: dict[str, Any]) -> str:
             f"learning   {shown('lag')} messages behind, {shown('not_stored')} not stored",
             f"model      {shown('model_version')}",
             f"trees      {shown('leaves')} leaves, {shown('nodes')} nodes, level {shown('level')}, {size} MB",
+            *([source] if found["skipped"] is not None else []),  # a file skips none
             f"refused    {sum(found['refused'].values())} messages",
             f"heard      {', '.join(heard)}",
         )

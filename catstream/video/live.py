@@ -78,7 +78,9 @@ class LiveSource(Source):
     @property
     def counters(self) -> dict[str, float]:
         """`skipped`, `reopened`, and `lost_seconds`: how long it has been lost, 0 while it is not."""
-        lost = monotonic() - self._heard if self._problem else 0.0
+        silent = monotonic() - self._heard
+        # A device that hangs is beyond every time-out of FFmpeg: at least it is said.
+        lost = silent if self._problem or silent > _OPEN_SECONDS else 0.0
         return {"skipped": self.skipped, "reopened": self.reopened, "lost_seconds": lost}
 
     def __next__(self) -> Frame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import signal
 import subprocess
 from contextlib import ExitStack, contextmanager
@@ -118,7 +119,7 @@ def test_a_server_that_freezes_and_dies_is_followed_again_with_what_was_learned(
     assert [int(row["frame"]) for row in rows] == list(range(len(rows)))
     versions = [int(row["model_version"]) for row in rows]
     assert versions == sorted(versions), "what was learned is kept"
-    assert all(found(row, story) for row in rows[-20:])
+    assert sum(found(row, story) for row in rows[-20:]) > 15
 
 
 def test_a_stream_over_http_is_followed_by_a_restarted_detector_too(camera, following, story):
@@ -137,12 +138,15 @@ def test_a_stream_over_http_is_followed_by_a_restarted_detector_too(camera, foll
     assert sum(found(row, story) for row in rows) > 0.8 * len(rows)
 
 
-def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, story, tmp_path):
+def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, tmp_path):
     cam = camera(lambda number: story[number % len(story)][0])
     with following(cam.url) as run, subscribe(str(tmp_path / "run"), "tracks", timeout=60) as tracks:
         next(tracks)
         cam.leave()
         run.until(lambda counters: counters["lost_seconds"] > 0)
+        code, status, _ = said("status", "--endpoint", tmp_path / "run")
+        assert code == 0, "the processes are well"
+        assert re.search(r"^source +lost for \d+ s, \d+ frames skipped, came back 0 times$", status, re.MULTILINE)
         rows, errors = run.stopped()
         assert len(list(tracks)) < len(rows)
         assert (tracks.end.reason, tracks.end.failed) == ("it was stopped", False)
