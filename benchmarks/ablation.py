@@ -26,6 +26,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "hard negatives of the whole frame": {"far_negatives": 0},
     "near misses": {"near_misses": 0},
     "weight of the object's row": {"object_weight": 1.0},
+    "distrust of a window found elsewhere": {"trust_score": _NEVER},
     "search of the whole frame": {"sure_score": _NEVER, "lost_score": _NEVER},
     "affine copies of each frame": {"copies": 0},
     "search over scales": {"scale_count": 1},

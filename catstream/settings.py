@@ -148,6 +148,9 @@ class Settings:
     sure_score: Annotated[float, _about("Score below which the whole frame is searched now and then.")] = 0.55
     lost_score: Annotated[float, _about("Score below which the whole frame is searched in every frame.")] = 0.3
     jump_margin: Annotated[float, _about("Score by which a window elsewhere must be better than the one near.")] = 0.1
+    trust_score: Annotated[
+        float, _about("Score from which on a window found elsewhere teaches, and the whole frame is searched no more.")
+    ] = 0.75
     whole_frames: Annotated[int, _about("Frames from one whole search to the next while unsure.", ge=1)] = 10
     teach_score: Annotated[float, _about("Score below which a frame teaches nothing.")] = 0.4
     copies: Annotated[

@@ -38,6 +38,7 @@ class Detector:
         self.state: State = "bootstrapping"
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
         self._usual_score = 0.0
+        self._elsewhere = False  # found by a search of the whole frame, and not trusted yet
         self._centre: CentreFilter | None = None
         self._scm: SparseCollaborativeModel | None = None
 
@@ -112,6 +113,7 @@ class Detector:
             self._box = found.box.scaled(settings.context).held_in(width, height)
             return self._answer(time, found.score, self._lesson(image, found.score))
         found = self._find(image)
+        self._elsewhere &= found.score < settings.trust_score
         there = self._there(found.score)
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
@@ -141,11 +143,13 @@ class Detector:
             return self._fitted(image, search.whole(image, self._box, self.model, settings))
         found = self._fitted(image, search.local(image, self._box, self.model, settings))
         lost = found.score < settings.lost_score
-        if lost or (found.score < settings.sure_score and self.seq % settings.whole_frames == 0):
+        unsure = found.score < settings.sure_score or self._elsewhere
+        if lost or (unsure and self.seq % settings.whole_frames == 0):
             other = search.whole(image, self._sure_box.centred(*self._box.centre), self.model, settings)
             if other.score > settings.return_score and other.score > found.score + settings.jump_margin:
                 other = self._fitted(image, search.local(image, other.box, self.model, settings))
                 if other.score > found.score:
+                    self._elsewhere = True
                     return other
         return found
 
@@ -154,7 +158,7 @@ class Detector:
 
     def _lesson(self, image: np.ndarray, score: float) -> Lesson:
         settings = self.settings
-        if score < settings.teach_score:
+        if score < settings.teach_score or self._elsewhere:
             return Lesson.none()
         lesson = lessons.near(image, self._box, self.model, self._random(), settings)
         if score > settings.mine_score and self.seq % settings.mine_frames == 0:
