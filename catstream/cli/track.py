@@ -173,12 +173,11 @@ class _Run:
             return
         self._shown = now
         leaves = self._pipeline.health.get("compressor", {}).get("leaves", 0)
+        skipped = f"{self._detector('skipped'):.0f} skipped   " if self._pipeline.live else ""
         line = (
-            f"{self._rate(now):.0f} frames/s   score {found.score:+.2f}   "
+            f"{self._rate(now):.0f} frames/s   {skipped}score {found.score:+.2f}   "
             f"model {found.model_version}   {leaves:.0f} leaves in the trees"
         )
-        if self._pipeline.live:
-            line += f"   {self._detector('skipped'):.0f} skipped"
         progress.update(self._task, completed=self.frames, state=found.state, line=line)
 
     def summary(self, output: Path | None) -> str:
