@@ -40,7 +40,7 @@ class Features:
 
     seq      1, 2, 3 ... without a gap: one message a frame
     frame    the frame the rows were cut from
-    time     seconds since the start of the source
+    time     seconds since the start of the source, of a live one since that of the run
     box      where the object was found, or None
     rows     float32 (k, d); k is 0 where the frame teaches nothing
     labels   float32 (k,): 1 the object, 0 background, between them a near miss
@@ -167,7 +167,7 @@ class Track:
 
     seq            1, 2, 3 ...: a gap means that this subscriber missed some
     frame          number of the frame
-    time           seconds since the start of the source
+    time           seconds since the start of the source, of a live one since that of the run
     state          "bootstrapping" until the first model, then "present" or "absent"
     box            where, in pixels of the frame; None while absent
     score          confidence: about 0 on background, about 1 on the object
