@@ -16,14 +16,8 @@ START = Box(60, 50, 48, 40)
 
 
 @pytest.fixture
-def scene():
+def scene(texture):
     """A function that draws a frame with the object at (x, y), or without it."""
-    rng = np.random.default_rng(11)
-
-    def texture(height, width, cell):
-        coarse = rng.integers(0, 256, (height // cell + 1, width // cell + 1, 3), np.uint8)
-        return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-
     background, thing = texture(240, 320, 20), texture(40, 48, 8)
 
     def draw(at=None):

@@ -15,14 +15,8 @@ BOX = Box(60, 50, 48, 40)
 
 
 @pytest.fixture
-def draw():
+def draw(texture):
     """A function that draws a textured thing of some width and height over a textured background."""
-    rng = np.random.default_rng(5)
-
-    def texture(height, width, cell):
-        coarse = rng.integers(0, 256, (height // cell + 1, width // cell + 1, 3), np.uint8)
-        return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-
     background, thing = texture(240, 320, 20), texture(120, 120, 20)
 
     def frame(w, h):
