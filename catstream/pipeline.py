@@ -47,7 +47,7 @@ class Pipeline:
 
     Attributes
     ----------
-    name, frames, rate, size, live : of the source, as `catstream.video.source.Source` has them
+    name, frames, rate, size, live : of the source, as `catstream.video.frames.Source` has them
 
     Raises
     ------

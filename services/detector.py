@@ -10,7 +10,8 @@ from catstream.detection.detector import Detector
 from catstream.errors import VideoError
 from catstream.messages import End, Features, Model, Position, Track
 from catstream.services.loop import Process
-from catstream.video.source import WHOLE, Source, open_source
+from catstream.video.frames import Source
+from catstream.video.source import WHOLE, open_source
 from catstream.wire.sockets import Publisher, Sender, Subscriber
 
 __all__ = ["main"]

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import cv2
 
 from catstream.errors import VideoError
-from catstream.video.source import RATE, Frame, Source, reason, upright
+from catstream.video.frames import RATE, Frame, Source, reason, upright
 
 __all__ = ["LiveSource"]
 

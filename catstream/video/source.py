@@ -23,24 +23,19 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import cv2
-import numpy as np
 
 from catstream.errors import VideoError
+from catstream.video.frames import RATE, Frame, Source, reason, upright
 
-__all__ = ["WHOLE", "Frame", "Source", "image_files", "is_live", "natural_order", "open_source", "reason", "upright"]
+__all__ = ["WHOLE", "image_files", "is_live", "natural_order", "open_source"]
 
 #: All frames of a source.
 WHOLE = slice(None)
-
-#: Frames a second of a source that does not say: images have no clock.
-RATE = 25.0
 
 _IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 _VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
@@ -50,59 +45,6 @@ _LIVE = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+")
 
 #: A video that ends this much before its container says was cut off: rounding and audio explain less.
 _SHORT_SECONDS = 0.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """One image of a source.
-
-    number  0, 1, 2 ... of the frames that the source gives, which are not all of a live one, or of a part
-    time    seconds since the start of the video; of a live source, when this frame came
-    image   uint8 (h, w, 3), blue green red; grey is expanded
-    """
-
-    number: int
-    time: float
-    image: np.ndarray
-
-
-class Source(ABC):
-    """Frames in order, once, and what is known of them before they are read.
-
-    name    what results are called: the stem of a file, the name of a folder
-    frames  how many the source says it has, or None
-    rate    frames a second
-    size    (width, height) of the first frame in pixels
-    live    whether frames pass by whether they are read or not
-
-    Close it, or use it in a `with`.
-    """
-
-    live = False
-
-    def __init__(self, name: str, frames: int | None, rate: float, size: tuple[int, int]) -> None:
-        self.name, self.frames, self.rate, self.size = name, frames, rate, size
-
-    @property
-    def counters(self) -> dict[str, float]:
-        """What a source that may lose frames counts: name -> number."""
-        return {}
-
-    def __iter__(self) -> Iterator[Frame]:
-        return self
-
-    @abstractmethod
-    def __next__(self) -> Frame: ...
-
-    @abstractmethod
-    def close(self) -> None:
-        """Let the source go. Iterating afterwards ends at once."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class _Recording(Source):
@@ -176,7 +118,7 @@ def open_source(
     if is_live(text):
         if part != WHOLE:
             raise VideoError("of a live source only the newest frame can be had: leave start, end and stride away")
-        from catstream.video.live import LiveSource  # here, as it is built on this module
+        from catstream.video.live import LiveSource  # here, as files do without its threads
 
         return LiveSource(str(text), start, since=since, idle=idle)
     path = Path(text)
@@ -294,11 +236,6 @@ def _read_video(path: Path, container: Any, rate: float, wanted: range, start: i
                 return
 
 
-def upright(frame: Any) -> np.ndarray:
-    """The image of a frame that PyAV decoded: phones store upright videos lying down, and the turn beside them."""
-    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90))
-
-
 def _good_frames(path: Path, container: Any, stream: Any, rate: float) -> Iterator[Any]:
     """Decoded frames up to the first that is damaged or missing, then a VideoError if there was one."""
     import av
@@ -345,11 +282,6 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
         if packet.pts is not None:
             end = max(end, float((packet.pts + (packet.duration or 0) - (stream.start_time or 0)) * stream.time_base))
         yield packet, "data is missing" if packet.is_corrupt else ""
-
-
-def reason(error: Any) -> str:
-    """What FFmpeg says went wrong, in its words."""
-    return (error.strerror or str(error)).lower()
 
 
 def _stated_seconds(container: Any, stream: Any) -> float:

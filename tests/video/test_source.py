@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from catstream.errors import VideoError
-from catstream.video.source import Source, open_source
+from catstream.video.frames import Source
+from catstream.video.source import open_source
 
 CODECS = {".mp4": "libx264", ".mkv": "libx264", ".ts": "libx264", ".avi": "mjpeg", ".mpg": "mpeg2video"}
 

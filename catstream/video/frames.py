@@ -1,0 +1,78 @@
+"""Frames, and what every source of them has, whether it is a recording or live."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+__all__ = ["RATE", "Frame", "Source", "reason", "upright"]
+
+#: Frames a second of a source that does not say: images have no clock.
+RATE = 25.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image of a source.
+
+    number  0, 1, 2 ... of the frames that the source gives, which are not all of a live one, or of a part
+    time    seconds since the start of the video; of a live source, when this frame came
+    image   uint8 (h, w, 3), blue green red; grey is expanded
+    """
+
+    number: int
+    time: float
+    image: np.ndarray
+
+
+class Source(ABC):
+    """Frames in order, once, and what is known of them before they are read.
+
+    name    what results are called: the stem of a file, the name of a folder
+    frames  how many the source says it has, or None
+    rate    frames a second
+    size    (width, height) of the first frame in pixels
+    live    whether frames pass by whether they are read or not
+
+    Close it, or use it in a `with`.
+    """
+
+    live = False
+
+    def __init__(self, name: str, frames: int | None, rate: float, size: tuple[int, int]) -> None:
+        self.name, self.frames, self.rate, self.size = name, frames, rate, size
+
+    @property
+    def counters(self) -> dict[str, float]:
+        """What a source that may lose frames counts: name -> number."""
+        return {}
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self
+
+    @abstractmethod
+    def __next__(self) -> Frame: ...
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let the source go. Iterating afterwards ends at once."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def upright(frame: Any) -> np.ndarray:
+    """The image of a frame that PyAV decoded: phones store upright videos lying down, and the turn beside them."""
+    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90))
+
+
+def reason(error: Any) -> str:
+    """What FFmpeg says went wrong, in its words."""
+    return (error.strerror or str(error)).lower()
