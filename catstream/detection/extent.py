@@ -30,7 +30,7 @@ def fitted(image: np.ndarray, box: Box, first: Box, model: Model, settings: Sett
     ----------
     first : the window of the first frame, whose extent is likelier than others
     """
-    sizes = _sizes(settings)
+    sizes = _steps(settings.scale_count)
     tried = [search.scored_around(image, box.scaled(_size(k, settings)), _FINE_CELLS, model) for k in sizes]
     places = [search.highest(scored.scores) for scored in tried]
     scores = np.array([scored.scores[place] for scored, place in zip(tried, places, strict=True)])
@@ -46,7 +46,7 @@ def fitted(image: np.ndarray, box: Box, first: Box, model: Model, settings: Sett
 
 def _widened(image: np.ndarray, found: Found, first: Box, model: Model, settings: Settings) -> Found:
     """The same place, size and score, at the best aspect."""
-    aspects = _aspects(settings)
+    aspects = _steps(settings.aspect_count)
     boxes = [found.box.scaled(*_stretch(k, settings)) for k in aspects]
     tried = [search.scored_around(image, box, WINDOW, model) for box in boxes]
     values = np.array(
@@ -86,8 +86,8 @@ def cuts(image: np.ndarray, box: Box, own: np.ndarray, settings: Settings) -> tu
     """
     if not settings.extent_weight:
         return [], []
-    trials = [(k, box.scaled(_size(k, settings))) for k in _sizes(settings) if k]
-    trials += [(k, box.scaled(*_stretch(k, settings))) for k in _aspects(settings) if k]
+    trials = [(k, box.scaled(_size(k, settings))) for k in _steps(settings.scale_count) if k]
+    trials += [(k, box.scaled(*_stretch(k, settings))) for k in _steps(settings.aspect_count) if k]
     rows = [windows.around(image, trial, WINDOW)[0].reshape(-1) for _, trial in trials]
     fits = [math.exp(-((k / settings.extent_sigma) ** 2) / 2) for k, _ in trials]
     return [own, *rows], [1.0, *fits]
@@ -98,14 +98,9 @@ def _cost(changes: np.ndarray, now: float, settings: Settings) -> np.ndarray:
     return settings.extent_penalty * np.abs(changes) + settings.extent_prior * (changes + now) ** 2
 
 
-def _sizes(settings: Settings) -> range:
-    """Steps of size to try, smallest first."""
-    return range(-(settings.scale_count // 2), settings.scale_count // 2 + 1)
-
-
-def _aspects(settings: Settings) -> range:
-    """Steps of aspect to try, narrowest first."""
-    return range(-(settings.aspect_count // 2), settings.aspect_count // 2 + 1)
+def _steps(count: int) -> range:
+    """Steps to try, smallest or narrowest first, 0 in the middle."""
+    return range(-(count // 2), count // 2 + 1)
 
 
 def _size(step: float, settings: Settings) -> float:
