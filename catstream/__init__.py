@@ -7,7 +7,7 @@
             print(track.frame, track.state, track.box, track.score)
 
 In one process, frame by frame: `catstream.Tracker`, used like a `cv2.Tracker`. From another process, while a
-pipeline runs: `catstream.subscribe`.
+pipeline runs: `catstream.subscribe` to hear it, `catstream.control` to steer it.
 """
 
 from __future__ import annotations
@@ -21,18 +21,21 @@ if TYPE_CHECKING:
     from catstream.messages import Track
     from catstream.pipeline import Pipeline
     from catstream.settings import Settings
+    from catstream.steering import Control, control
     from catstream.subscription import Subscription, subscribe
     from catstream.tracker import Tracker
 
 __all__ = [
     "Box",
     "CatstreamError",
+    "Control",
     "Pipeline",
     "Settings",
     "Subscription",
     "Track",
     "Tracker",
     "__version__",
+    "control",
     "subscribe",
 ]
 
@@ -41,11 +44,13 @@ __version__ = "0.1.0"
 _HOMES = {
     "Box": "box",
     "CatstreamError": "errors",
+    "Control": "steering",
     "Pipeline": "pipeline",
     "Settings": "settings",
     "Subscription": "subscription",
     "Track": "messages",
     "Tracker": "tracker",
+    "control": "steering",
     "subscribe": "subscription",
 }
 

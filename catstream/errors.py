@@ -5,7 +5,16 @@ line prints it as one line and exits with 1; a program catches
 `CatstreamError`, or one of its kinds.
 """
 
-__all__ = ["BoxError", "CatstreamError", "ProtocolError", "ServiceError", "SettingsError", "SilenceError", "VideoError"]
+__all__ = [
+    "BoxError",
+    "CatstreamError",
+    "ProtocolError",
+    "RefusedError",
+    "ServiceError",
+    "SettingsError",
+    "SilenceError",
+    "VideoError",
+]
 
 
 class CatstreamError(Exception):
@@ -34,3 +43,7 @@ class ServiceError(CatstreamError):
 
 class SilenceError(ServiceError, TimeoutError):
     """A pipeline from which nothing came in the time given."""
+
+
+class RefusedError(ServiceError):
+    """A command that a running pipeline did not carry out; says why."""

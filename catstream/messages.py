@@ -18,6 +18,8 @@ import numpy as np
 from catstream.box import Box
 
 __all__ = [
+    "Answer",
+    "Command",
     "End",
     "Features",
     "Health",
@@ -29,9 +31,12 @@ __all__ = [
     "Stored",
     "Summary",
     "Track",
+    "Verb",
 ]
 
 State = Literal["bootstrapping", "present", "absent"]
+
+Verb = Literal["set-box", "pause", "resume", "save", "stop"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,3 +216,39 @@ class End:
     reason: str
     failed: bool = False
     totals: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What somebody wants of a running pipeline, anyone -> detector.
+
+    id    chosen anew for each command: one that comes twice is answered twice, and done once
+    verb  what to do
+    box   with "set-box": where the object is in the newest frame, in pixels
+    keep  with "set-box": it is the same object, and what was learned of it is kept
+    """
+
+    id: str
+    verb: Verb
+    box: Box | None = None
+    keep: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of a Command, detector -> who sent it.
+
+    id       that of the command
+    done     whether it was carried out
+    reason   what was done, or why nothing was, for a person to read
+    frame    the newest frame that was followed by then
+    box      where the object was last, or None
+    version  the newest model of this object, 0 before the first
+    """
+
+    id: str
+    done: bool
+    reason: str
+    frame: int = 0
+    box: Box | None = None
+    version: int = 0

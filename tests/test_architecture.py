@@ -18,7 +18,7 @@ FLOORS = [
     {"box"},
     {"messages", "settings", "ridge"},
     {"detection", "compression", "training", "wire", "video"},
-    {"tracker", "subscription"},
+    {"tracker", "subscription", "steering"},
     {"services"},
     {"pipeline"},
     {"evaluation"},

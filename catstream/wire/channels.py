@@ -6,6 +6,7 @@
     tracks     every message, to any number of readers; a slow one loses some, and sees by `seq` how many
     results    the tracks once more, acknowledged: for the one process that started the pipeline
     health     the newest of each process
+    control    commands, each answered; who hears no answer asks again, and it is done once
 
 The receiver of an acknowledged channel binds its address, and so does the sender of any other;
 the rest connect, in any order. See `catstream.wire.endpoint` for what the addresses are.
@@ -16,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from catstream.messages import End, Features, Health, Model, Sample, Track
+from catstream.messages import Answer, Command, End, Features, Health, Model, Sample, Track
 
 __all__ = ["CHANNELS", "PORT", "Channel"]
 
@@ -30,7 +31,7 @@ class Channel:
 
     name       the plural of what flows
     messages   kinds that it carries
-    senders    processes that send
+    senders    processes that send, or "anyone"
     receiver   the one process that every message is for, or None: whoever wants them
     keeps      "every" message, or the "newest"
     port       offset from the first port; each further sender takes the next one
@@ -47,7 +48,7 @@ class Channel:
 
     @property
     def acknowledged(self) -> bool:
-        """Whether each message is held until its receiver has stored it."""
+        """Whether each message is repeated until its one receiver has answered it."""
         return self.receiver is not None
 
     @property
@@ -66,5 +67,6 @@ CHANNELS: dict[str, Channel] = {
         Channel("tracks", (Track, End), ("detector",), None, "every", port=3, megabytes=1),
         Channel("results", (Track, End), ("detector",), "owner", "every", port=4, megabytes=1),
         Channel("health", (Health,), ("detector", "compressor", "trainer"), None, "newest", port=5, megabytes=1),
+        Channel("control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=1),
     )
 }

@@ -24,7 +24,20 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.errors import ProtocolError
-from catstream.messages import End, Features, Health, Model, Motion, Position, Sample, Stored, Summary, Track
+from catstream.messages import (
+    Answer,
+    Command,
+    End,
+    Features,
+    Health,
+    Model,
+    Motion,
+    Position,
+    Sample,
+    Stored,
+    Summary,
+    Track,
+)
 
 __all__ = ["KINDS", "VERSION", "decode", "encode", "opening"]
 
@@ -33,7 +46,8 @@ VERSION = 1
 
 #: Kinds of message, by their name on the wire.
 KINDS: dict[str, type] = {
-    kind.__name__.lower(): kind for kind in (End, Features, Health, Model, Position, Sample, Stored, Track)
+    kind.__name__.lower(): kind
+    for kind in (Answer, Command, End, Features, Health, Model, Position, Sample, Stored, Track)
 }
 
 _F32, _F64 = np.dtype("<f4"), np.dtype("<f8")
@@ -179,6 +193,8 @@ def _check(message: Any) -> None:
         widths = [len(tree.mean) if tree is not None else d + 2 for tree in trees]
         if widths != [d, d + 2, d + 2]:
             raise ProtocolError(f"sample: expected trees of d, d, d + 2 and d + 2 columns, got {[d, *widths]}")
+    if isinstance(message, Command) and (message.box is not None) != (message.verb == "set-box"):
+        raise ProtocolError(f"command: expected a box with set-box and with nothing else, got {message.verb!r}")
 
 
 def _check_array(array: np.ndarray, kind: type, name: str, where: str, lengths: dict[str, int]) -> None:

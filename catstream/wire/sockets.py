@@ -10,6 +10,9 @@ The other channels (`Publisher`, `Subscriber`) never wait for a reader. Where th
 counts, the last message is sent again to everyone who comes late, and once to all when
 nothing newer followed: a burst may have cost a reader the last of it. So a reader must take
 the same message twice calmly.
+
+Commands (`Requester`, `Responder`) are asked again until they are answered. The responder
+remembers its answers, so that a command whose answer was lost is not carried out twice.
 """
 
 from __future__ import annotations
@@ -24,18 +27,19 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from catstream.errors import ProtocolError, ServiceError
-from catstream.messages import End, Position, Stored
+from catstream.messages import Answer, Command, End, Position, Stored
 from catstream.wire.channels import CHANNELS, Channel
 from catstream.wire.codec import decode, encode, opening
 from catstream.wire.endpoint import Endpoint
 
-__all__ = ["Publisher", "Receiver", "Sender", "Subscriber"]
+__all__ = ["Publisher", "Receiver", "Requester", "Responder", "Sender", "Subscriber"]
 
 _HELLO = b""
 _PATIENCE = 0.2  # seconds of silence after which a sender asks where the receiver is, a publisher says it once more
 _LINGER = 2000  # milliseconds that a closed socket still has for its last messages
 _NEWEST = 8  # messages of a burst that are on their way at once where only the newest counts
 _SAMPLES = 65536  # that a sender remembers, at most one a message: as many as `lag_frames` may be
+_COMMANDS = 64  # that wait, or were answered last, and that are taken in at once
 _TRACKS = 1000  # messages that a slow reader of a channel that keeps every message may fall behind
 
 _log = logging.getLogger(__name__)
@@ -345,6 +349,69 @@ class Subscriber(_Socket):
         while (message := self.receive(0)) is not None:
             messages.append(message)
         return messages
+
+
+class Requester(_Socket):
+    """Sends commands, one at a time, and waits for the answer to each."""
+
+    def __init__(self, channel: str, endpoint: Endpoint) -> None:
+        super().__init__(zmq.DEALER, channel, endpoint, depth=_COMMANDS)
+        self._socket.linger = 0  # a command that nobody took is given up
+        self._socket.immediate = True
+        self._connect()
+
+    def ask(self, command: Command, seconds: float) -> Answer | None:
+        """The answer to a command, asked again until it comes; None where none came in time."""
+        data, deadline = encode(command), monotonic() + seconds
+        while (left := deadline - monotonic()) > 0:
+            with contextlib.suppress(zmq.Again):  # nobody there yet
+                self._socket.send(data, zmq.NOBLOCK)
+            until = monotonic() + min(left, _PATIENCE)
+            while (left := until - monotonic()) > 0:
+                answer = self._decode(self._socket.recv(), Answer) if self._wait(left) else None
+                if answer is not None and answer.id == command.id:  # not a late one to the command before
+                    return answer
+        return None
+
+
+class Responder(_Socket):
+    """Hears commands and answers them, whoever sends them; it binds."""
+
+    def __init__(self, channel: str, endpoint: Endpoint) -> None:
+        super().__init__(zmq.ROUTER, channel, endpoint, depth=_COMMANDS)
+        self._asking: dict[str, bytes] = {}  # who asked last, by the command that was not answered yet
+        self._answers: dict[str, bytes] = {}  # the last ones, by their command
+        self._bind()
+
+    def waiting(self) -> list[Command]:
+        """Commands that came since, oldest first; each is to be answered. One that comes again is not among them."""
+        commands = []
+        for _ in range(_COMMANDS):  # more wait for the next turn: a flood stops nothing
+            if not self._wait(0):
+                break
+            peer, *parts = self._socket.recv_multipart(copy=False)  # a stranger may send any number
+            command = self._decode(parts[0].buffer if len(parts) == 1 else b"", Command)
+            if command is None:
+                continue
+            if (answer := self._answers.get(command.id)) is not None:
+                self._send(peer.bytes, answer)
+            elif command.id in self._asking or len(self._asking) < _COMMANDS:
+                if command.id not in self._asking:
+                    commands.append(command)
+                self._asking[command.id] = peer.bytes
+        return commands
+
+    def answer(self, answer: Answer) -> None:
+        """Answer a command, now and whenever it comes again."""
+        self._answers[answer.id] = data = encode(answer)
+        if len(self._answers) > _COMMANDS:
+            del self._answers[next(iter(self._answers))]
+        if (peer := self._asking.pop(answer.id, None)) is not None:
+            self._send(peer, data)
+
+    def _send(self, peer: bytes, data: bytes) -> None:
+        with contextlib.suppress(zmq.Again):  # one that does not listen asks again
+            self._socket.send_multipart([peer, data], zmq.NOBLOCK)
 
 
 def _hear(monitor: Any, event: int) -> None:

@@ -17,7 +17,7 @@ from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
 
 FRAMES, SIZE = 160, (320, 240)
-PORTS = sum(len(channel.senders) for channel in CHANNELS.values())
+PORTS = max(channel.port + len(channel.senders) for channel in CHANNELS.values())
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,20 @@ from hypothesis import strategies as st
 
 from catstream.box import Box
 from catstream.errors import ProtocolError
-from catstream.messages import End, Features, Health, Model, Motion, Position, Sample, Stored, Summary, Track
+from catstream.messages import (
+    Answer,
+    Command,
+    End,
+    Features,
+    Health,
+    Model,
+    Motion,
+    Position,
+    Sample,
+    Stored,
+    Summary,
+    Track,
+)
 from catstream.wire.codec import KINDS, VERSION, decode, encode
 
 
@@ -26,6 +39,8 @@ def summary(columns: int) -> Summary:
 
 
 EXAMPLES = {
+    "answer": Answer("7f", True, "followed from frame 9 on", 9, Box(4.5, 3.0, 20.0, 10.0), 4),
+    "command": Command("7f", "set-box", Box(4.5, 3.0, 20.0, 10.0), True),
     "end": End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),
     "features": Features(3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5), array(1)),
     "health": Health("trainer", 1.7e9, {"version": 4.0}),
@@ -98,6 +113,9 @@ def test_a_message_of_another_kind_is_refused(message):
 
 
 REFUSED = {
+    "a verb that is none": packed("command", verb="format"),
+    "a box that nothing is done with": packed("command", verb="stop"),
+    "set-box without a box": packed("command", box=None),
     "a dtype that is not promised": packed("features", rows=plain("<f8", [3, 5], bytes(120))),
     "objects": packed("features", rows=plain("|O", [3, 5], bytes(120))),
     "another width of its labels": packed("features", labels=plain("<f4", [2], bytes(8))),

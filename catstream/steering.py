@@ -1,0 +1,100 @@
+"""Steer a running pipeline: another object, a pause, what was learned, the end.
+
+    import catstream
+
+    with catstream.control("run") as pipeline:
+        pipeline.set_box((120, 80, 64, 48))
+
+Each command is asked again until it is answered, and carried out once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+from uuid import uuid4
+
+from catstream.box import Box
+from catstream.errors import RefusedError, SilenceError
+from catstream.messages import Answer, Command, Verb
+from catstream.wire.endpoint import find
+from catstream.wire.sockets import Requester
+
+__all__ = ["Control", "control"]
+
+
+class Control:
+    """The helm of one running pipeline; close it, or use it in a `with`. Any number may hold one.
+
+    endpoint : where it is attached
+    timeout : seconds that a command may take
+
+    Raises
+    ------
+    RefusedError
+        From each command, where the pipeline says why it is not carried out.
+    SilenceError
+        From each command, where no answer came in time; one that is on its way may still be carried out.
+    """
+
+    def __init__(self, endpoint: str = "", *, timeout: float = 5.0) -> None:
+        place = find(endpoint)
+        self.endpoint, self.timeout = str(place), timeout
+        self._commands = Requester("control", place)
+
+    def set_box(self, box: Sequence[float], *, keep: bool = False) -> Answer:
+        """Say where the object is in the newest frame: x, y, w, h in pixels.
+
+        It is another object, and what was learned of the one before is forgotten; with `keep`
+        it is the same one, found again for the tracker. A paused pipeline follows this frame, and stays paused.
+        """
+        return self._ask("set-box", Box(*map(float, box)), keep)
+
+    def pause(self) -> Answer:
+        """Stop taking frames; those of a live source pass by and are counted as skipped."""
+        return self._ask("pause")
+
+    def resume(self) -> Answer:
+        """Take frames again."""
+        return self._ask("resume")
+
+    def stop(self) -> Answer:
+        """End the stream as if the source had come to its end: all that was learned is stored first."""
+        return self._ask("stop")
+
+    def close(self) -> None:
+        """Let go; the pipeline goes on."""
+        self._commands.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _ask(self, verb: Verb, box: Box | None = None, keep: bool = False) -> Answer:
+        answer = self._commands.ask(Command(uuid4().hex, verb, box, keep), self.timeout)
+        if answer is None:
+            raise SilenceError(
+                f"nothing at {self.endpoint} answered {verb} within {self.timeout:g} s: is a pipeline running there, "
+                "and does it go on (catstream status)?"
+            )
+        if not answer.done:
+            raise RefusedError(f"{verb}: {answer.reason}")
+        return answer
+
+
+def control(endpoint: str = "", *, timeout: float = 5.0) -> Control:
+    """Take the helm of a running pipeline.
+
+    Parameters
+    ----------
+    endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
+    timeout : seconds that a command may take
+
+    Raises
+    ------
+    ServiceError
+        Where `endpoint` is empty and not just one pipeline runs.
+    """
+    return Control(endpoint, timeout=timeout)

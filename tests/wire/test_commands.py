@@ -1,0 +1,165 @@
+"""Commands and their answers: each is carried out once, whatever gets lost, and whoever else talks."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from threading import Event
+
+import pytest
+import zmq
+
+from catstream.box import Box
+from catstream.errors import ProtocolError, RefusedError, SilenceError
+from catstream.messages import Answer, Command
+from catstream.steering import Control
+from catstream.wire.channels import CHANNELS
+from catstream.wire.codec import decode, encode
+from catstream.wire.sockets import Requester, Responder
+
+PAUSE = Command("one", "pause")
+
+
+@contextmanager
+def answering(endpoint, answer):
+    """Answers commands in a thread; gives the responder, and a list of the commands as they come."""
+    heard, over = [], Event()
+
+    def serve():
+        while not over.wait(0.01):
+            for command in responder.waiting():
+                heard.append(command)
+                responder.answer(answer(command))
+
+    with Responder("control", endpoint) as responder, ThreadPoolExecutor(1) as pool:
+        serving = pool.submit(serve)
+        try:
+            yield responder, heard
+        finally:
+            over.set()
+            serving.result(20)
+
+
+def done(command):
+    return Answer(command.id, True, "so it is", 7, Box(1.0, 2.0, 3.0, 4.0), 5)
+
+
+@pytest.fixture
+def raw(endpoint):
+    """A client that speaks ZeroMQ only."""
+    with zmq.Context.instance().socket(zmq.DEALER) as client:
+        client.linger = 0
+        client.connect(endpoint.address(CHANNELS["control"]))
+        yield client
+
+
+def test_a_command_gets_its_answer(endpoint):
+    with answering(endpoint, done) as (_, heard), Requester("control", endpoint) as requester:
+        assert requester.ask(PAUSE, 20) == done(PAUSE)
+    assert heard == [PAUSE]
+
+
+def test_who_asks_before_anybody_is_there_is_answered_once_somebody_is(endpoint):
+    with ThreadPoolExecutor(1) as pool, Requester("control", endpoint) as requester:
+        assert requester.ask(PAUSE, 0.3) is None
+        answer = pool.submit(requester.ask, PAUSE, 20)
+        with answering(endpoint, done) as (_, heard):
+            assert answer.result(20) == done(PAUSE)
+    assert heard == [PAUSE]
+
+
+def test_a_command_that_comes_again_is_answered_again_and_carried_out_once(endpoint, raw, until):
+    with Responder("control", endpoint) as responder:
+        heard = []
+        for _ in range(3):  # on its way when the first is taken, and after its answer
+            raw.send(encode(PAUSE))
+        until(lambda: heard, lambda: heard.extend(responder.waiting()))
+        until(lambda: not heard[1:] and not raw.poll(20), lambda: heard.extend(responder.waiting()))
+        responder.answer(done(PAUSE))
+        raw.send(encode(PAUSE))
+        answers = []
+
+        def turn():
+            heard.extend(responder.waiting())
+            answers.extend([decode(raw.recv(), Answer)] if raw.poll(20) else [])
+
+        until(lambda: len(answers) == 2, turn)
+    assert heard == [PAUSE]
+    assert answers == [done(PAUSE)] * 2
+
+
+def test_of_two_who_ask_each_gets_its_own_answer(endpoint):
+    with (
+        answering(endpoint, done),
+        Requester("control", endpoint) as one,
+        Requester("control", endpoint) as two,
+        ThreadPoolExecutor(2) as pool,
+    ):
+        answers = [pool.submit(who.ask, Command(name, "pause"), 20) for name, who in (("one", one), ("two", two))]
+        assert [answer.result().id for answer in answers] == ["one", "two"]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [[b""], [b"\xc1"], [b"", b"", b""], [encode(PAUSE), b"more"], [encode(done(PAUSE))]],
+    ids=["nothing", "no msgpack", "many parts", "two parts", "an answer"],
+)
+def test_what_is_no_command_is_counted_and_the_next_one_is_answered(endpoint, raw, parts):
+    with answering(endpoint, done) as (responder, heard):
+        raw.send_multipart(parts)
+        raw.send(encode(PAUSE))
+        assert raw.poll(20_000)
+        assert decode(raw.recv(), Answer) == done(PAUSE)
+    assert heard == [PAUSE]
+    assert responder.refused == 1
+
+
+def test_a_flood_of_commands_is_bounded_and_those_that_were_dropped_may_come_again(endpoint, raw, until):
+    with Responder("control", endpoint) as responder:
+        heard = []
+        for number in range(60):
+            raw.send(encode(Command(f"{number}", "pause")))
+        until(lambda: len(heard) == 60, lambda: heard.extend(responder.waiting()))
+        for number in range(60, 100):
+            raw.send(encode(Command(f"{number}", "pause")))
+        until(lambda: len(heard) == 64 and not responder._wait(0.1), lambda: heard.extend(responder.waiting()))
+        for command in heard:
+            responder.answer(done(command))
+        raw.send(encode(Command("99", "pause")))
+        until(lambda: heard[-1].id == "99", lambda: heard.extend(responder.waiting()))
+    assert len(heard) == 65
+
+
+def test_the_helm_sends_each_command_with_an_id_of_its_own(endpoint):
+    with answering(endpoint, done) as (_, heard), Control(str(endpoint), timeout=20) as control:
+        for answer in (control.set_box((1, 2, 3, 4), keep=True), control.pause(), control.resume(), control.stop()):
+            assert (answer.done, answer.frame) == (True, 7)
+    assert len({command.id for command in heard}) == 4
+    assert [(command.verb, command.box, command.keep) for command in heard] == [
+        ("set-box", Box(1, 2, 3, 4), True), ("pause", None, False), ("resume", None, False), ("stop", None, False),
+    ]  # fmt: skip
+
+
+def test_what_is_refused_says_why(endpoint):
+    def refuse(command):
+        return Answer(command.id, False, "it is no time for that")
+
+    with (
+        answering(endpoint, refuse),
+        Control(str(endpoint), timeout=20) as control,
+        pytest.raises(RefusedError, match=r"^pause: it is no time for that$"),
+    ):
+        control.pause()
+
+
+def test_where_nobody_answers_it_says_so(endpoint):
+    with (
+        Control(str(endpoint), timeout=0.3) as control,
+        pytest.raises(SilenceError, match=r"answered stop within 0\.3 s: is a pipeline running there"),
+    ):
+        control.stop()
+
+
+def test_a_box_that_cannot_travel_is_refused_before_it_is_sent(endpoint):
+    with Control(str(endpoint)) as control, pytest.raises(ProtocolError, match="above 0"):
+        control.set_box((1, 2, 0, 4))
