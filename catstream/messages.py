@@ -177,6 +177,7 @@ class Track:
     box            where, in pixels of the frame; None while absent
     score          confidence: about 0 on background, about 1 on the object
     model_version  the model that scored it, 0 before the first
+    pts            time stamp of the frame in a live stream, seconds of a clock of the stream's own; None of a file
     """
 
     seq: int
@@ -186,6 +187,7 @@ class Track:
     box: Box | None
     score: float
     model_version: int
+    pts: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

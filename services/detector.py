@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import ExitStack
+from dataclasses import replace
 
 from catstream.box import Box
 from catstream.detection.detector import Detector
@@ -64,7 +65,7 @@ def main(
                     track, features = detector.step(frame.image, frame.time)
                 else:
                     track, features = detector.init(frame.image, box, frame.time)
-                line.send(track, features)
+                line.send(replace(track, pts=frame.pts), features)
                 if not frames.live:
                     line.wait(detector)
                 if process.ended:

@@ -22,11 +22,13 @@ class Frame:
     number  0, 1, 2 ... of the frames that the source gives, which are not all of a live one, or of a part
     time    seconds since the start of the video; of a live source, when this frame came
     image   uint8 (h, w, 3), blue green red; grey is expanded
+    pts     time stamp of the frame in a live stream, seconds of a clock of the stream's own; None of a file
     """
 
     number: int
     time: float
     image: np.ndarray
+    pts: float | None = None
 
 
 class Source(ABC):

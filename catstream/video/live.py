@@ -126,7 +126,7 @@ class LiveSource(Source):
         if size != self.size:
             image = cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
         self._zero = moment if self._zero is None else self._zero
-        frame = Frame(self._number, max(0.0, moment - self._zero), image)
+        frame = Frame(self._number, max(0.0, moment - self._zero), image, decoded.time)
         self._number += 1
         return frame
 

@@ -48,7 +48,7 @@ EXAMPLES = {
     "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2),
     "sample": Sample(4, 20, summary(5), summary(5), summary(7), summary(7), np.array([[1.0, 2.0], [np.nan, np.nan]])),
     "stored": Stored(5, 7, 2),
-    "track": Track(3, 2, 0.08, "present", Box(4.5, 3.0, 20.0, 10.0), 0.75, 4),
+    "track": Track(3, 2, 0.08, "present", Box(4.5, 3.0, 20.0, 10.0), 0.75, 4, 1234.5),
 }
 MESSAGES = pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
 ALL = tuple(KINDS.values())
