@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"errors"},
     {"box"},
-    {"messages", "settings", "ridge"},
+    {"messages", "settings", "ridge", "html"},
     {"detection", "compression", "training", "wire", "video"},
     {"tracker", "subscription", "steering"},
     {"services"},

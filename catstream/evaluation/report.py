@@ -4,40 +4,23 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
-from catstream.errors import VideoError
 from catstream.evaluation.films import Film, film_of, worst
 from catstream.evaluation.metrics import OVERLAPS, PIXELS, precision_plot, success_plot
-from catstream.evaluation.plots import plot
 from catstream.evaluation.runs import Run
 from catstream.evaluation.summary import Row, mean_of, rows_of
+from catstream.html.page import table, write_page
+from catstream.html.plots import SHARES, Axis, plot
 from catstream.settings import Settings
 
 __all__ = ["write_report"]
 
 _FILMS = 8
-
-_STYLE = """
-:root { color-scheme: light dark; --line: #8884; --soft: #8881; }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1060px; margin: 2.5rem auto; padding: 0 1rem; }
-h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; }
-p.about, figcaption { opacity: .75; margin: .2rem 0; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: .22rem .55rem; text-align: right; border-bottom: 1px solid var(--line); }
-th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; }
-tr.mean td { font-weight: 600; } small { opacity: .65; }
-.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(380px, 1fr)); gap: 1.2rem; }
-svg text { font-size: 12px; fill: currentColor; } svg .title { font-size: 14px; font-weight: 600; }
-svg .grid { stroke: var(--line); }
-.film { display: flex; gap: .5rem; overflow-x: auto; padding-bottom: .4rem; }
-.film figure { margin: 0; } .film img { display: block; border-radius: 4px; }
-.film figcaption { font-size: 12px; }
-pre { background: var(--soft); padding: .8rem; border-radius: 6px; overflow-x: auto; }
-"""
 
 
 def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
@@ -65,56 +48,47 @@ def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
         "<h2>Settings that are not the default</h2>",
         f"<pre>{escape(chr(10).join(f'{name} = {value!r}' for name, value in changed.items()) or 'none')}</pre>",
     ]
-    page = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>catstream: evaluation</title>\n'
-        f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>\n<body>\n'
-        + "\n".join(part for part in body if part)
-        + "\n</body></html>\n"
-    )
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise VideoError(f"cannot write the report {str(path)!r} ({error.strerror}): give another folder") from None
-    return path
+    return write_page(path, "evaluation", body)
 
 
 def _plots(runs: list[Run]) -> str:
     """Success and precision, averaged over the runs of each tracker."""
 
-    def curves(measure: Callable[..., np.ndarray], at: Callable[[np.ndarray], float]) -> dict[str, np.ndarray]:
+    def curves(
+        places: np.ndarray, measure: Callable[..., np.ndarray], at: Callable[[np.ndarray], float]
+    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         trackers = dict.fromkeys(run.tracker for run in runs)
         means = {
             tracker: np.mean([measure(run.boxes, run.truth) for run in runs if run.tracker == tracker], axis=0)
             for tracker in trackers
         }
         ranked = sorted(means.items(), key=lambda item: -at(item[1]))
-        return {f"{tracker}  {at(curve):.3f}": curve for tracker, curve in ranked}
+        return {f"{tracker}  {at(curve):.3f}": (places, curve) for tracker, curve in ranked}
 
-    success = plot(
-        "Success (AUC)", "overlap threshold", OVERLAPS, curves(success_plot, lambda curve: float(curve.mean()))
+    overlap, distance = replace(SHARES, label="overlap threshold"), Axis.upto(PIXELS[-1], "distance in pixels")
+    success = curves(OVERLAPS, success_plot, lambda curve: float(curve.mean()))
+    precision = curves(PIXELS, precision_plot, lambda curve: float(curve[20]))
+    pair = plot("Success (AUC)", overlap, SHARES, success) + plot(
+        "Precision (at 20 pixels)", distance, SHARES, precision
     )
-    precision = plot(
-        "Precision (at 20 pixels)", "distance in pixels", PIXELS, curves(precision_plot, lambda curve: float(curve[20]))
-    )
-    return f'<div class="plots">{success}{precision}</div>'
+    return f'<div class="plots">{pair}</div>'
 
 
 def _table(rows: list[Row]) -> str:
     heads = ("sequence", "tracker", "frames", "AUC", "success", "precision", "norm. precision", "F", "frames/s")
-    lines = [f"<tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>"]
+    lines = []
     for row in rows:
         auc, success = _share(row.auc), _share(row.success)
         if row.starts > 1:
             auc += f" <small>±{row.auc_spread:.3f}</small>"
             success += f" <small>±{row.success_spread:.3f}</small>"
         rest = (row.precision, row.normalised_precision, row.f_score)
-        cells = [escape(row.name), row.tracker, row.frames, auc, success, *map(_share, rest), f"{row.fps:.0f}"]
-        lines.append(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
-    for tracker, mean in mean_of(rows).items():
+        lines.append([escape(row.name), row.tracker, row.frames, auc, success, *map(_share, rest), f"{row.fps:.0f}"])
+    means = mean_of(rows)
+    for tracker, mean in means.items():
         shares = [_share(mean[name]) for name in ("auc", "success", "precision", "normalised_precision", "f_score")]
-        cells = ["mean", tracker, "", *shares, f"{mean['fps']:.0f}"]
-        lines.append(f'<tr class="mean">{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>')
-    return f"<table>\n{chr(10).join(lines)}\n</table>"
+        lines.append(["mean", tracker, "", *shares, f"{mean['fps']:.0f}"])
+    return table(heads, lines, texts=2, means=len(means))
 
 
 def _share(value: float | None) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from click.testing import CliRunner
 from catstream.cli.evaluate import evaluate
 from catstream.errors import VideoError
 from catstream.evaluation.films import film_of, worst
-from catstream.evaluation.plots import plot
 from catstream.evaluation.report import write_report
 from catstream.evaluation.runs import Run
 from catstream.settings import Settings
@@ -29,18 +27,6 @@ def lost(sequence, found) -> Run:
     boxes = found.copy()
     boxes[3:, :2] += 60
     return run_of(sequence, boxes)
-
-
-def test_a_plot_is_one_svg_with_a_line_a_curve():
-    curves = {"a & b": np.linspace(1, 0, 21), "<c>": np.linspace(0.5, 0, 21)}
-    tree = ElementTree.fromstring(plot("Success", "threshold", np.linspace(0, 1, 21), curves))
-    lines = [line for line in tree.iter() if line.tag.endswith("polyline")]
-    assert len(lines) == 2
-    first = [tuple(map(float, point.split(","))) for point in lines[0].get("points", "").split()]
-    assert len(first) == 21
-    assert first[0][0] < first[-1][0]
-    assert first[0][1] < first[-1][1]  # down the page
-    assert "a & b" in [text.text for text in tree.iter() if text.tag.endswith("text")]
 
 
 def test_a_film_shows_the_frames_around_the_loss(lost):

@@ -1,0 +1,1 @@
+"""Pages of one file that need nothing else, and the plots on them."""

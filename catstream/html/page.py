@@ -1,0 +1,69 @@
+"""A page: one HTML file with all in it, that opens anywhere, light or dark, wide or narrow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from html import escape
+from pathlib import Path
+
+from catstream.errors import VideoError
+
+__all__ = ["table", "write_page"]
+
+_STYLE = """
+:root { color-scheme: light dark; --line: #8884; --soft: #8881; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1060px; margin: 2.5rem auto; padding: 0 1rem; }
+h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; }
+p.about, figcaption { opacity: .75; margin: .2rem 0; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
+th, td { padding: .22rem .55rem; text-align: right; border-bottom: 1px solid var(--line); }
+th.text, td.text { text-align: left; }
+tr.mean td { font-weight: 600; } small { opacity: .65; }
+.good { color: #2f9e44; } .bad { color: #e03131; font-weight: 600; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(380px, 100%), 1fr)); gap: 1.2rem; }
+svg text { font-size: 12px; fill: currentColor; } svg .title { font-size: 14px; font-weight: 600; }
+svg .grid { stroke: var(--line); }
+.film { display: flex; gap: .5rem; overflow-x: auto; padding-bottom: .4rem; }
+.film figure { margin: 0; } .film img { display: block; border-radius: 4px; }
+.film figcaption { font-size: 12px; }
+pre { background: var(--soft); padding: .8rem; border-radius: 6px; overflow-x: auto; }
+"""
+
+
+def table(heads: Iterable[str], rows: Iterable[Iterable[object]], *, texts: int = 1, means: int = 0) -> str:
+    """A table of cells that are HTML already; the first `texts` columns hold text, the last `means` rows stand out."""
+
+    def line(kind: str, cells: Iterable[object]) -> str:
+        return "".join(
+            f'<{kind} class="text">{cell}</{kind}>' if number < texts else f"<{kind}>{cell}</{kind}>"
+            for number, cell in enumerate(cells)
+        )
+
+    lines = [line("td", row) for row in rows]
+    marked = [f"<tr>{row}</tr>" for row in lines[: len(lines) - means]]
+    marked += [f'<tr class="mean">{row}</tr>' for row in lines[len(lines) - means :]]
+    return "\n".join(
+        ['<div class="wide"><table>', f"<tr>{line('th', map(escape, heads))}</tr>", *marked, "</table></div>"]
+    )
+
+
+def write_page(path: Path, title: str, body: Iterable[str]) -> Path:
+    """Write a page of these parts, the empty ones left out.
+
+    Raises
+    ------
+    VideoError
+        Where the file cannot be written.
+    """
+    page = (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>catstream: {escape(title)}</title>\n'
+        f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>\n<body>\n'
+        + "\n".join(part for part in body if part)
+        + "\n</body></html>\n"
+    )
+    try:
+        path.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise VideoError(f"cannot write the report {str(path)!r} ({error.strerror}): give another folder") from None
+    return path

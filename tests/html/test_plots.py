@@ -1,0 +1,43 @@
+"""Plots: one SVG each, curves where they belong, and nothing over them."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from catstream.html.plots import SHARES, Axis, plot
+
+
+def parsed(svg):
+    """Points of each curve, and all texts."""
+    parts = list(ElementTree.fromstring(svg).iter())
+    lines = [part.get("points", "").split() for part in parts if part.tag.endswith("polyline")]
+    texts = [part.text for part in parts if part.tag.endswith("text")]
+    return [[tuple(map(float, point.split(","))) for point in line] for line in lines], texts
+
+
+def test_a_plot_is_one_svg_with_a_line_a_curve():
+    places = np.linspace(0, 1, 21)
+    curves = {"a & b": (places, np.linspace(1, 0, 21)), "<c>": (places, np.linspace(0.5, 0, 21))}
+    (first, second), texts = parsed(plot("Success", SHARES, SHARES, curves))
+    assert len(first) == len(second) == 21
+    assert first[0][0] < first[-1][0]
+    assert first[0][1] < first[-1][1]  # down the page
+    assert {"Success", "a & b", "<c>", "0.2", "1.0"} <= set(texts)
+
+
+def test_a_value_that_is_not_known_leaves_a_gap():
+    ys = np.array([1.0, 2.0, np.nan, np.nan, 4.0, 3.0])
+    lines, _ = parsed(plot("Lag", Axis.upto(5), Axis.upto(4), {"": (np.arange(6.0), ys)}))
+    assert [len(line) for line in lines] == [2, 2]
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-4, 0.031, 0.7, 1.0, 4.9, 10.0, 12.0, 99.0, 5e6])
+def test_an_axis_holds_its_value_and_has_two_to_six_ticks_up_to_its_end(value):
+    axis = Axis.upto(value)
+    assert value <= axis.high * (1 + 1e-6)
+    assert axis.ticks[0][0] == 0
+    assert axis.ticks[-1][0] == axis.high
+    assert 2 <= len(axis.ticks) <= 6
