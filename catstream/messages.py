@@ -26,6 +26,7 @@ __all__ = [
     "Model",
     "Motion",
     "Position",
+    "Run",
     "Sample",
     "State",
     "Stored",
@@ -202,6 +203,18 @@ class Health:
     process: str
     time: float
     counters: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a pipeline runs with: who keeps its features can learn from them once more, detector -> anyone.
+
+    program   version of catstream
+    settings  name -> value of all settings but `endpoint`, each as the text that `--set` takes
+    """
+
+    program: str
+    settings: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)

@@ -257,9 +257,13 @@ class Settings:
         >>> Settings(lockstep=True, coreset_size=32).changed()
         ['lockstep=true', 'coreset_size=32']
         """
-        pairs = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
-        texts = ((field, value if isinstance(value, str) else json.dumps(value)) for field, value in pairs)
-        return [f"{field.name}={text}" for field, text in texts if getattr(self, field.name) != field.default]
+        fields, texts = dataclasses.fields(self), self.texts()
+        return [f"{field.name}={texts[field.name]}" for field in fields if getattr(self, field.name) != field.default]
+
+    def texts(self) -> dict[str, str]:
+        """All of them as texts, by name; `of` reads them."""
+        values = self.values().items()
+        return {name: value if isinstance(value, str) else json.dumps(value) for name, value in values}
 
 
 _PAPER = {

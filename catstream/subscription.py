@@ -17,7 +17,7 @@ from time import monotonic
 from typing import Generic, Literal, Self, TypeVar, overload
 
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import End, Health, Model, Sample, Track
+from catstream.messages import End, Features, Health, Model, Run, Sample, Track
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import find
 from catstream.wire.sockets import Subscriber
@@ -27,21 +27,25 @@ __all__ = ["Subscription", "subscribe"]
 #: Seconds that the last messages have to come in after the end was heard: it travels by itself.
 _LAST_WORDS = 0.5
 
-_OPEN = [name for name, channel in CHANNELS.items() if not channel.acknowledged]
+#: What one can subscribe to, and its channel: of features, that of the copies.
+_OPEN = {
+    **{name: name for name, channel in CHANNELS.items() if not channel.acknowledged and name != "lessons"},
+    "features": "lessons",
+}
 
-Message = TypeVar("Message", bound=Track | Model | Health | Sample)
+Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features)
 
 
 class Subscription(Generic[Message]):
     """Messages of one channel of a running pipeline, from now until its end; iterate it, with `for` or `async for`.
 
-    Tracks come one a frame, a restarted detector may repeat some. Of models, samples and the
+    Tracks and features come one a frame, a restarted detector may repeat some. Of models, samples and the
     health of each process the last one comes at once, then each that is the newest when it is
     taken. Before the pipeline is there, and while it is away, it waits.
 
     Attributes
     ----------
-    missed : tracks that never came, as the gaps in `seq` tell: this reader was too slow, or away
+    missed : tracks or features that never came, as the gaps in `seq` tell: this reader was too slow, or away
     refused : messages that were dropped because they were not what the channel carries
     end : the pipeline's `End`, None before it
     endpoint : where it is attached
@@ -61,11 +65,11 @@ class Subscription(Generic[Message]):
         self.endpoint, self.timeout = str(place), timeout
         self.missed = 0
         self.end: End | None = None
-        self._channel, self._seq = channel, 0
+        self._what, self._channel, self._seq = channel, CHANNELS[_OPEN[channel]], 0
         self._newest: dict[str, float] = {}  # of each process that sends: what was taken last
         self._closing = float("inf")  # when to wait no more
-        self._messages = Subscriber(channel, place)
-        # By itself: a reader that is so slow that tracks are dropped would miss the end among them.
+        self._messages = Subscriber(self._channel.name, place)
+        # By itself: a reader that is so slow that messages are dropped would miss the end among them.
         self._ends = Subscriber("tracks", place, only=End)
 
     @property
@@ -127,7 +131,7 @@ class Subscription(Generic[Message]):
         while self._messages.pending():
             message = self._messages.receive(0)
             if isinstance(message, End):
-                if self._channel == "tracks":  # nothing is on its way behind it
+                if self._channel.keeps == "every":  # nothing is on its way behind it
                     self.end, self._closing = message, 0.0
                     return None
             elif message is not None and self._new(message):
@@ -140,7 +144,9 @@ class Subscription(Generic[Message]):
 
     def _new(self, message: Message) -> bool:
         """Whether it did not come before: a channel's last message is sent again when somebody new comes."""
-        if isinstance(message, Track):
+        if isinstance(message, Run):
+            return False
+        if isinstance(message, Track | Features):
             self._count(message.seq)
             return True
         name, mark = (message.process, message.time) if isinstance(message, Health) else ("", message.version)
@@ -156,7 +162,7 @@ class Subscription(Generic[Message]):
     def _ended(self) -> bool:
         if self.end is None or monotonic() < self._closing:
             return False
-        if self._channel == "tracks":
+        if self._channel.keeps == "every":
             self._count(self.end.seq)
         return True
 
@@ -168,7 +174,7 @@ class Subscription(Generic[Message]):
         now = monotonic()
         if now >= patience and self.end is None:
             raise SilenceError(
-                f"no {self._channel} came from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
+                f"no {self._what} came from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
             )
         until = min(patience if self.end is None else float("inf"), self._closing)
         return None if until == float("inf") else max(0.0, until - now)
@@ -182,13 +188,17 @@ def subscribe(endpoint: str, channel: Literal["models"], *, timeout: float | Non
 def subscribe(endpoint: str, channel: Literal["health"], *, timeout: float | None = ...) -> Subscription[Health]: ...
 @overload
 def subscribe(endpoint: str, channel: Literal["samples"], *, timeout: float | None = ...) -> Subscription[Sample]: ...
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["features"], *, timeout: float | None = ...
+) -> Subscription[Features]: ...
 def subscribe(endpoint: str, channel: str, *, timeout: float | None = None) -> Subscription:
     """Attach to a running pipeline.
 
     Parameters
     ----------
     endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
-    channel : "tracks", "models", "health" or "samples"
+    channel : "tracks", "models", "health", "samples" or "features"
     timeout : seconds without a message after which iterating raises `SilenceError`; None to wait for ever
 
     Raises

@@ -89,6 +89,7 @@ class _Line:
         self._features = stack.enter_context(Sender("features", endpoint, window))
         self._results = stack.enter_context(Sender("results", endpoint, window)) if owned else None
         self._tracks = stack.enter_context(Publisher("tracks", endpoint))
+        self._lessons = stack.enter_context(Publisher("lessons", endpoint, greeting=process.run))
         self.models = stack.enter_context(Subscriber("models", endpoint))
         self._senders = [self._features] + ([self._results] if self._results else [])
         self._lag = 0 if process.settings.lockstep else process.settings.lag_frames
@@ -121,6 +122,7 @@ class _Line:
         self._tracks.send(track)
         if self._results is not None:
             self._deliver(self._results, track)
+        self._lessons.send(features)
         self._deliver(self._features, features)
         self._process.beat(self._counters)
 
@@ -156,7 +158,8 @@ class _Line:
                 self._process.beat(self._counters)
             if sender is self._features:
                 totals = {"sent": float(seq), "stored": float(min(sender.stored, seq))}
-        self._tracks.send(End(seq + 1, reason, failed, totals))
+        for publisher in (self._tracks, self._lessons):
+            publisher.send(End(seq + 1, reason, failed, totals))
         self._process.beat(self._counters, now=True)
 
     def _deliver(self, sender: Sender, message: Track | Features | End, seconds: float = 0) -> None:

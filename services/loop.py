@@ -8,9 +8,10 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 
 from catstream.errors import CatstreamError
-from catstream.messages import Health
+from catstream.messages import Health, Run
 from catstream.settings import Settings
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
@@ -44,6 +45,13 @@ class Process:
     def ended(self) -> bool:
         """Whether it was asked to end."""
         return self.ended_for(0)
+
+    @property
+    def run(self) -> Run:
+        """What this pipeline runs with, for those who want to learn from its features once more."""
+        settings = self.settings.texts()
+        del settings["endpoint"]  # of this machine, and of no meaning to them
+        return Run(version("catstream"), settings)
 
     def ended_for(self, seconds: float) -> bool:
         """Whether it was asked to end, at least so long ago."""

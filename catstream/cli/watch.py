@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from catstream.box import Box
-from catstream.messages import Health, Model, Sample, Track
+from catstream.messages import Features, Health, Model, Sample, Track
 from catstream.subscription import Subscription, subscribe
 
 __all__ = ["watch"]
@@ -36,10 +36,14 @@ def _track(message: Track) -> dict[str, str]:
         "frame": f"{message.frame}",
         "seconds": f"{message.time:.2f}",
         "state": message.state,
-        "box": "-" if message.box is None else ", ".join(f"{side:.0f}" for side in message.box),
+        "box": _sides(message.box),
         "score": f"{message.score:+.2f}",
         "model": f"{message.model_version}",
     }
+
+
+def _sides(box: Box | None) -> str:
+    return "-" if box is None else ", ".join(f"{side:.0f}" for side in box)
 
 
 def _model(message: Model) -> dict[str, str]:
@@ -63,6 +67,19 @@ def _sample(message: Sample) -> dict[str, str]:
     }
 
 
+def _features(message: Features) -> dict[str, str]:
+    objects, background = int((message.labels == 1).sum()), int((message.labels == 0).sum())
+    return {
+        "frame": f"{message.frame}",
+        "box": _sides(message.box),
+        "rows": f"{len(message.rows)}",
+        "object": f"{objects}",
+        "background": f"{background}",
+        "near": f"{len(message.rows) - objects - background}",
+        "extents": f"{len(message.extents)}",
+    }
+
+
 def _health(message: Health) -> dict[str, str]:
     counters = (f"{name} {value:.0f}" for name, value in message.counters.items())
     return {"process": message.process, "counters": "  ".join(counters)}
@@ -74,6 +91,7 @@ _CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
     "models": _model,
     "health": _health,
     "samples": _sample,
+    "features": _features,
 }
 
 
@@ -94,6 +112,7 @@ def watch(channel: str, endpoint: str, as_json: bool, count: int | None) -> None
       models    what was learned: the last model, then the newest
       health    what each process counts, once a second
       samples   what the trainer learns from, and the levels of the object's tree
+      features  the rows that each frame teaches
 
     \b
     EXAMPLES

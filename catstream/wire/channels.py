@@ -7,6 +7,7 @@
     results    the tracks once more, acknowledged: for the one process that started the pipeline
     health     the newest of each process
     control    commands, each answered; who hears no answer asks again, and it is done once
+    lessons    the features once more, to any number of readers; nothing is sent where there is none
 
 The receiver of an acknowledged channel binds its address, and so does the sender of any other;
 the rest connect, in any order. See `catstream.wire.endpoint` for what the addresses are.
@@ -17,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from catstream.messages import Answer, Command, End, Features, Health, Model, Sample, Track
+from catstream.messages import Answer, Command, End, Features, Health, Model, Run, Sample, Track
 
 __all__ = ["CHANNELS", "PORT", "Channel"]
 
@@ -36,6 +37,7 @@ class Channel:
     keeps      "every" message, or the "newest"
     port       offset from the first port; each further sender takes the next one
     megabytes  size of the largest message
+    depth      where every message counts: how many a slow reader may fall behind before it loses some
     """
 
     name: str
@@ -45,6 +47,7 @@ class Channel:
     keeps: Literal["every", "newest"]
     port: int
     megabytes: int
+    depth: int = 1000
 
     @property
     def acknowledged(self) -> bool:
@@ -68,5 +71,6 @@ CHANNELS: dict[str, Channel] = {
         Channel("results", (Track, End), ("detector",), "owner", "every", port=4, megabytes=1),
         Channel("health", (Health,), ("detector", "compressor", "trainer"), None, "newest", port=5, megabytes=1),
         Channel("control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=1),
+        Channel("lessons", (Run, Features, End), ("detector",), None, "every", port=10, megabytes=64, depth=64),
     )
 }

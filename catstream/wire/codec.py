@@ -33,6 +33,7 @@ from catstream.messages import (
     Model,
     Motion,
     Position,
+    Run,
     Sample,
     Stored,
     Summary,
@@ -47,7 +48,7 @@ VERSION = 1
 #: Kinds of message, by their name on the wire.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind
-    for kind in (Answer, Command, End, Features, Health, Model, Position, Sample, Stored, Track)
+    for kind in (Answer, Command, End, Features, Health, Model, Position, Run, Sample, Stored, Track)
 }
 
 _F32, _F64 = np.dtype("<f4"), np.dtype("<f8")

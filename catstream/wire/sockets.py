@@ -40,7 +40,6 @@ _LINGER = 2000  # milliseconds that a closed socket still has for its last messa
 _NEWEST = 8  # messages of a burst that are on their way at once where only the newest counts
 _SAMPLES = 65536  # that a sender remembers, at most one a message: as many as `lag_frames` may be
 _COMMANDS = 64  # that wait, or were answered last, and that are taken in at once
-_TRACKS = 1000  # messages that a slow reader of a channel that keeps every message may fall behind
 
 _log = logging.getLogger(__name__)
 
@@ -281,12 +280,20 @@ class Receiver(_Socket):
 
 
 class Publisher(_Socket):
-    """Sends to anyone who listens, and waits for no one."""
+    """Sends to anyone who listens, and waits for no one.
 
-    def __init__(self, channel: str, endpoint: Endpoint, sender: str | None = None) -> None:
-        newest = CHANNELS[channel].keeps == "newest"
-        super().__init__(zmq.XPUB, channel, endpoint, depth=_NEWEST if newest else _TRACKS)
-        self._last: bytes | None = None
+    Parameters
+    ----------
+    sender : which of the channel's senders this is, where there are several
+    greeting : what everyone who comes gets first; on a channel that keeps every message
+    """
+
+    def __init__(self, channel: str, endpoint: Endpoint, sender: str | None = None, greeting: Any = None) -> None:
+        row = CHANNELS[channel]
+        newest = row.keeps == "newest"
+        super().__init__(zmq.XPUB, channel, endpoint, depth=_NEWEST if newest else row.depth)
+        self._wanted: set[bytes] = set()  # what messages must begin with for somebody to get them
+        self._last: bytes | None = None if greeting is None else encode(greeting)
         self._repeat = float("inf")  # when the last message is due once more
         self._newest = newest
         self._socket.xpub_verbose = True  # hear of every reader, also of one that asks for what others get
@@ -294,20 +301,33 @@ class Publisher(_Socket):
 
     def send(self, message: Any) -> None:
         """Send to all who listen now, and where the newest counts to those who come later."""
-        data = encode(message)
-        if self._newest:
-            self._last, self._repeat = data, monotonic() + _PATIENCE
-        self._socket.send(data, copy=False)
+        if not self._newest:
+            self.welcome()
+            if self._wanted:
+                self._socket.send(encode(message), copy=False)
+            return
+        self._last, self._repeat = encode(message), monotonic() + _PATIENCE
+        self._socket.send(self._last, copy=False)
         self.welcome()
 
+    @property
+    def heard(self) -> bool:
+        """Whether somebody listened when `send` or `welcome` was last called."""
+        return bool(self._wanted)
+
     def welcome(self) -> None:
-        """Send the last message to those who came since, or missed it; call it now and then."""
+        """Send the greeting, or the last message, to those who came since or missed it; call it now and then."""
         late = monotonic() >= self._repeat
         while True:
             try:
-                late |= self._socket.recv(zmq.NOBLOCK).startswith(b"\x01")
+                change = self._socket.recv(zmq.NOBLOCK)
             except zmq.Again:
                 break
+            if change.startswith(b"\x01"):
+                late = True
+                self._wanted.add(change[1:])
+            else:  # the last one who wanted this has left
+                self._wanted.discard(change[1:])
         if late and self._last is not None:
             self._repeat = float("inf")
             self._socket.send(self._last, copy=False)
@@ -319,12 +339,13 @@ class Subscriber(_Socket):
     Parameters
     ----------
     only : the one kind of message to receive; all where None
+    every : take also those that are not the newest, as far as they come
     """
 
-    def __init__(self, channel: str, endpoint: Endpoint, only: type | None = None) -> None:
+    def __init__(self, channel: str, endpoint: Endpoint, only: type | None = None, *, every: bool = False) -> None:
         row = CHANNELS[channel]
-        super().__init__(zmq.SUB, channel, endpoint, depth=_TRACKS if row.keeps == "every" else 16)
-        if row.keeps == "newest" and len(row.senders) == 1:
+        super().__init__(zmq.SUB, channel, endpoint, depth=row.depth if row.keeps == "every" else 16)
+        if row.keeps == "newest" and len(row.senders) == 1 and not every:
             self._socket.conflate = True
         self._socket.subscribe(b"" if only is None else opening(only))  # the publisher sends nothing else
         self._connect()

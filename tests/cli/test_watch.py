@@ -91,6 +91,18 @@ def test_a_terminal_shows_a_table_until_it_is_stopped_which_is_no_error(resting,
 TERMINAL = {**os.environ, "TERM": "xterm", "COLUMNS": "160"}
 
 
+def test_features_are_shown_as_they_come(video, catstream):
+    with pipeline(video) as running:
+        process = catstream("watch", "features", "--count", 3, "--endpoint", running.endpoint)
+        for _ in running:
+            select.select([process.stdout], [], [], 0.3)  # until it has begun
+        output, _ = process.communicate(timeout=SECONDS)
+    assert process.returncode == 0
+    lines = output.splitlines()
+    assert len(lines) == 3
+    assert all(word in lines[0] for word in ("frame ", "rows ", "background ", "extents "))
+
+
 @pytest.mark.parametrize("arguments", [("watch", "tracks"), ("status",)], ids=" ".join)
 def test_where_no_pipeline_runs_one_line_says_so(said, tmp_path, arguments):
     nowhere = {**os.environ, "TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}

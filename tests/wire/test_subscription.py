@@ -12,7 +12,7 @@ import pytest
 import catstream
 from catstream.box import Box
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import End, Health, Model, Track
+from catstream.messages import End, Features, Health, Model, Run, Track
 from catstream.wire.channels import CHANNELS
 from catstream.wire.sockets import Publisher
 
@@ -23,6 +23,11 @@ def track(seq):
 
 def model(version):
     return Model(version, 10 * version, np.full(5, version, np.float32), 0.5)
+
+
+def features(seq):
+    rows = np.full((2, 5), seq, np.float32)
+    return Features(seq, seq - 1, 0.0, None, rows, rows[:, 0] * 0, rows[:, 0], rows[:0], rows[:0, 0])
 
 
 @pytest.fixture
@@ -133,6 +138,34 @@ def test_each_process_is_heard_and_nothing_twice(endpoint):
     assert sorted(heard) == sorted(names)
 
 
+def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, until):
+    with (
+        Publisher("lessons", endpoint, greeting=Run("0", {"coreset_size": "64"})) as lessons,
+        catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
+    ):
+        until(lambda: lessons.heard, lessons.welcome)
+        for seq in (3, 4, 7):
+            lessons.send(features(seq))
+        lessons.send(End(9, "the source came to its end"))
+        subscription.timeout = 20
+        heard = list(subscription)
+    assert [message.seq for message in heard] == [3, 4, 7]
+    assert np.array_equal(heard[0].rows, features(3).rows)
+    assert subscription.missed == 2 + 1
+
+
+def test_what_nobody_listens_to_is_not_even_made(endpoint, until):
+    no_message = object()
+    with Publisher("lessons", endpoint) as lessons:
+        lessons.send(no_message)
+        with catstream.subscribe(str(endpoint), "features"):
+            until(lambda: lessons.heard, lessons.welcome)
+            with pytest.raises(TypeError):
+                lessons.send(no_message)
+        until(lambda: not lessons.heard, lessons.welcome)
+        lessons.send(no_message)
+
+
 def test_silence_is_an_error_after_the_time_given_and_one_may_go_on(endpoint, tracks):
     with attached(endpoint, tracks) as subscription:
         subscription.timeout = 0.1
@@ -177,7 +210,7 @@ def test_a_waiting_task_can_be_cancelled_and_hears_silence(endpoint, tracks):
         assert asyncio.run(waits()).seq == 2
 
 
-@pytest.mark.parametrize("channel", ["features", "results", "frames"])
+@pytest.mark.parametrize("channel", ["lessons", "results", "frames"])
 def test_a_channel_for_one_receiver_is_refused(endpoint, channel):
     with pytest.raises(ServiceError, match="one can subscribe to samples, models, tracks, health"):
         catstream.subscribe(str(endpoint), channel)
