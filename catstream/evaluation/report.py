@@ -68,10 +68,9 @@ def _plots(runs: list[Run]) -> str:
     overlap, distance = replace(SHARES, label="overlap threshold"), Axis.upto(PIXELS[-1], "distance in pixels")
     success = curves(OVERLAPS, success_plot, lambda curve: float(curve.mean()))
     precision = curves(PIXELS, precision_plot, lambda curve: float(curve[20]))
-    pair = plot("Success (AUC)", overlap, SHARES, success) + plot(
-        "Precision (at 20 pixels)", distance, SHARES, precision
-    )
-    return f'<div class="plots">{pair}</div>'
+    left = plot("Success (AUC)", overlap, SHARES, success)
+    right = plot("Precision (at 20 pixels)", distance, SHARES, precision)
+    return f'<div class="plots">{left}{right}</div>'
 
 
 def _table(rows: list[Row]) -> str:
