@@ -19,6 +19,7 @@ from catstream.box import Box
 
 __all__ = [
     "Answer",
+    "Bearings",
     "Command",
     "End",
     "Features",
@@ -41,18 +42,53 @@ Verb = Literal["set-box", "pause", "resume", "save", "stop"]
 
 
 @dataclass(frozen=True, slots=True)
+class Motion:
+    """Parameters of the Kalman filter of the centre, found by EM (paper, section "Classification").
+
+    process      float64 (4, 4), covariance of what the constant-velocity model misses a frame
+    observation  float64 (2, 2), covariance of a measured centre, pixels squared
+    """
+
+    process: np.ndarray
+    observation: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Bearings:
+    """What a detector needs to go on after a frame, besides the newest model.
+
+    state      as in `Track`
+    window     where it looks next
+    sure       where it was when it was last sure
+    usual      score that the object usually has
+    elsewhere  whether it was found by a search of the whole frame, and is not trusted yet
+    motion     the Kalman filter's parameters, None before it has any
+    centre     float64 (5, 4), the filter's mean (x, y, and their speeds) above its covariance; None before it has any
+    """
+
+    state: State
+    window: Box
+    sure: Box
+    usual: float
+    elsewhere: bool
+    motion: Motion | None = None
+    centre: np.ndarray | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Features:
     """What one frame teaches: rows for the coreset trees, detector -> compressor.
 
-    seq      1, 2, 3 ... without a gap: one message a frame
-    frame    the frame the rows were cut from
-    time     seconds since the start of the source, of a live one since that of the run
-    box      where the object was found, or None
-    rows     float32 (k, d); k is 0 where the frame teaches nothing
-    labels   float32 (k,): 1 the object, 0 background, between them a near miss
-    weights  float32 (k,): how many ordinary rows each counts for, above 0
-    extents  float32 (s, d): the object cut as it is, too small, too large, too wide and too narrow; s may be 0
-    fits     float32 (s,): how well each of those fits, 1 as it is, towards 0 far from it
+    seq       1, 2, 3 ... without a gap: one message a frame
+    frame     the frame the rows were cut from
+    time      seconds since the start of the source, of a live one since that of the run
+    box       where the object was found, or None
+    rows      float32 (k, d); k is 0 where the frame teaches nothing
+    labels    float32 (k,): 1 the object, 0 background, between them a near miss
+    weights   float32 (k,): how many ordinary rows each counts for, above 0
+    extents   float32 (s, d): the object cut as it is, too small, too large, too wide and too narrow; s may be 0
+    fits      float32 (s,): how well each of those fits, 1 as it is, towards 0 far from it
+    bearings  from where a restarted detector goes on; None where the sender has none
     """
 
     seq: int
@@ -64,6 +100,7 @@ class Features:
     weights: np.ndarray
     extents: np.ndarray
     fits: np.ndarray
+    bearings: Bearings | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,16 +121,18 @@ class Stored:
 class Position:
     """Where a stream goes on: a receiver's answer to each new connection.
 
-    seq      the last message stored, 0 in a new stream: send from the next one on
-    frame    its frame
-    box      where the object was last found, None in a new stream
-    version  the newest Sample made so far, 0 before the first
+    seq       the last message stored, 0 in a new stream: send from the next one on
+    frame     its frame
+    box       where the object was last found, None in a new stream
+    version   the newest Sample made so far, 0 before the first
+    bearings  those of that message, None where it had none
     """
 
     seq: int = 0
     frame: int = 0
     box: Box | None = None
     version: int = 0
+    bearings: Bearings | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,18 +171,6 @@ class Sample:
     loss: Summary
     extent: Summary | None
     centres: np.ndarray
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """Parameters of the Kalman filter of the centre, found by EM (paper, section "Classification").
-
-    process      float64 (4, 4), covariance of what the constant-velocity model misses a frame
-    observation  float64 (2, 2), covariance of a measured centre, pixels squared
-    """
-
-    process: np.ndarray
-    observation: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)

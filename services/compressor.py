@@ -30,8 +30,16 @@ def main(process: Process, state: Path | None) -> None:
     file = _checkpoint(state)
     compressor = Compressor.load(file, settings) if file and file.exists() else Compressor(settings)
     stored, saved = _position(compressor), time.monotonic()
+
+    def store() -> Position:
+        nonlocal stored, saved
+        if file is not None:
+            compressor.save(file)
+        stored, saved = _position(compressor), time.monotonic()
+        return stored
+
     with (
-        Receiver("features", process.endpoint, stored, settings.window) as features,
+        Receiver("features", process.endpoint, stored, settings.window, store) as features,
         Publisher("samples", process.endpoint) as samples,
     ):
 
@@ -49,11 +57,8 @@ def main(process: Process, state: Path | None) -> None:
                     samples.send(sample)
             before, waiting = stored.seq, compressor.seq - stored.seq
             overdue = time.monotonic() - saved >= settings.checkpoint_seconds
-            if file is None:
-                stored = _position(compressor)
-            elif waiting and (end or overdue or 2 * waiting >= settings.window):
-                compressor.save(file)
-                stored, saved = _position(compressor), time.monotonic()
+            if file is None or (waiting and (end or overdue or 2 * waiting >= settings.window)):
+                store()
             if message is not None or stored.seq > before:
                 # The end of the stream holds no features: with all before it, it is stored too. A sample needs
                 # no checkpoint to be made: in lockstep the detector waits for its model.
@@ -77,6 +82,5 @@ def _checkpoint(state: Path | None) -> Path | None:
 
 
 def _position(compressor: Compressor, seq: int | None = None) -> Position:
-    return Position(
-        compressor.seq if seq is None else seq, max(compressor.frame, 0), compressor.box, compressor.version
-    )
+    seq = compressor.seq if seq is None else seq
+    return Position(seq, max(compressor.frame, 0), compressor.box, compressor.version, compressor.bearings)

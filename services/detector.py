@@ -46,10 +46,9 @@ def main(
     """
     with ExitStack() as stack:
         line = _Line(process, stack, owned)
-        position = line.position() if resume else Position()
         detector = Detector(process.settings)
-        if position.seq and position.box is not None:
-            detector.resume(position.seq, box, position.box, line.model())
+        if resume:
+            line.resume(detector, box)
         # From the last frame that was stored, which is passed over: there may be none after it.
         first = max(detector.seq - 1, 0)
         frames = stack.enter_context(open_source(source, first, part=part, since=since, idle=line.idle))
@@ -92,29 +91,33 @@ class _Line:
         self._lessons = stack.enter_context(Publisher("lessons", endpoint, greeting=process.run))
         self.models = stack.enter_context(Subscriber("models", endpoint))
         self._senders = [self._features] + ([self._results] if self._results else [])
-        self._lag = 0 if process.settings.lockstep else process.settings.lag_frames
+        self._lockstep = process.settings.lockstep
+        self._lag = 0 if self._lockstep else process.settings.lag_frames
         self._version = 0
         self.source: Source | None = None
 
-    def position(self) -> Position:
-        """Where to go on: after the last frame that all receivers have; from the start where there is no model yet."""
-        positions: list[Position] = []
-        for sender in self._senders:
-            while (position := sender.position()) is None:
-                self._turn()
-            positions.append(position)
+    def resume(self, detector: Detector, first: Box) -> None:
+        """Go on after the last frame that all receivers have; from the start where there is no model yet."""
+        model: Model | None = None
+        while True:  # until the compressor and the trainer are of the same moment: either may have died too
+            positions = [self._position(sender) for sender in self._senders]
+            version = positions[0].version
+            if not version or (model is not None and model.version == version):
+                break
+            model = self.models.receive(0.05) or model
         start = min(positions, key=lambda position: position.seq)
-        if not positions[0].version or start.box is None:
+        if model is None or start.box is None:
             start = Position()
+        else:
+            detector.resume(start.seq, first, start.bearings or detector.bearings_at(start.box), model)
         for sender, position in zip(self._senders, positions, strict=True):
             sender.resume(start.seq, position.seq)
-        return start
 
-    def model(self) -> Model:
-        """The newest model, however long it takes."""
-        while (model := self.models.receive(0.05)) is None:
+    def _position(self, sender: Sender) -> Position:
+        """Where a receiver is, however long it takes."""
+        while (position := sender.position()) is None:
             self._turn()
-        return model
+        return position
 
     def send(self, track: Track, features: Features) -> None:
         """Send what one frame gave; wait where a window is full."""
@@ -122,6 +125,10 @@ class _Line:
         self._tracks.send(track)
         if self._results is not None:
             self._deliver(self._results, track)
+            # Where a run can be repeated, the owner is never behind: the bearings are those of the features.
+            while self._lockstep and self._results.taken < track.seq and not self._process.ended:
+                self._results.listen(0.02)
+                self._process.beat(self._counters)
         self._lessons.send(features)
         self._deliver(self._features, features)
         self._process.beat(self._counters)

@@ -22,7 +22,8 @@ def main(process: Process) -> None:
         while not process.ended:
             message = samples.receive(0.1)
             end = isinstance(message, End)
-            if message is not None and not end and message.version > version:
+            # An older one comes from a compressor that lost the newer: it is made again, and a detector may need this.
+            if message is not None and not end and message.version != version:
                 models.send(trainer.train(message))
                 version, trained = message.version, trained + 1
             models.welcome()

@@ -13,10 +13,10 @@ import os
 import numpy as np
 
 from catstream.box import Box
-from catstream.compression import storage
+from catstream.compression import checkpoint, storage
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, SettingsError
-from catstream.messages import Features, Sample
+from catstream.messages import Bearings, Features, Sample
 from catstream.settings import Settings
 
 __all__ = ["Compressor"]
@@ -29,6 +29,9 @@ class Compressor:
 
     Constant time a frame on average, logarithmic memory. The same messages make
     the same samples, bit for bit, also across `save` and `load`.
+
+    last_sample : the newest, None before the first
+    bearings : what came with the last message: a restarted detector goes on from there
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -44,9 +47,9 @@ class Compressor:
         self.seq = 0
         self.frame = -1
         self.box: Box | None = None
-        self.version = 0
+        self.bearings: Bearings | None = None
+        self.last_sample: Sample | None = None
         self._sampled_leaves = 0
-        self._sampled_frame = -1
 
     def take(self, features: Features) -> Sample | None:
         """Store one frame's features; a sample where the trees have grown enough since the last.
@@ -74,21 +77,21 @@ class Compressor:
             self.trees["background"].insert(rows[labels == 0])
         if extents := len(features.extents):
             self.trees["extent"].insert(_loss_rows(features.extents, features.fits, np.ones(extents)))
-        self.seq, self.frame = features.seq, features.frame
+        self.seq, self.frame, self.bearings = features.seq, features.frame, features.bearings
         if features.box is not None:
             self.box = features.box
         self._follow(features.box)
         return self._sample() if self._due() else None
 
     @property
+    def version(self) -> int:
+        """That of the last sample, 0 before the first."""
+        return self.last_sample.version if self.last_sample else 0
+
+    @property
     def leaves(self) -> int:
         """Leaves ever inserted into the trees."""
         return sum(sum(1 << node.level for node in tree.nodes) for tree in self.trees.values())
-
-    @property
-    def last_sample(self) -> Sample | None:
-        """The sample of the trees as they are, under the newest version; None before the first."""
-        return self._made() if self.version else None
 
     def counters(self) -> dict[str, float]:
         """What health tells of it."""
@@ -109,10 +112,12 @@ class Compressor:
             "seq": self.seq,
             "frame": self.frame,
             "box": list(self.box) if self.box else None,
-            "version": self.version,
-            "sampled": [self._sampled_leaves, self._sampled_frame],
+            "sampled_leaves": self._sampled_leaves,
             "trees": {},
         }
+        sample, facts["sample"] = checkpoint.sample_state(self.last_sample)
+        bearings, facts["bearings"] = checkpoint.bearings_state(self.bearings)
+        arrays |= sample | bearings
         for name, tree in self.trees.items():
             own, facts["trees"][name] = tree.state()  # type: ignore[index]
             arrays |= {f"{name}.{key}": array for key, array in own.items()}
@@ -130,9 +135,11 @@ class Compressor:
         arrays, facts = storage.read(path)
         self = cls(settings)
         try:
-            self.seq, self.frame, self.version = int(facts["seq"]), int(facts["frame"]), int(facts["version"])  # type: ignore[call-overload]
+            self.seq, self.frame = int(facts["seq"]), int(facts["frame"])  # type: ignore[call-overload]
             self.box = Box(*facts["box"]) if facts["box"] else None  # type: ignore[misc]
-            self._sampled_leaves, self._sampled_frame = facts["sampled"]  # type: ignore[misc]
+            self.bearings = checkpoint.bearings_of(arrays, facts["bearings"])  # type: ignore[arg-type]
+            self.last_sample = checkpoint.sample_of(arrays, facts["sample"])  # type: ignore[arg-type]
+            self._sampled_leaves = int(facts["sampled_leaves"])  # type: ignore[call-overload]
             self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]
             for name, tree_facts in facts["trees"].items():  # type: ignore[attr-defined]
                 own = {
@@ -160,17 +167,15 @@ class Compressor:
         """Trees that can teach, a leaf more than last time, and not right after the last sample."""
         if not (self.trees["object"].nodes and self.trees["background"].nodes and self.trees["loss"].nodes):
             return False
-        waited = self.version == 0 or self.frame - self._sampled_frame >= self.settings.train_frames
+        last = self.last_sample
+        waited = last is None or self.frame - last.frame >= self.settings.train_frames
         return waited and self.leaves > self._sampled_leaves
 
     def _sample(self) -> Sample:
-        self.version += 1
-        self._sampled_leaves, self._sampled_frame = self.leaves, self.frame
-        return self._made()
-
-    def _made(self) -> Sample:
+        self._sampled_leaves = self.leaves
         summaries = {name: tree.sample() if tree.nodes else None for name, tree in self.trees.items()}
-        return Sample(self.version, self.frame, centres=self.centres, **summaries)  # type: ignore[arg-type]
+        self.last_sample = Sample(self.version + 1, self.frame, centres=self.centres, **summaries)  # type: ignore[arg-type]
+        return self.last_sample
 
 
 def _loss_rows(rows: np.ndarray, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from catstream.detection.lessons import Lesson
 from catstream.detection.motion import CentreFilter
 from catstream.detection.search import Found
 from catstream.errors import BoxError
-from catstream.messages import Features, Model, State, Track
+from catstream.messages import Bearings, Features, Model, State, Track
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
@@ -84,20 +84,30 @@ class Detector:
             else:
                 self._centre.adopt(model.motion)
 
-    def resume(self, seq: int, first: Box, box: Box, model: Model) -> None:
+    def resume(self, seq: int, first: Box, bearings: Bearings, model: Model) -> None:
         """Go on after message `seq` of a stream that another detector began.
+
+        With the model that the other one had by then, it goes on as that would have, bit for bit.
 
         Parameters
         ----------
         seq : the last Features that is stored
         first : the object in the first frame, in pixels
-        box : where it was last
+        bearings : those of that message, or `bearings_at` where the object was last
         model : the newest there is
         """
-        self.seq, self.state = seq, "present"
+        self.seq, self.state = seq, bearings.state
         self._first_box = first.scaled(self.settings.context)
-        self._box = self._sure_box = box.scaled(self.settings.context)
+        self._box, self._sure_box = bearings.window, bearings.sure
+        self._usual_score, self._elsewhere = bearings.usual, bearings.elsewhere
+        if bearings.motion is not None and bearings.centre is not None:
+            self._centre = CentreFilter.resumed(bearings.motion, bearings.centre, bearings.state != "absent")
         self.adopt(model)
+
+    def bearings_at(self, box: Box) -> Bearings:
+        """Where nothing is known but where the object was last."""
+        window = box.scaled(self.settings.context)
+        return Bearings("present", window, window, 0.0, False)
 
     def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
         """Find the object in the next frame."""
@@ -173,6 +183,19 @@ class Detector:
         frame = self.seq - 1
         box = None if self.state == "absent" else self._box.scaled(1 / self.settings.context)
         track = Track(self.seq, frame, time, self.state, box, float(score), self.model.version)
+        motion, centre = (self._centre.motion, self._centre.state) if self._centre is not None else (None, None)
+        bearings = Bearings(
+            self.state, self._box, self._sure_box, float(self._usual_score), self._elsewhere, motion, centre
+        )
         return track, Features(
-            self.seq, frame, time, box, lesson.rows, lesson.labels, lesson.weights, lesson.extents, lesson.fits
+            self.seq,
+            frame,
+            time,
+            box,
+            lesson.rows,
+            lesson.labels,
+            lesson.weights,
+            lesson.extents,
+            lesson.fits,
+            bearings,
         )

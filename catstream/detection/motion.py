@@ -81,6 +81,23 @@ class CentreFilter:
         """Go on from here with other covariances."""
         self._kalman.Q, self._kalman.R = motion.process, motion.observation
 
+    @property
+    def motion(self) -> Motion:
+        """The covariances it goes by."""
+        return Motion(self._kalman.Q, self._kalman.R)
+
+    @property
+    def state(self) -> np.ndarray:
+        """Mean above covariance, float64 (5, 4): with `motion`, all that it knows."""
+        return np.vstack([self._kalman.x, self._kalman.P])
+
+    @classmethod
+    def resumed(cls, motion: Motion, state: np.ndarray, seen: bool) -> CentreFilter:
+        """A filter that goes on from another one's state, bit for bit; `seen` as the object was in its last frame."""
+        self = cls(motion, (0.0, 0.0))
+        self._kalman.x, self._kalman.P, self._seen = state[0].copy(), state[1:].copy(), seen
+        return self
+
     def _start(self, centre: tuple[float, float]) -> None:
         self._seen = True
         self._kalman.x = np.array([*centre, 0.0, 0.0])

@@ -26,6 +26,7 @@ from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import (
     Answer,
+    Bearings,
     Command,
     End,
     Features,
@@ -64,6 +65,7 @@ _ARRAYS: dict[type, dict[str, tuple[np.dtype, tuple[int | str, ...]]]] = {
     },
     Summary: {"rows": (_F32, ("r", "d")), "mean": (_F32, ("d",))},
     Sample: {"centres": (_F64, ("m", 2))},
+    Bearings: {"centre": (_F64, (5, 4))},
     Motion: {"process": (_F64, (4, 4)), "observation": (_F64, (2, 2))},
     Model: {"weights": (_F32, ("d",)), "extent": (_F32, ("d",))},
 }

@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections import deque
+from collections.abc import Callable
 from time import monotonic
 from typing import Any, Self
 
@@ -224,12 +225,21 @@ class Receiver(_Socket):
     Parameters
     ----------
     position : where the stream goes on: the next message taken is the one after `position.seq`
+    store : stores all that was taken, and returns where that is; called where a sender asks, so that one
+        that starts anew has nothing to repeat. Without it the answer is what was stored last
     """
 
-    def __init__(self, channel: str, endpoint: Endpoint, position: Position, window: int) -> None:
+    def __init__(
+        self,
+        channel: str,
+        endpoint: Endpoint,
+        position: Position,
+        window: int,
+        store: Callable[[], Position] | None = None,
+    ) -> None:
         super().__init__(zmq.ROUTER, channel, endpoint, depth=window + 1)
         self.taken = position.seq
-        self._position = position
+        self._position, self._store = position, store
         self._peer: bytes | None = None
         self._asked = 0.0  # when a message was last found missing
         self._gone: Any = None  # hears of the sender's leaving, once it has sent its end
@@ -243,6 +253,8 @@ class Receiver(_Socket):
         peer, *parts = self._socket.recv_multipart(copy=False)
         self._peer = peer.bytes
         if len(parts) == 1 and not len(parts[0].buffer):
+            if self._store is not None and self._position.seq < self.taken:
+                self._position = self._store()
             self._answer(self._position)
             return None
         message = self._decode(parts[0].buffer if len(parts) == 1 else b"", *self.channel.messages)

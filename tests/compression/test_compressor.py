@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.errors import ProtocolError
-from catstream.messages import Features, Sample
+from catstream.messages import Bearings, Features, Motion, Sample
 from catstream.settings import Settings
 
 WIDTH = 20
@@ -153,13 +153,27 @@ def test_a_saved_compressor_goes_on_bit_for_bit(settings, messages, count, tmp_p
             assert_same(sample, again)
 
 
-def test_the_last_sample_can_be_had_again(settings, messages, tmp_path):
-    compressor, sample = Compressor(settings), None
+def test_the_last_sample_can_be_had_again_though_the_trees_have_grown(settings, messages, tmp_path):
+    compressor, samples = Compressor(settings), []
     assert compressor.last_sample is None
-    while sample is None:
-        sample = compressor.take(next(messages))
+    while len(samples) < 3:
+        samples += take(compressor, messages, 1)
+    assert not take(compressor, messages, 2)
     compressor.save(tmp_path / "state")
-    assert_same(Compressor.load(tmp_path / "state", settings).last_sample, sample)
+    assert_same(Compressor.load(tmp_path / "state", settings).last_sample, samples[-1])
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_the_bearings_of_the_last_message_are_kept_bit_for_bit(settings, messages, moving, rng, tmp_path):
+    motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
+    bearings = Bearings("absent", Box(*rng.random(4)), Box(*rng.random(4)), rng.random(), True)
+    if moving:
+        bearings = dataclasses.replace(bearings, motion=motion, centre=centre)
+    compressor = Compressor(settings)
+    compressor.take(dataclasses.replace(next(messages), bearings=bearings))
+    compressor.save(tmp_path / "state")
+    loaded = Compressor.load(tmp_path / "state", settings).bearings
+    assert_equal(dataclasses.asdict(loaded), dataclasses.asdict(bearings))
 
 
 def test_memory_is_flat_between_doublings(settings, messages):

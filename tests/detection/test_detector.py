@@ -10,6 +10,7 @@ from catstream.box import Box
 from catstream.detection.detector import Detector
 from catstream.detection.hog import row_length
 from catstream.errors import BoxError
+from catstream.messages import Motion
 from catstream.settings import Settings
 
 START = Box(60, 50, 48, 40)
@@ -117,17 +118,33 @@ def test_another_detector_goes_on_where_one_stopped(scene):
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
     track, features = detector.step(scene((64, 52)))
-    other.resume(features.seq, START, track.box, model)
+    other.resume(features.seq, START, other.bearings_at(track.box), model)
     track, _ = other.step(scene((68, 54)))
     assert (track.seq, track.state) == (3, "present")
     assert track.box.overlap(Box(68, 54, 48, 40)) > 0.8
+
+
+@pytest.mark.parametrize("absent", [False, True])
+def test_with_the_bearings_of_a_frame_another_detector_goes_on_bit_for_bit(scene, absent):
+    detector, other = started(scene), Detector(Settings())
+    model = dataclasses.replace(detector.model, version=1, motion=Motion(np.eye(4), np.eye(2)))
+    detector.adopt(model)
+    for left in range(60, 84, 4):
+        _, features = detector.step(scene((left, 50)))
+    if absent:
+        _, features = detector.step(scene())
+    other.resume(features.seq, START, features.bearings, model)
+    for left in range(84, 100, 4):
+        (track, features), (again, repeated) = (stage.step(scene((left, 50))) for stage in (detector, other))
+        assert again == track
+        np.testing.assert_equal(dataclasses.asdict(repeated), dataclasses.asdict(features))
 
 
 def test_a_frame_teaches_the_same_whatever_came_before(scene):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
-    other.resume(1, START, START, model)
+    other.resume(1, START, other.bearings_at(START), model)
     one, two = (stage.step(scene((60, 50)))[1] for stage in (detector, other))
     np.testing.assert_allclose(one.rows, two.rows, atol=1e-5)
 

@@ -15,6 +15,7 @@ from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import (
     Answer,
+    Bearings,
     Command,
     End,
     Features,
@@ -39,14 +40,20 @@ def summary(columns: int) -> Summary:
     return Summary(array(6, columns), array(columns), 40, (3, 1, 0))
 
 
+MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
+BEARINGS = Bearings(
+    "present", Box(4.0, 2.0, 25.0, 12.5), Box(4.5, 2.0, 25.0, 12.5), 0.9, False, MOTION, array(5, 4, dtype="<f8")
+)
 EXAMPLES = {
     "answer": Answer("7f", True, "followed from frame 9 on", 9, Box(4.5, 3.0, 20.0, 10.0), 4),
     "command": Command("7f", "set-box", Box(4.5, 3.0, 20.0, 10.0), True),
     "end": End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),
-    "features": Features(3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5), array(1)),
+    "features": Features(
+        3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5), array(1), BEARINGS
+    ),
     "health": Health("trainer", 1.7e9, {"version": 4.0}),
-    "model": Model(4, 20, array(5), -0.25, Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8")), array(5)),
-    "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2),
+    "model": Model(4, 20, array(5), -0.25, MOTION, array(5)),
+    "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2, BEARINGS),
     "run": Run("0.1.0", {"coreset_size": "64", "classifier": "joint"}),
     "sample": Sample(4, 20, summary(5), summary(5), summary(7), summary(7), np.array([[1.0, 2.0], [np.nan, np.nan]])),
     "stored": Stored(5, 7, 2),

@@ -227,6 +227,18 @@ def test_a_restarted_sender_may_hear_that_more_was_stored_since_it_asked(endpoin
     assert taken == list(range(1, 10))
 
 
+def test_a_receiver_that_is_asked_stores_what_it_has_taken_first(endpoint, until):
+    taken, found = [], []
+    with Receiver("results", endpoint, Position(), 10, lambda: Position(len(taken), version=7)) as receiver:
+        with Sender("results", endpoint, 10) as sender:
+            for seq in range(1, 6):
+                sender.send(track(seq))
+            until(lambda: len(taken) == 5, lambda: (sender.listen(0), take(receiver, taken, store=False)))
+        with Sender("results", endpoint, 10) as sender:
+            until(lambda: found and found[-1], lambda: (found.append(sender.position()), receiver.receive(0)))
+    assert found[-1] == Position(5, version=7)
+
+
 def test_a_receiver_of_another_stream_is_noticed(endpoint, until):
     with Receiver("results", endpoint, Position(99), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
         sender.send(track(1))

@@ -1,0 +1,66 @@
+"""What a compressor's checkpoint holds besides the trees: the last sample, and the detector's bearings.
+
+The trees grow on after a sample: only the sample itself gives a trainer that starts anew the
+model that the detector goes by. Each is turned into arrays and facts for `storage`, and back.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from catstream.box import Box
+from catstream.messages import Bearings, Motion, Sample, Summary
+
+__all__ = ["bearings_of", "bearings_state", "sample_of", "sample_state"]
+
+State = tuple[dict[str, np.ndarray], dict[str, Any] | None]
+
+
+def sample_state(sample: Sample | None) -> State:
+    """Arrays and facts that `sample_of` makes this sample of again."""
+    if sample is None:
+        return {}, None
+    arrays: dict[str, np.ndarray] = {"sample.centres": sample.centres}
+    trees: dict[str, Any] = {}
+    for name in ("object", "background", "loss", "extent"):
+        summary: Summary | None = getattr(sample, name)
+        if summary is not None:
+            arrays |= {f"sample.{name}.rows": summary.rows, f"sample.{name}.mean": summary.mean}
+            trees[name] = [summary.count, summary.levels]
+    return arrays, {"version": sample.version, "frame": sample.frame, "trees": trees}
+
+
+def sample_of(arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> Sample | None:
+    """The sample, bit for bit; KeyError, TypeError or ValueError where it is none."""
+    if facts is None:
+        return None
+    summaries: dict[str, Any] = {"extent": None}
+    for name, (count, levels) in facts["trees"].items():
+        rows, mean = arrays[f"sample.{name}.rows"], arrays[f"sample.{name}.mean"]
+        summaries[name] = Summary(rows, mean, int(count), tuple(levels))
+    return Sample(int(facts["version"]), int(facts["frame"]), centres=arrays["sample.centres"], **summaries)
+
+
+def bearings_state(bearings: Bearings | None) -> State:
+    """Arrays and facts that `bearings_of` makes these of again."""
+    if bearings is None:
+        return {}, None
+    arrays: dict[str, np.ndarray] = {}
+    if bearings.motion is not None and bearings.centre is not None:
+        parts = {"process": bearings.motion.process, "observation": bearings.motion.observation}
+        arrays = {f"bearings.{name}": array for name, array in {**parts, "centre": bearings.centre}.items()}
+    names = ("state", "window", "sure", "usual", "elsewhere")
+    return arrays, {name: getattr(bearings, name) for name in names}
+
+
+def bearings_of(arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> Bearings | None:
+    """The bearings, bit for bit; KeyError, TypeError or ValueError where they are none."""
+    if facts is None:
+        return None
+    motion, centre = None, arrays.get("bearings.centre")
+    if centre is not None:
+        motion = Motion(arrays["bearings.process"], arrays["bearings.observation"])
+    boxes = {name: Box(*facts[name]) for name in ("window", "sure")}
+    return Bearings(**(facts | boxes), motion=motion, centre=centre)
