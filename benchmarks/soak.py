@@ -1,0 +1,213 @@
+"""Whether a compressor slows down or grows: a million messages of features into one, and some through the process.
+
+The rows are real, cut by a detector that follows a video; each message draws a few of them anew, a little
+brighter or darker than they were. So few rows a message let a million of them pass in minutes; the law is in rows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import NamedTuple
+
+import numpy as np
+import psutil
+from sequences import named, scratch
+from table import Table, command, publish
+
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
+from catstream.compression.tree import CoresetTree
+from catstream.detection.detector import Detector
+from catstream.errors import ServiceError
+from catstream.evaluation.datasets import Sequence
+from catstream.messages import End, Features
+from catstream.settings import Settings
+from catstream.training.trainer import Trainer
+from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.sockets import Sender
+
+BLOCKS = 200  # the run is looked at so often
+GAIN = 0.02  # standard deviation of a drawn row's brightness
+
+COLUMNS = ("messages", "rows", "us a message", "nodes", "trees MB", "law MB", "resident MB", "handles", "disk MB")
+
+
+class Sight(NamedTuple):
+    """What was seen after some messages; megabytes are 10**6 bytes.
+
+    messages, rows  taken so far, inserted into the four trees so far
+    micros          microseconds of processor time a message since the sight before, reductions and samples included
+    nodes, trees    nodes of all trees, and megabytes of their arrays
+    law             megabytes of log2(p/n) + 1 nodes and n pending rows in each tree
+    resident        megabytes of the process
+    handles         open files and sockets
+    disk            megabytes of the checkpoint
+    """
+
+    messages: int
+    rows: int
+    micros: float
+    nodes: int
+    trees: float
+    law: float
+    resident: float
+    handles: int
+    disk: float
+
+
+class Stream:
+    """Messages without end, of rows that a detector cut from a video."""
+
+    def __init__(self, sequence: Sequence, frames: int, settings: Settings) -> None:
+        lessons = list(cut(sequence, frames, settings))
+        rows, labels = np.vstack([one.rows for one in lessons]), np.concatenate([one.labels for one in lessons])
+        self._object, self._background = rows[labels == 1], rows[labels == 0]
+        self._extents = np.vstack([one.extents for one in lessons])
+        self._fits = np.concatenate([one.fits for one in lessons])
+        self._box, self._random = lessons[-1].box, np.random.default_rng(settings.seed)
+
+    def message(self, seq: int) -> Features:
+        """A row of the object, one of the background and two of its extent."""
+        random = self._random
+        gains = random.normal(1, GAIN, (4, 1)).astype(np.float32)
+        pair = random.integers(len(self._fits), size=2)
+        rows = np.stack([part[random.integers(len(part))] for part in (self._object, self._background)]) * gains[:2]
+        return Features(
+            seq, seq - 1, (seq - 1) / 25, self._box, rows, np.float32([1, 0]), np.ones(2, np.float32),
+            self._extents[pair] * gains[2:], self._fits[pair],
+        )  # fmt: skip
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    settings = Settings()
+    messages, through, frames = (2_000, 500, 24) if options.quick else (options.messages, options.through, 200)
+    stream = Stream(named(options, "TLD_01_david"), frames, settings)
+    here, there = alone(stream, messages, settings), served(stream, through, settings)
+    draw(here, options.plot)
+    note = (
+        f"time is the processor's; law: log2(p/n) + 1 nodes of n = {settings.coreset_size} rows a tree; {options.plot}"
+    )
+    yield Table("In one process", COLUMNS, list(doubling(here)), note)
+    note = "the compressor's process, with its checkpoints, over a Unix socket: from the sender's side, all stored"
+    yield Table("Through the process", ("messages", "us a message", "resident MB", "handles", "disk MB"), there, note)
+
+
+def cut(sequence: Sequence, frames: int, settings: Settings) -> Iterator[Features]:
+    """What the first frames of a sequence teach."""
+    detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
+    for number, image in zip(range(frames), sequence.frames(), strict=False):
+        _, lesson = detector.step(image) if number else detector.init(image, Box(*sequence.boxes[0]))
+        yield lesson
+        if (sample := compressor.take(lesson)) is not None:
+            detector.adopt(trainer.train(sample))
+
+
+def alone(stream: Stream, messages: int, settings: Settings) -> list[Sight]:
+    """A compressor in this process; it is looked at, and saved, after each block."""
+    compressor, me, file, sights = Compressor(settings), psutil.Process(), scratch() / "soak.safetensors", []
+    block, busy = max(messages // BLOCKS, 1), 0.0
+    for seq in range(1, messages + 1):
+        message = stream.message(seq)
+        begin = process_time()
+        compressor.take(message)
+        busy += process_time() - begin
+        if seq % block == 0:
+            compressor.save(file)
+            seen = compressor.counters()
+            sights.append(
+                Sight(
+                    seq, int(seen["rows"]), busy / block * 1e6, int(seen["nodes"]), seen["bytes"] / 1e6,
+                    sum(map(law, compressor.trees.values())) / 1e6, me.memory_info().rss / 1e6, me.num_fds(),
+                    file.stat().st_size / 1e6,
+                )
+            )  # fmt: skip
+            busy = 0.0
+            if len(sights) % 10 == 0:
+                print(f"{seq} of {messages} messages, {sights[-1].micros:.0f} us each", file=sys.stderr, flush=True)
+    return sights
+
+
+def law(tree: CoresetTree) -> float:
+    """Most bytes that a tree of so many rows may hold."""
+    nodes = math.log2(max(tree.rows_seen / tree.size, 1)) + 1
+    return nodes * tree.width * (4 * tree.size + 8) + 4 * tree.size * tree.width
+
+
+def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int, float, float, int, float]]:
+    """The same through the compressor's process: a row for each fifth of the messages."""
+    rows = []
+    with private_folder() as folder:
+        command = [sys.executable, "-m", "catstream.services", "compressor"]
+        options = ["--set", f"endpoint={folder}", "--state", folder / "state"]
+        with (
+            subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL) as process,
+            Sender("features", Endpoint.parse(str(folder)), settings.window) as sender,
+        ):
+            seen, part, begin = psutil.Process(process.pid), messages // 5, 0.0
+            for seq in range(1, messages + 1):
+                message = stream.message(seq)
+                while not sender.send(message):
+                    sender.listen(0.05)
+                    if process.poll() is not None:
+                        raise ServiceError(f"the compressor ended with {process.returncode}: run it by hand to see why")
+                if seq == 1:  # it is imported by the time that it has answered
+                    wait(sender, 1)
+                    begin = perf_counter()
+                if seq % part == 0:
+                    wait(sender, seq)
+                    micros = (perf_counter() - begin) / part * 1e6
+                    disk = sum(file.stat().st_size for file in (folder / "state").iterdir()) / 1e6
+                    rows.append((seq, micros, seen.memory_info().rss / 1e6, seen.num_fds(), disk))
+                    begin = perf_counter()
+            sender.send(End(messages + 1, "that was all"))
+            wait(sender, messages + 1)
+    return rows
+
+
+def wait(sender: Sender, seq: int) -> None:
+    """Until a message is stored."""
+    while sender.stored < seq:
+        sender.listen(0.05)
+
+
+def doubling(sights: list[Sight]) -> Iterator[Sight]:
+    """The last sights whose messages double from one to the next; time is the mean of up to four before each."""
+    for place in (len(sights) // 2**doubled - 1 for doubled in reversed(range(BLOCKS.bit_length()))):
+        if place >= 0:
+            near = [sight.micros for sight in sights[max(place - 3, 0) : place + 1]]
+            yield sights[place]._replace(micros=sum(near) / len(near))
+
+
+def draw(sights: list[Sight], file: Path) -> None:
+    """Plot time a message, and memory beside its law, against messages; one above the other."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, (time, memory) = pyplot.subplots(2, 1, sharex=True, figsize=(8, 6), layout="constrained")
+    counts = [sight.messages for sight in sights]
+    time.plot(counts, [sight.micros for sight in sights])
+    time.set(ylabel="us a message", ylim=(0, None))
+    for label in ("resident", "law", "trees", "disk"):
+        memory.plot(counts, [getattr(sight, label) for sight in sights], label=label)
+    memory.set(ylabel="MB", xlabel="messages of features", xscale="log", ylim=(0, None))
+    memory.legend(fontsize="small")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=120)
+    pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--messages", type=int, default=1_000_000, help="in one process (default: %(default)s)")
+    parser.add_argument("--through", type=int, default=50_000, help="through the process (default: %(default)s)")
+    parser.add_argument("--plot", type=Path, default=Path("out/soak.png"), help="(default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)
