@@ -27,6 +27,7 @@ __all__ = [
     "Model",
     "Motion",
     "Position",
+    "Preview",
     "Run",
     "Sample",
     "State",
@@ -216,6 +217,24 @@ class Track:
     score: float
     model_version: int
     pts: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """A small picture of a frame that was followed, or that waits for a box, detector -> anyone.
+
+    frame   number of the frame
+    width   of the frame in pixels; the picture may be smaller
+    height  of the frame in pixels
+    box     where the object was found in it, in pixels of the frame; None while absent, or before there is a box
+    jpeg    the picture: a JPEG file, its sides in the proportion of the frame's
+    """
+
+    frame: int
+    width: int
+    height: int
+    box: Box | None
+    jpeg: bytes
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from time import monotonic
 from typing import Generic, Literal, Self, TypeVar, overload
 
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import End, Features, Health, Model, Run, Sample, Track
+from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import find
 from catstream.wire.sockets import Subscriber
@@ -33,13 +33,13 @@ _OPEN = {
     "features": "lessons",
 }
 
-Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features)
+Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features | Preview)
 
 
 class Subscription(Generic[Message]):
     """Messages of one channel of a running pipeline, from now until its end; iterate it, with `for` or `async for`.
 
-    Tracks and features come one a frame, a restarted detector may repeat some. Of models, samples and the
+    Tracks and features come one a frame, a restarted detector may repeat some. Of models, samples, previews and the
     health of each process the last one comes at once, then each that is the newest when it is
     taken. Before the pipeline is there, and while it is away, it waits.
 
@@ -149,7 +149,7 @@ class Subscription(Generic[Message]):
         if isinstance(message, Track | Features):
             self._count(message.seq)
             return True
-        name, mark = (message.process, message.time) if isinstance(message, Health) else ("", message.version)
+        name, mark = _mark(message)
         known = self._newest.get(name)
         self._newest[name] = mark
         return mark != known
@@ -180,6 +180,13 @@ class Subscription(Generic[Message]):
         return None if until == float("inf") else max(0.0, until - now)
 
 
+def _mark(message: Health | Model | Sample | Preview) -> tuple[str, float]:
+    """Who sent it, and what tells it from the one before."""
+    if isinstance(message, Health):
+        return message.process, message.time
+    return "", message.frame if isinstance(message, Preview) else message.version
+
+
 @overload
 def subscribe(endpoint: str, channel: Literal["tracks"], *, timeout: float | None = ...) -> Subscription[Track]: ...
 @overload
@@ -192,13 +199,15 @@ def subscribe(endpoint: str, channel: Literal["samples"], *, timeout: float | No
 def subscribe(
     endpoint: str, channel: Literal["features"], *, timeout: float | None = ...
 ) -> Subscription[Features]: ...
+@overload
+def subscribe(endpoint: str, channel: Literal["previews"], *, timeout: float | None = ...) -> Subscription[Preview]: ...
 def subscribe(endpoint: str, channel: str, *, timeout: float | None = None) -> Subscription:
     """Attach to a running pipeline.
 
     Parameters
     ----------
     endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
-    channel : "tracks", "models", "health", "samples" or "features"
+    channel : "tracks", "models", "health", "samples", "features" or "previews"
     timeout : seconds without a message after which iterating raises `SilenceError`; None to wait for ever
 
     Raises

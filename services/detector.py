@@ -11,6 +11,7 @@ from catstream.detection.detector import Detector
 from catstream.errors import VideoError
 from catstream.messages import End, Features, Model, Position, Track
 from catstream.services.loop import Process
+from catstream.services.previews import Previews
 from catstream.video.frames import Source
 from catstream.video.source import WHOLE, open_source
 from catstream.wire.sockets import Publisher, Sender, Subscriber
@@ -65,6 +66,7 @@ def main(
                 else:
                     track, features = detector.init(frame.image, box, frame.time)
                 line.send(replace(track, pts=frame.pts), features)
+                line.previews.show(track.frame, frame.image, track.box)
                 if not frames.live:
                     line.wait(detector)
                 if process.ended:
@@ -90,6 +92,7 @@ class _Line:
         self._tracks = stack.enter_context(Publisher("tracks", endpoint))
         self._lessons = stack.enter_context(Publisher("lessons", endpoint, greeting=process.run))
         self.models = stack.enter_context(Subscriber("models", endpoint))
+        self.previews = stack.enter_context(Previews(endpoint))
         self._senders = [self._features] + ([self._results] if self._results else [])
         self._lockstep = process.settings.lockstep
         self._lag = 0 if self._lockstep else process.settings.lag_frames
@@ -151,6 +154,7 @@ class _Line:
         """Stay in touch while the source gives no frame; returns whether to wait no more."""
         for sender in self._senders:
             sender.listen(0)
+        self.previews.turn()
         self._process.beat(self._counters)
         return self._process.ended
 

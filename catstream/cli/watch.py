@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from catstream.box import Box
-from catstream.messages import Features, Health, Model, Sample, Track
+from catstream.messages import Features, Health, Model, Preview, Sample, Track
 from catstream.subscription import Subscription, subscribe
 
 __all__ = ["watch"]
@@ -80,6 +80,15 @@ def _features(message: Features) -> dict[str, str]:
     }
 
 
+def _preview(message: Preview) -> dict[str, str]:
+    return {
+        "frame": f"{message.frame}",
+        "size": f"{message.width} x {message.height}",
+        "box": _sides(message.box),
+        "bytes": f"{len(message.jpeg)}",
+    }
+
+
 def _health(message: Health) -> dict[str, str]:
     counters = (f"{name} {value:.0f}" for name, value in message.counters.items())
     return {"process": message.process, "counters": "  ".join(counters)}
@@ -92,6 +101,7 @@ _CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
     "health": _health,
     "samples": _sample,
     "features": _features,
+    "previews": _preview,
 }
 
 
@@ -113,6 +123,7 @@ def watch(channel: str, endpoint: str, as_json: bool, count: int | None) -> None
       health    what each process counts, once a second
       samples   what the trainer learns from, and the levels of the object's tree
       features  the rows that each frame teaches
+      previews  small pictures of the newest frame, about ten a second
 
     \b
     EXAMPLES
@@ -151,10 +162,12 @@ def _print_json(message: Any) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """A message for JSON; an array by what it is."""
+    """A message for JSON; an array, or a picture, by what it is."""
     if isinstance(value, np.ndarray):
         norm = float(np.linalg.norm(np.nan_to_num(value)))
         return {"dtype": value.dtype.name, "shape": value.shape, "norm": round(norm, 6)}
+    if isinstance(value, bytes):
+        return {"bytes": len(value)}
     if isinstance(value, Box):
         return list(value)
     if dataclasses.is_dataclass(value):

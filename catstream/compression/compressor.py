@@ -91,7 +91,7 @@ class Compressor:
     @property
     def leaves(self) -> int:
         """Leaves ever inserted into the trees."""
-        return sum(sum(1 << node.level for node in tree.nodes) for tree in self.trees.values())
+        return sum(self._leaves().values())
 
     def counters(self) -> dict[str, float]:
         """What health tells of it."""
@@ -100,6 +100,7 @@ class Compressor:
             "version": self.version,
             "rows": sum(tree.rows_seen for tree in self.trees.values()),
             "leaves": self.leaves,
+            **{f"{name}_leaves": leaves for name, leaves in self._leaves().items()},
             "level": max((node.level for tree in self.trees.values() for node in tree.nodes), default=0),
             "nodes": sum(len(tree.nodes) for tree in self.trees.values()),
             "bytes": sum(tree.nbytes for tree in self.trees.values()),
@@ -155,6 +156,10 @@ class Compressor:
                 "go on with the same settings"
             )
         return self
+
+    def _leaves(self) -> dict[str, int]:
+        """Of each tree: the levels of its nodes are the ones in this number's binary digits."""
+        return {name: sum(1 << node.level for node in tree.nodes) for name, tree in self.trees.items()}
 
     def _follow(self, box: Box | None) -> None:
         """Centres go out in whole blocks, so that the trainer learns the motion once a block."""

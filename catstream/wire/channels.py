@@ -6,6 +6,7 @@
     tracks     every message, to any number of readers; a slow one loses some, and sees by `seq` how many
     results    the tracks once more, acknowledged: for the one process that started the pipeline
     health     the newest of each process
+    previews   small pictures of the newest frame; none is made where nobody looks
     control    commands, each answered; who hears no answer asks again, and it is done once
     lessons    the features once more, to any number of readers; nothing is sent where there is none
 
@@ -18,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from catstream.messages import Answer, Command, End, Features, Health, Model, Run, Sample, Track
+from catstream.messages import Answer, Command, End, Features, Health, Model, Preview, Run, Sample, Track
 
 __all__ = ["CHANNELS", "PORT", "Channel"]
 
@@ -70,6 +71,7 @@ CHANNELS: dict[str, Channel] = {
         Channel("tracks", (Track, End), ("detector",), None, "every", port=3, megabytes=1),
         Channel("results", (Track, End), ("detector",), "owner", "every", port=4, megabytes=1),
         Channel("health", (Health,), ("detector", "compressor", "trainer"), None, "newest", port=5, megabytes=1),
+        Channel("previews", (Preview,), ("detector",), None, "newest", port=8, megabytes=1),
         Channel("control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=1),
         Channel("lessons", (Run, Features, End), ("detector",), None, "every", port=10, megabytes=64, depth=64),
     )

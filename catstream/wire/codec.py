@@ -34,6 +34,7 @@ from catstream.messages import (
     Model,
     Motion,
     Position,
+    Preview,
     Run,
     Sample,
     Stored,
@@ -49,7 +50,7 @@ VERSION = 1
 #: Kinds of message, by their name on the wire.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind
-    for kind in (Answer, Command, End, Features, Health, Model, Position, Run, Sample, Stored, Track)
+    for kind in (Answer, Command, End, Features, Health, Model, Position, Preview, Run, Sample, Stored, Track)
 }
 
 _F32, _F64 = np.dtype("<f4"), np.dtype("<f8")
@@ -75,6 +76,8 @@ _MAY_BE_NAN = {(Sample, "centres")}
 
 _LONGEST_TEXT = 4096  # bytes
 _LONGEST_LIST = 256  # entries of a list or map: levels of a tree, counters
+_LONGEST_PICTURE = 1 << 19  # bytes
+_JPEG = b"\xff\xd8\xff"  # what every one begins with
 _LARGEST_INTEGER = 2**53  # so that a reader in any language holds it exactly
 
 
@@ -196,6 +199,14 @@ def _check(message: Any) -> None:
         widths = [len(tree.mean) if tree is not None else d + 2 for tree in trees]
         if widths != [d, d + 2, d + 2]:
             raise ProtocolError(f"sample: expected trees of d, d, d + 2 and d + 2 columns, got {[d, *widths]}")
+    if isinstance(message, Preview):
+        if not (message.jpeg.startswith(_JPEG) and len(message.jpeg) <= _LONGEST_PICTURE):
+            raise ProtocolError(
+                f"preview jpeg: expected a JPEG of at most {_LONGEST_PICTURE} bytes, got {len(message.jpeg)} "
+                f"that begin with {message.jpeg[:3]!r}"
+            )
+        if not (message.width and message.height):
+            raise ProtocolError(f"preview: expected sides above 0, got {message.width} x {message.height}")
     if isinstance(message, Command) and (message.box is not None) != (message.verb == "set-box"):
         raise ProtocolError(f"command: expected a box with set-box and with nothing else, got {message.verb!r}")
 

@@ -1,0 +1,94 @@
+"""Pictures for those who look: small, of the newest frame, and none where nobody looks."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import cv2
+import numpy as np
+import pytest
+
+from catstream.box import Box
+from catstream.errors import SilenceError
+from catstream.services.previews import Previews
+from catstream.subscription import subscribe
+from catstream.video.demo import render
+from catstream.wire.endpoint import Endpoint
+
+
+@pytest.fixture
+def previews(folder):
+    with Previews(Endpoint.parse(str(folder))) as previews:
+        yield previews
+
+
+@pytest.fixture
+def looks(folder, previews, until):
+    """Somebody begins to look."""
+
+    def begin():
+        reader = subscribe(str(folder), "previews", timeout=60)
+        until(lambda: previews.heard, previews.turn)
+        return reader
+
+    return begin
+
+
+@pytest.fixture
+def until(until):
+    """Turns what waits for its turn, too."""
+    return lambda condition, turn: until(lambda: (turn(), condition())[1])
+
+
+def test_a_picture_is_small_and_says_how_large_the_frame_is(previews, looks):
+    image = np.zeros((720, 1280, 3), np.uint8)
+    with looks() as reader:
+        previews.show(7, image, Box(5.0, 6.0, 70.0, 80.0))
+        preview = next(reader)
+    assert (preview.frame, preview.width, preview.height) == (7, 1280, 720)
+    assert preview.box == Box(5.0, 6.0, 70.0, 80.0)
+    assert cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (360, 640, 3)
+
+
+def test_a_picture_shows_the_frame(previews, looks):
+    ((image, _),) = render(1, (320, 240))
+    with looks() as reader:
+        previews.show(0, image, None)
+        shown = cv2.imdecode(np.frombuffer(next(reader).jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert cv2.PSNR(shown, image) > 28
+
+
+def test_none_is_made_while_nobody_looks(previews, monkeypatch):
+    monkeypatch.setattr("catstream.services.previews.jpeg", None)  # to call it is an error
+    for frame in range(5):
+        previews.show(frame, np.zeros((48, 64, 3), np.uint8), None)
+
+
+def test_who_begins_to_look_while_no_frame_comes_sees_the_newest(previews, looks):
+    for frame in range(5):
+        previews.show(frame, np.zeros((48, 64, 3), np.uint8), None)
+    with looks() as reader:
+        previews.turn()
+        assert next(reader).frame == 4
+
+
+def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
+    seen = []
+    with looks() as reader:
+        reader.timeout = 0
+        for frame in range(200):
+            previews.show(frame, np.zeros((48, 64, 3), np.uint8), None)
+
+        def look():
+            previews.turn()
+            seen.extend(preview.frame for preview in _here(reader))
+
+        until(lambda: 199 in seen, look)
+    assert seen == sorted(set(seen))
+    assert len(seen) < 200
+
+
+def _here(reader):
+    """What has come already."""
+    with suppress(SilenceError):
+        yield from reader
