@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from accuracy import MEANS, accuracy_command, compared, difference, means, spread
-from sequences import sequences
+from accuracy import MEANS, accuracy_command, compared, difference, means, spread, videos
 from table import Table, publish
 
 from catstream.settings import PRESETS, Settings
@@ -52,7 +51,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     variants |= {"the paper's tracker": Settings(**PRESETS["one-class-paper"])}
     if options.quick:
         variants = dict(list(variants.items())[:2])
-    runs = compared(options, sequences(options), variants)
+    runs = compared(options, videos(options), variants)
     whole = runs["nothing left out"]
     rows = [(name, *means(found), spread(found), *difference(whole, found)) for name, found in runs.items()]
     columns = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error")

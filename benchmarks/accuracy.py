@@ -6,10 +6,12 @@ import argparse
 import os
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
+from sequences import sequences
 from table import command
 
 from catstream.evaluation.datasets import Sequence
@@ -18,7 +20,7 @@ from catstream.evaluation.runs import Run
 from catstream.evaluation.summary import rows_of
 from catstream.settings import Settings
 
-__all__ = ["accuracy_command", "compared", "difference", "means"]
+__all__ = ["accuracy_command", "compared", "difference", "means", "videos"]
 
 #: What `means` gives, as headings.
 MEANS = ("AUC", "success", "precision")
@@ -30,9 +32,15 @@ def accuracy_command(about: str | None, starts: int = 1) -> argparse.ArgumentPar
     parser.add_argument(
         "--starts", type=int, default=starts, help="frames of each to start from (default: %(default)s)"
     )
+    parser.add_argument("--frames", type=int, help="of each sequence, the first ones (default: all)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once (default: %(default)s)")
     parser.add_argument("--output", type=Path, help="folder that keeps runs: finished ones are not run again")
     return parser
+
+
+def videos(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
+    """The sequences to follow, those whose name begins so, cut to the first `--frames`."""
+    return [replace(found, boxes=found.boxes[: options.frames]) for found in sequences(options, prefix)]
 
 
 def compared(

@@ -14,8 +14,7 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
 
-from accuracy import accuracy_command, compared, means
-from sequences import sequences
+from accuracy import accuracy_command, compared, means, videos
 from table import Table, publish
 
 from catstream.settings import PRESETS, Settings
@@ -25,21 +24,21 @@ PAPER = {1: (0.49, 0.59), 2.5: (0.51, 0.59), 5: (0.53, 0.61), 10: (0.56, 0.62), 
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    videos = sequences(options, "TLD_")
+    found = videos(options, "TLD_")
     variants, sizes = {}, list(PAPER)[-1:] if options.quick else list(PAPER)
     for percent in sizes:
         share = {"coreset_share": percent / 100}
         copies = {"copies": int(25 // percent) - 1}
         variants[f"paper's, {percent} %"] = Settings(**PRESETS["one-class-paper"] | share | copies)
         variants[f"ours, {percent} %"] = Settings(**share)
-    runs = compared(options, videos, variants)
+    runs = compared(options, found, variants)
     rows = []
     for percent in sizes:
         theirs, ours = runs[f"paper's, {percent} %"], runs[f"ours, {percent} %"]
         panda = [run.score().success for run in theirs if "panda" in run.name]
         rows.append((f"{percent} %", means(ours)[1], means(theirs)[1], panda[0] if panda else None, *PAPER[percent]))
     columns = ("n", "ours: mean", "paper's way: mean", "paper's way: panda", "paper: mean of ten", "paper: Panda")
-    yield Table("Success against the size of the coreset", columns, rows, f"we: {len(videos)} videos of TLD")
+    yield Table("Success against the size of the coreset", columns, rows, f"we: {len(found)} videos of TLD")
 
 
 if __name__ == "__main__":

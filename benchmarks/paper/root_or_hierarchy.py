@@ -13,9 +13,8 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
 
-from accuracy import MEANS, accuracy_command, means, spread
+from accuracy import MEANS, accuracy_command, means, spread, videos
 from assembled import Recipe, follow_all
-from sequences import sequences
 from table import Table, publish
 
 from catstream.compression import sampling
@@ -41,7 +40,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     for source, tree in (("root", RootTree), ("hierarchy", CoresetTree)):
         recipes[f"paper's way, {source}"] = Recipe(Settings(**PRESETS["one-class-paper"]), tree)
         recipes[f"our settings, {source}"] = Recipe(Settings(), tree)
-    runs = follow_all(options, sequences(options), recipes)
+    runs = follow_all(options, videos(options), recipes)
     rows = [(name, *means(found), spread(found), *PAPER[name.split(", ")[1]]) for name, found in runs.items()]
     columns = ("learned from", *MEANS, "spread of AUC", "paper: success", "paper: precision")
     yield Table("Root or hierarchy", columns, rows, f"{options.starts} starts of each sequence")

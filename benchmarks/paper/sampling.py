@@ -18,9 +18,8 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
 
-from accuracy import accuracy_command, means
+from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
-from sequences import sequences
 from table import Table, publish
 
 from catstream.compression.tree import CoresetTree
@@ -98,7 +97,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
             for name, tree in TREES.items()
             for share in shares
         }
-        runs = follow_all(options, sequences(options, "TLD_"), recipes)
+        runs = follow_all(options, videos(options, "TLD_"), recipes)
         rows = []
         for name, printed in PAPER.items():
             rows.append((name, *(means(runs[f"{name}, {share}"])[1] for share in shares)))

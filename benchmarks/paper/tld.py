@@ -14,8 +14,7 @@ from statistics import fmean
 
 sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
 
-from accuracy import accuracy_command, compared
-from sequences import sequences
+from accuracy import accuracy_command, compared, videos
 from table import Table, publish
 
 from catstream.evaluation.summary import rows_of
@@ -34,14 +33,14 @@ PAPER = {
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     variants = {"defaults": Settings(), **{name: Settings(**PRESETS[name]) for name in ("cat25", "cat10")}}
-    videos = sequences(options, "TLD_")
+    found = videos(options, "TLD_")
     rows = []
-    for name, runs in compared(options, videos, variants).items():
+    for name, runs in compared(options, found, variants).items():
         found = [row.success for row in rows_of(runs)]
         rows.append((name, fmean(found), *found, *PAPER.get(name, (None, None))))
-    nothing = (None,) * (1 + len(videos))
+    nothing = (None,) * (1 + len(found))
     rows += [(name, *nothing, *printed) for name, printed in PAPER.items() if name not in variants]
-    names = [video.name.removeprefix("TLD_") for video in videos]
+    names = [video.name.removeprefix("TLD_") for video in found]
     yield Table("Success on TLD", ("tracker", "mean", *names, "paper: mean of ten", "paper: Panda"), rows)
 
 
