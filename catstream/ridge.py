@@ -7,7 +7,6 @@ By the push-through identity only a `rows x rows` system is solved, never a
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 
 __all__ = ["between", "fit"]
 
@@ -52,5 +51,7 @@ def fit(rows: np.ndarray, penalty: float) -> np.ndarray:
 
 
 def _solve(gram: np.ndarray, penalty: float, right: np.ndarray) -> np.ndarray:
+    import scipy.linalg  # a restarted detector has its model, and needs none of it
+
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
     return scipy.linalg.solve(gram, right, assume_a="pos", overwrite_a=True, check_finite=False)

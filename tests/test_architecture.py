@@ -31,7 +31,7 @@ HOMES = {
     "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
     "cv2": ["catstream/detection", "catstream/video", "catstream/evaluation/peers.py", "services/__main__.py"],
     "numba": ["catstream/detection"],
-    "filterpy": ["catstream/detection/motion.py", "catstream/training/motion_em.py"],
+    "filterpy": ["catstream/training/motion_em.py"],
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
     "safetensors": ["catstream/compression"],
     "av": ["catstream/video"],
@@ -44,7 +44,7 @@ HOMES = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"sklearn", "filterpy", "av"}
+SLOW = {"sklearn", "filterpy", "av", "scipy"}
 
 #: What a stage does not touch: it could run on a desert island.
 MAINLAND = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

@@ -7,7 +7,6 @@ the best n rows there are: no other n keep more of ||A||^2, the sum of squares.
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 
 __all__ = ["energy", "reduce"]
 
@@ -43,6 +42,8 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     >>> reduce(np.ones((6, 4), np.float32), size=2).shape
     (2, 4)
     """
+    import scipy.linalg  # a restarted compressor answers first
+
     m = len(rows)
     keep = min(size, m)
     gram = rows @ rows.T

@@ -43,64 +43,73 @@ class CentreFilter:
     """
 
     def __init__(self, motion: Motion, centre: tuple[float, float]) -> None:
-        from filterpy.kalman import KalmanFilter  # a second to import: not before there is a motion to use
-
-        self._kalman = KalmanFilter(dim_x=4, dim_z=2)
-        self._kalman.H = _OBSERVED
         self.adopt(motion)
         self._start(centre)
 
     @property
-    def centre(self) -> tuple[float, float]:
-        """Best estimate of x and y, in pixels."""
-        return float(self._kalman.x[0]), float(self._kalman.x[1])
-
-    @property
-    def velocity(self) -> tuple[float, float]:
-        """Best estimate of the way along x and y, in pixels a frame."""
-        return float(self._kalman.x[2]), float(self._kalman.x[3])
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation of the centre along its less certain direction, in pixels."""
-        return float(np.sqrt(np.linalg.eigvalsh(self._kalman.P[:2, :2])[-1]))
-
-    def predict(self) -> tuple[float, float]:
-        """Go on by a frame: the centre to expect in it."""
-        self._kalman.predict(F=_TRANSITION if self._seen else _COASTING)
-        return self.centre
-
-    def update(self, centre: tuple[float, float] | None) -> None:
-        """Take in the centre that was measured in this frame, None where the object is absent."""
-        self._seen = centre is not None
-        self._kalman.update(centre)
-        if centre is not None and self._kalman.mahalanobis > _JUMP:
-            self._start(centre)
-
-    def adopt(self, motion: Motion) -> None:
-        """Go on from here with other covariances."""
-        self._kalman.Q, self._kalman.R = motion.process, motion.observation
-
-    @property
     def motion(self) -> Motion:
         """The covariances it goes by."""
-        return Motion(self._kalman.Q, self._kalman.R)
+        return self._motion
 
     @property
     def state(self) -> np.ndarray:
         """Mean above covariance, float64 (5, 4): with `motion`, all that it knows."""
-        return np.vstack([self._kalman.x, self._kalman.P])
+        return np.vstack([self._mean, self._covariance])
 
     @classmethod
     def resumed(cls, motion: Motion, state: np.ndarray, seen: bool) -> CentreFilter:
         """A filter that goes on from another one's state, bit for bit; `seen` as the object was in its last frame."""
         self = cls(motion, (0.0, 0.0))
-        self._kalman.x, self._kalman.P, self._seen = state[0].copy(), state[1:].copy(), seen
+        self._mean, self._covariance, self._seen = state[0], state[1:], seen
         return self
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Best estimate of x and y, in pixels."""
+        return float(self._mean[0]), float(self._mean[1])
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """Best estimate of the way along x and y, in pixels a frame."""
+        return float(self._mean[2]), float(self._mean[3])
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the centre along its less certain direction, in pixels."""
+        return float(np.sqrt(np.linalg.eigvalsh(self._covariance[:2, :2])[-1]))
+
+    def predict(self) -> tuple[float, float]:
+        """Go on by a frame: the centre to expect in it."""
+        transition = _TRANSITION if self._seen else _COASTING
+        self._mean = transition @ self._mean
+        self._covariance = transition @ self._covariance @ transition.T + self._motion.process
+        return self.centre
+
+    def update(self, centre: tuple[float, float] | None) -> None:
+        """Take in the centre that was measured in this frame, None where the object is absent."""
+        self._seen = centre is not None
+        if centre is None:
+            return
+        noise = self._motion.observation
+        error = np.array(centre) - _OBSERVED @ self._mean
+        shared = self._covariance @ _OBSERVED.T
+        inverse = np.linalg.inv(_OBSERVED @ shared + noise)
+        if np.sqrt(error @ inverse @ error) > _JUMP:
+            self._start(centre)
+            return
+        gain = shared @ inverse
+        left = np.eye(4) - gain @ _OBSERVED
+        self._mean = self._mean + gain @ error
+        # Joseph's form: it stays symmetric and positive.
+        self._covariance = left @ self._covariance @ left.T + gain @ noise @ gain.T
+
+    def adopt(self, motion: Motion) -> None:
+        """Go on from here with other covariances."""
+        self._motion = motion
 
     def _start(self, centre: tuple[float, float]) -> None:
         self._seen = True
-        self._kalman.x = np.array([*centre, 0.0, 0.0])
-        self._kalman.P = np.zeros((4, 4))
-        self._kalman.P[:2, :2] = self._kalman.R
-        self._kalman.P[2:, 2:] = _UNKNOWN_SPEED * self._kalman.Q[2:, 2:]
+        self._mean: np.ndarray = np.array([*centre, 0.0, 0.0])
+        self._covariance: np.ndarray = np.zeros((4, 4))
+        self._covariance[:2, :2] = self._motion.observation
+        self._covariance[2:, 2:] = _UNKNOWN_SPEED * self._motion.process[2:, 2:]
