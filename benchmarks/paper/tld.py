@@ -36,8 +36,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     found = videos(options, "TLD_")
     rows = []
     for name, runs in compared(options, found, variants).items():
-        found = [row.success for row in rows_of(runs)]
-        rows.append((name, fmean(found), *found, *PAPER.get(name, (None, None))))
+        success = [row.success for row in rows_of(runs)]
+        rows.append((name, fmean(success), *success, *PAPER.get(name, (None, None))))
     nothing = (None,) * (1 + len(found))
     rows += [(name, *nothing, *printed) for name, printed in PAPER.items() if name not in variants]
     names = [video.name.removeprefix("TLD_") for video in found]
