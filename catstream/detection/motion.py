@@ -43,6 +43,7 @@ class CentreFilter:
     """
 
     def __init__(self, motion: Motion, centre: tuple[float, float]) -> None:
+        self._mean, self._covariance = np.empty(4), np.empty((4, 4))
         self.adopt(motion)
         self._start(centre)
 
@@ -109,7 +110,7 @@ class CentreFilter:
 
     def _start(self, centre: tuple[float, float]) -> None:
         self._seen = True
-        self._mean: np.ndarray = np.array([*centre, 0.0, 0.0])
-        self._covariance: np.ndarray = np.zeros((4, 4))
+        self._mean = np.array([*centre, 0.0, 0.0])
+        self._covariance = np.zeros((4, 4))
         self._covariance[:2, :2] = self._motion.observation
         self._covariance[2:, 2:] = _UNKNOWN_SPEED * self._motion.process[2:, 2:]
