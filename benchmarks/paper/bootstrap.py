@@ -1,0 +1,61 @@
+"""The paper's bootstrap against ours: who follows better until there is a model to learn.
+
+The paper begins with SCM, a sparse collaborative model in a particle filter, for the first n frames; we with affine
+copies of the first box and ridge regression, and learn from the first leaf on. Both follow the same n frames, from
+several places of each sequence. The paper prints no figures of its bootstrap alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+
+from accuracy import MEANS, accuracy_command, compared, difference, means, videos
+from table import Table, publish
+
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.onepass import starts_of
+from catstream.settings import Settings
+
+#: Bootstrap -> its settings. SCM follows all n frames where each gives one row: no copies.
+BOOTSTRAPS: dict[str, dict[str, Any]] = {"copies": {}, "scm": {"bootstrap": "scm", "copies": 0}}
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    base = Settings(coreset_size=options.size)
+    places = 1 if options.quick else options.starts
+    pieces = [piece for found in videos(options) for piece in pieces_of(found, places, options.size)]
+    options.starts = 1  # of each piece
+    runs = compared(options, pieces, {name: replace(base, **changes) for name, changes in BOOTSTRAPS.items()})
+    rows = []
+    for name, found in runs.items():
+        rate = sum(len(run.seconds) for run in found) / sum(float(run.seconds.sum()) for run in found)
+        rows.append((name, *means(found), *difference(found, runs["scm"]), rate))
+    columns = ("bootstrap", *MEANS, "AUC above scm", "± standard error", "frames/s")
+    yield Table(f"The first {options.size} frames", columns, rows, f"{len(pieces)} pieces")
+
+
+def pieces_of(sequence: Sequence, places: int, frames: int) -> list[Sequence]:
+    """`frames` frames from each of several places where the object is there, as sequences of their own."""
+    return [
+        replace(
+            sequence,
+            name=f"{sequence.name}-{start}",
+            boxes=sequence.boxes[start : start + frames],
+            begin=sequence.begin + start,
+        )
+        for start in starts_of(sequence, places)
+    ]
+
+
+if __name__ == "__main__":
+    parser = accuracy_command(__doc__, starts=3)
+    parser.add_argument("--size", type=int, default=64, help="n, in frames and rows (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)
