@@ -59,9 +59,9 @@ def around(journey: Journey, frame: int, turn: int) -> float:
 
 def memory(journey: Journey, early: int) -> Iterator[tuple[str, float, float, float]]:
     """Resident megabytes of each process: early, last and most."""
-    for name, seen in journey.memory.items():
-        megabytes = [resident for _, resident in seen]
-        first = next(resident for frame, resident in seen if frame >= early)
+    for name, looks in journey.looks.items():
+        megabytes = [look.megabytes for look in looks]
+        first = next(look.megabytes for look in looks if look.frame >= early)
         yield name, first, megabytes[-1], max(megabytes)
 
 

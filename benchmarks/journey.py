@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -16,18 +18,26 @@ from catstream.settings import Settings
 __all__ = ["Journey", "draw", "travel"]
 
 
+class Look(NamedTuple):
+    """A process at one moment: resident megabytes, and seconds of a processor that it has used."""
+
+    frame: int
+    megabytes: float
+    seconds: float
+
+
 @dataclass(slots=True)
 class Journey:
     """What was seen of one run.
 
     boxes    a row a frame, x, y, w, h in pixels; NaN where absent
     moments  seconds from the start to the track of each frame
-    memory   of each process: (frame, resident megabytes), now and then
+    looks    at each process, now and then
     """
 
     boxes: list[Sequence[float]] = field(default_factory=list)
     moments: list[float] = field(default_factory=list)
-    memory: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
+    looks: dict[str, list[Look]] = field(default_factory=dict)
 
     @property
     def rate(self) -> float:
@@ -39,9 +49,17 @@ class Journey:
         """Between each track and the one before it, float64 (frames - 1,)."""
         return np.diff(self.moments) * 1000
 
+    def work(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Frames, and milliseconds of a processor that a process took for each since the look before.
+
+        Other work on the machine hardly changes it, as it does the time between tracks.
+        """
+        frames, _, seconds = np.array(self.looks[name], float).T
+        return frames[1:], np.diff(seconds) / np.diff(frames) * 1000
+
 
 def travel(source: str, box: Sequence[float], settings: Settings, watch: int = 250) -> Journey:
-    """Run a pipeline to the end of its source; look at the processes' memory each `watch` frames."""
+    """Run a pipeline to the end of its source; look at the processes each `watch` frames."""
     journey, begin = Journey(), perf_counter()
     with Pipeline(source, box, settings) as pipeline:
         for track in pipeline:
@@ -49,37 +67,34 @@ def travel(source: str, box: Sequence[float], settings: Settings, watch: int = 2
             journey.boxes.append(track.box or (np.nan,) * 4)
             if track.frame % watch == 0:
                 for name, pid in pipeline.pids.items():
-                    if megabytes := resident(pid):
-                        journey.memory.setdefault(name, []).append((track.frame, megabytes))
+                    with suppress(psutil.Error):  # it has just ended
+                        process = psutil.Process(pid)
+                        seconds = sum(process.cpu_times()[:2])
+                        look = Look(track.frame, process.memory_info().rss / 1e6, seconds)
+                        journey.looks.setdefault(name, []).append(look)
     return journey
 
 
-def resident(pid: int) -> float:
-    """Megabytes of a process; 0 where it has just ended."""
-    try:
-        return psutil.Process(pid).memory_info().rss / 1e6
-    except psutil.Error:
-        return 0.0
-
-
 def draw(journeys: dict[str, Journey], file: Path, blocks: int = 80) -> None:
-    """Plot time a frame, the median of each block of frames, and memory against frames, one above the other."""
+    """Plot against frames: time a frame, the median of each block; what each process took for one; and memory."""
     import matplotlib
 
     matplotlib.use("agg")
     from matplotlib import pyplot
 
-    figure, (time, memory) = pyplot.subplots(2, 1, sharex=True, figsize=(8, 6), layout="constrained")
+    figure, (time, work, memory) = pyplot.subplots(3, 1, sharex=True, figsize=(8, 8), layout="constrained")
     for label, journey in journeys.items():
         parts = np.array_split(journey.milliseconds, blocks)
         time.plot(np.cumsum([len(part) for part in parts]), [np.median(part) for part in parts], label=label)
-        for name, seen in journey.memory.items():
-            memory.plot(*zip(*seen, strict=True), label=f"{label} {name}".strip())
+        for name, looks in journey.looks.items():
+            work.plot(*journey.work(name), label=f"{label} {name}".strip())
+            memory.plot([look.frame for look in looks], [look.megabytes for look in looks])
     time.set(ylabel="ms a frame (median)", ylim=(0, None))
+    work.set(ylabel="processor time, ms a frame", ylim=(0, None))
     memory.set(ylabel="resident memory, MB", xlabel="frame", ylim=(0, None))
     if len(journeys) > 1:
         time.legend()
-    memory.legend(fontsize="small")
+    work.legend(fontsize="small")
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=120)
     pyplot.close(figure)

@@ -90,16 +90,28 @@ def lengthened(sequence: Sequence, frames: int) -> tuple[Path, np.ndarray]:
     return path, np.array(truth)
 
 
-GROWTH = ("ms, first tenth", "ms, last tenth", "ratio", "MB, first tenth", "MB at the end")
+GROWTH = (
+    "ms, first tenth",
+    "ms, last tenth",
+    "ratio",
+    "processor ms, first tenth",
+    "last tenth",
+    "ratio",
+    "MB, first tenth",
+    "MB at the end",
+)
 
 
 def growth(journey: Journey) -> tuple[float, ...]:
-    """Median milliseconds a frame, and memory of all processes, early and late."""
+    """Early and late: median milliseconds a frame, those of a processor of all processes together, and their memory."""
     tenth = max(len(journey.milliseconds) // 10, 1)
     early, late = np.median(journey.milliseconds[:tenth]), np.median(journey.milliseconds[-tenth:])
-    before = sum(seen[len(seen) // 10][1] for seen in journey.memory.values())
-    after = sum(seen[-1][1] for seen in journey.memory.values())
-    return float(early), float(late), float(late / early), before, after
+    work = [journey.work(name)[1] for name in journey.looks]
+    few = max(len(work[0]) // 10, 1)
+    began, ended = (sum(float(each[part].mean()) for each in work) for part in (slice(few), slice(-few, None)))
+    before = sum(looks[len(looks) // 10].megabytes for looks in journey.looks.values())
+    after = sum(looks[-1].megabytes for looks in journey.looks.values())
+    return float(early), float(late), float(late / early), began, ended, ended / began, before, after
 
 
 if __name__ == "__main__":
