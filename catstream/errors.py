@@ -9,6 +9,7 @@ __all__ = [
     "BoxError",
     "CatstreamError",
     "ProtocolError",
+    "RecordingError",
     "RefusedError",
     "ServiceError",
     "SettingsError",
@@ -35,6 +36,10 @@ class VideoError(CatstreamError):
 
 class ProtocolError(CatstreamError, ValueError):
     """A message that is not what the channel carries."""
+
+
+class RecordingError(CatstreamError):
+    """A recording that cannot be written or read, or that is not whole enough."""
 
 
 class ServiceError(CatstreamError):

@@ -12,10 +12,11 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 from typing import Self
 
 from catstream.box import Box
-from catstream.errors import ServiceError, SettingsError, VideoError
+from catstream.errors import RecordingError, ServiceError, SettingsError, VideoError
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
@@ -44,6 +45,7 @@ class Pipeline:
     box : x, y, w, h of the object in the first frame, in pixels
     settings : all defaults where None
     part : which frames of a file or folder there are to follow, `slice(100, 200, 2)` for 100, 102 ... 198
+    record : file to write all that travels to, see `catstream.recording`; no features are missing there
 
     Attributes
     ----------
@@ -53,6 +55,8 @@ class Pipeline:
     ------
     BoxError, VideoError
         From the constructor, for a box that is not in the frame or a source that cannot be read.
+    RecordingError
+        From the constructor, where the file to record to is there already.
     SettingsError
         From the constructor, for settings that the source cannot be followed with: a live one in lockstep.
     ServiceError
@@ -62,14 +66,23 @@ class Pipeline:
     """
 
     def __init__(
-        self, source: str, box: Sequence[float], settings: Settings | None = None, *, part: slice = WHOLE
+        self,
+        source: str,
+        box: Sequence[float],
+        settings: Settings | None = None,
+        *,
+        part: slice = WHOLE,
+        record: str | Path | None = None,
     ) -> None:
         self.settings = settings or Settings()
         self._source, self._box, self._part = str(source), Box(*map(float, box)), part
+        self._record = None if record is None else Path(record)
         self._end: End | None = None
         self._health: dict[str, Health] = {}
         if self.settings.lockstep and is_live(self._source):
             raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
+        if self._record is not None and self._record.exists():
+            raise RecordingError(f"{record} is there already: give another name, or remove it")
         # The detector opens the source once more: a camera shows its picture to one at a time.
         with open_source(self._source, part=part) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
@@ -85,7 +98,9 @@ class Pipeline:
             self._results = stack.enter_context(Receiver("results", endpoint, Position(), self.settings.window))
             self._reports = stack.enter_context(Subscriber("health", endpoint))
             settings = replace(self.settings, endpoint=self.endpoint)
-            self._supervisor = Supervisor(self._source, self._box, settings, folder, owned=True, part=self._part)
+            self._supervisor = Supervisor(
+                self._source, self._box, settings, folder, owned=True, part=self._part, record=self._record
+            )
             stack.callback(self._supervisor.stop)
             self._stack = stack.pop_all()
         return self

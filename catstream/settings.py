@@ -205,11 +205,7 @@ class Settings:
         if isinstance(overrides, Mapping):
             values.update(overrides)
         else:
-            for pair in overrides:
-                name, sign, text = pair.partition("=")
-                if not sign:
-                    raise SettingsError(f"a setting is given as name=value, got {pair!r}")
-                values[name.strip()] = text.strip()
+            values.update(map(_pair, overrides))
         return cls.of(values)
 
     @classmethod
@@ -246,6 +242,14 @@ class Settings:
             )
         size = {"coreset_size": max(2, round(self.coreset_share * frames)), "coreset_share": 0.0}
         return Settings.of(self.values() | size)
+
+    def but(self, pairs: Iterable[str]) -> Settings:
+        """These, but for some: texts `name=value` as `--set` takes them.
+
+        >>> Settings(lockstep=True).but(["coreset_size=32"]).changed()
+        ['lockstep=true', 'coreset_size=32']
+        """
+        return Settings.of(self.values() | dict(map(_pair, pairs)))
 
     def values(self) -> dict[str, Any]:
         """All of them, by name."""
@@ -299,6 +303,13 @@ def describe() -> list[tuple[str, str, Any, str]]:
         text = " | ".join(map(str, options)) if options else kind.__name__
         rows.append((field.name, " ".join([text, ", ".join(bounds)]).strip(), field.default, meta.description))
     return rows
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, sign, value = text.partition("=")
+    if not sign:
+        raise SettingsError(f"a setting is given as name=value, got {text!r}")
+    return name.strip(), value.strip()
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -19,13 +19,16 @@ from typing import Generic, Literal, Self, TypeVar, overload
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import find
+from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.sockets import Subscriber
 
-__all__ = ["Subscription", "subscribe"]
+__all__ = ["Subscription", "knock", "subscribe"]
 
 #: Seconds that the last messages have to come in after the end was heard: it travels by itself.
 _LAST_WORDS = 0.5
+
+#: Seconds to wait for a sign of life: each process of a running pipeline is heard once a second.
+_PATIENCE = 5.0
 
 #: What one can subscribe to, and its channel: of features, that of the copies.
 _OPEN = {
@@ -216,3 +219,18 @@ def subscribe(endpoint: str, channel: str, *, timeout: float | None = None) -> S
         Where there is no such channel, or `endpoint` is empty and not just one pipeline runs.
     """
     return Subscription(endpoint, channel, timeout=timeout)
+
+
+def knock(endpoint: str) -> Endpoint:
+    """Where a pipeline runs, once it is heard: tracks and models may be silent for long where one does.
+
+    Raises
+    ------
+    ServiceError
+        Where `endpoint` is empty and not just one pipeline runs.
+    SilenceError
+        Where none is heard within seconds.
+    """
+    with subscribe(endpoint, "health", timeout=_PATIENCE) as health:
+        next(health, None)
+        return Endpoint.parse(health.endpoint)

@@ -52,6 +52,7 @@ _box = click.option("--box", required=True, metavar="X,Y,W,H", help="The object 
 @_box
 @click.option("--resume", is_flag=True, help="Go on where a detector before this one stopped.")
 @click.option("--owned", is_flag=True, help="Somebody takes every track from the channel `results`.")
+@click.option("--recorded", is_flag=True, help="Begin once somebody listens to the tracks: the compressor records.")
 @click.option("--since", type=float, hidden=True, help="Moment that the times of a live source count from.")
 @with_part
 @with_settings
@@ -69,13 +70,14 @@ def detector(parent: int | None, settings: Settings, source: str, box: str, **op
 
 @main.command()
 @click.option("--state", type=click.Path(path_type=Path), help="Folder of the checkpoint to go on from.")
+@click.option("--record", type=click.Path(path_type=Path), help="File to write all that travels to, or to go on with.")
 @with_settings
 @click.pass_obj
-def compressor(parent: int | None, settings: Settings, state: Path | None) -> None:
+def compressor(parent: int | None, settings: Settings, **options: Any) -> None:
     """Features in, samples out; owns the coreset trees."""
     from catstream.services import compressor
 
-    sys.exit(run("compressor", partial(compressor.main, state=state), settings, parent))
+    sys.exit(run("compressor", partial(compressor.main, **options), settings, parent))
 
 
 @main.command()

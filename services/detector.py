@@ -32,6 +32,7 @@ def main(
     *,
     resume: bool,
     owned: bool,
+    recorded: bool = False,
     part: slice = WHOLE,
     since: float | None = None,
 ) -> None:
@@ -43,10 +44,13 @@ def main(
     box : of the object in the first frame
     resume : go on where a detector before this one stopped
     owned : somebody takes every track from the channel `results`
+    recorded : begin once somebody listens to the tracks
     part, since : as `open_source` takes them
     """
     with ExitStack() as stack:
         line = _Line(process, stack, owned)
+        if recorded:
+            line.wait_for_listener()
         detector = Detector(process.settings)
         if resume:
             line.resume(detector, box)
@@ -98,6 +102,13 @@ class _Line:
         self._lag = 0 if self._lockstep else process.settings.lag_frames
         self._version = 0
         self.source: Source | None = None
+
+    def wait_for_listener(self) -> None:
+        """Wait until somebody listens to the tracks."""
+        while not self._tracks.heard:
+            self._features.listen(0.02)
+            self._tracks.welcome()
+            self._turn()
 
     def resume(self, detector: Detector, first: Box) -> None:
         """Go on after the last frame that all receivers have; from the start where there is no model yet."""

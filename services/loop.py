@@ -8,10 +8,10 @@ import os
 import signal
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 
 from catstream.errors import CatstreamError
 from catstream.messages import Health, Run
+from catstream.recording.file import run_of
 from catstream.settings import Settings
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
@@ -49,9 +49,7 @@ class Process:
     @property
     def run(self) -> Run:
         """What this pipeline runs with, for those who want to learn from its features once more."""
-        settings = self.settings.texts()
-        del settings["endpoint"]  # of this machine, and of no meaning to them
-        return Run(version("catstream"), settings)
+        return run_of(self.settings)
 
     def ended_for(self, seconds: float) -> bool:
         """Whether it was asked to end, at least so long ago."""

@@ -81,13 +81,23 @@ class Supervisor:
     folder : where checkpoints and logs are kept while the pipeline runs
     owned : whether somebody takes every track from the channel `results`
     part : which frames of the source there are to follow
+    record : file to write all that travels to, or to go on with
     """
 
     def __init__(
-        self, source: str, box: Box, settings: Settings, folder: Path, *, owned: bool, part: slice = WHOLE
+        self,
+        source: str,
+        box: Box,
+        settings: Settings,
+        folder: Path,
+        *,
+        owned: bool,
+        part: slice = WHOLE,
+        record: Path | None = None,
     ) -> None:
         self._source, self._box, self._settings, self._folder, self._owned = source, box, settings, folder, owned
         self._part = {"--start": part.start, "--end": part.stop, "--stride": part.step}
+        self._record = record
         self._since = time.monotonic()  # a restarted detector goes on with the times of a live source
         self._children = {name: _Child(name, (folder / f"{name}.log").open("w+b")) for name in NAMES}
         for child in self._children.values():
@@ -179,8 +189,10 @@ class Supervisor:
             for option, number in self._part.items():
                 command += [] if number is None else [option, str(number)]
             command += ["--owned"] * self._owned + ["--resume"] * bool(child.restarts)
+            command += ["--recorded"] * (self._record is not None)
         if child.name == "compressor":
             command += ["--state", str(self._folder)]
+            command += [] if self._record is None else ["--record", str(self._record)]
         child.seen = time.monotonic()
         own = {name: value for name, value in os.environ.items() if not name.startswith("CATSTREAM_")}
         child.process = subprocess.Popen(

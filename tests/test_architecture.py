@@ -18,7 +18,7 @@ FLOORS = [
     {"box"},
     {"messages", "settings", "ridge", "html"},
     {"detection", "compression", "training", "wire", "video"},
-    {"tracker", "subscription", "steering"},
+    {"tracker", "subscription", "steering", "recording"},
     {"services"},
     {"pipeline"},
     {"evaluation"},
@@ -38,7 +38,7 @@ HOMES = {
     "zmq": ["catstream/wire/sockets.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
-    "threadpoolctl": ["catstream/evaluation/onepass.py"],
+    "threadpoolctl": ["catstream/evaluation/onepass.py", "catstream/recording/learning.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "rich": ["catstream/cli"],
 }

@@ -17,6 +17,8 @@ VERBS = {
     "demo": "See it work, on a video that is rendered for it.",
     "evaluate": "Measure accuracy on annotated sequences, beside other trackers.",
     "watch": "Show what a running pipeline says, as it says it.",
+    "record": "Keep what a running pipeline says, in one file.",
+    "replay": "Play a recording to subscribers, or learn from it once more.",
     "status": "Ask a running pipeline how it is.",
     "settings": "List all settings, with their defaults and meaning.",
 }

@@ -17,6 +17,7 @@ from rich.text import Text
 from catstream.box import Box
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
+from catstream.recording.file import Recording
 from catstream.services.options import with_part, with_settings
 from catstream.settings import Settings
 from catstream.video.results import ResultsWriter
@@ -32,6 +33,7 @@ _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 @click.option("--box", required=True, metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
+@click.option("--record", type=click.Path(path_type=Path), help="File to record the run to: `catstream replay`.")
 @click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
 @with_part
 @with_settings
@@ -42,6 +44,7 @@ def track(
     box: str,
     output: Path | None,
     video: bool,
+    record: Path | None,
     lockstep: bool,
 ) -> None:
     """Follow an object through a video, from its box in the first frame.
@@ -69,6 +72,7 @@ def track(
       catstream track frames/ --box 120,80,64,48 --output out --set coreset_size=128
       catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
       catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
+      catstream track walk.mp4 --box 120,80,64,48 --record walk.rec
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
     """
     if video and output is None:
@@ -77,7 +81,7 @@ def track(
         raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
     if lockstep:
         settings = Settings.of({**settings.values(), "lockstep": True})
-    pipeline = Pipeline(source, Box.parse(box), settings, part=part)
+    pipeline = Pipeline(source, Box.parse(box), settings, part=part, record=record)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console(stderr=True, soft_wrap=True)
     run = _Run(pipeline)
@@ -97,6 +101,8 @@ def track(
     finally:
         if run.frames:
             console.print(run.summary(output), highlight=False)
+            if record is not None:
+                console.print(f"recording: {record}, {Recording(record)}", highlight=False)
     if interrupted:
         console.print("stopped: the results so far are kept")
         sys.exit(_INTERRUPTED)

@@ -20,11 +20,10 @@ from rich.text import Text
 
 from catstream.box import Box
 from catstream.messages import Features, Health, Model, Preview, Sample, Track
-from catstream.subscription import Subscription, subscribe
+from catstream.subscription import Subscription, knock, subscribe
 
 __all__ = ["watch"]
 
-_PATIENCE_SECONDS = 5.0  # each process of a running pipeline is heard once a second
 _RATE_SECONDS = 2.0  # that the rate is the mean of
 _ROWS = 16  # of the newest messages that a terminal shows
 _REFRESHES = 8  # a second
@@ -135,7 +134,7 @@ def watch(channel: str, endpoint: str, as_json: bool, count: int | None) -> None
     seen = 0
     with subscribe(endpoint, channel) as messages:  # type: ignore[call-overload]
         with suppress(KeyboardInterrupt), ExitStack() as stack:
-            _knock(messages.endpoint)
+            knock(messages.endpoint)
             if as_json:
                 show = _print_json
             elif Console().is_terminal:
@@ -149,12 +148,6 @@ def watch(channel: str, endpoint: str, as_json: bool, count: int | None) -> None
                     break
         reason = f": {messages.end.reason}" if messages.end is not None else ""
         click.echo(f"{seen} {channel}, {messages.missed} missed{reason}", err=True)
-
-
-def _knock(endpoint: str) -> None:
-    """Raise SilenceError where no pipeline runs: tracks and models may be silent for long where one does."""
-    with subscribe(endpoint, "health", timeout=_PATIENCE_SECONDS) as health:
-        next(health, None)
 
 
 def _print_json(message: Any) -> None:

@@ -1,0 +1,145 @@
+"""`catstream replay`: play a recording to subscribers, or learn from it once more."""
+
+from __future__ import annotations
+
+import signal
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.table import Table
+
+from catstream.errors import RecordingError
+from catstream.messages import Features, Model, Track
+from catstream.recording.file import Recording, RecordingWriter, run_of
+from catstream.recording.learning import Lesson, Marks, learn, marks_of
+from catstream.recording.player import Player
+from catstream.wire.endpoint import meeting_place, private_folder
+
+__all__ = ["replay"]
+
+
+@click.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--endpoint", default="", metavar="PLACE", help="Where subscribers attach; a fresh place if not given.")
+@click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Times as fast as it was recorded.")
+@click.option("--fast", is_flag=True, help="As fast as it goes.")
+@click.option("--wait", is_flag=True, help="Begin once somebody listens to the tracks.")
+@click.option("--learn", "learns", is_flag=True, help="Learn from the recorded features once more.")
+@click.option("--set", "pairs", multiple=True, metavar="NAME=VALUE", help="With --learn, a setting that was another.")
+@click.option(
+    "--output", type=click.Path(path_type=Path), help="With --learn, record the models that it gives to this."
+)
+@click.option("--incomplete", is_flag=True, help="With --learn, go on where features are missing.")
+def replay(
+    recording: Path,
+    endpoint: str,
+    speed: float,
+    fast: bool,
+    wait: bool,
+    learns: bool,
+    pairs: tuple[str, ...],
+    output: Path | None,
+    incomplete: bool,
+) -> None:
+    """Play a recording to subscribers, or learn from it once more.
+
+    Without --learn its tracks, models, features and health are sent as the
+    pipeline sent them: catstream watch, status and every subscriber work.
+
+    With --learn its features go through a fresh compressor and trainer, without
+    the video. With the settings of then, every recorded model must come out
+    again, bit for bit; the exit code is 1 where one does not. --set shows what
+    other settings would have made of the same features.
+
+    \b
+    The table of --learn
+      models     how many; a pipeline skips samples that are stale, the replay none
+      identical  recorded models that came out again, of those of the same version and frame
+      rows       put into the coreset trees
+      levels     of the nodes of the object's tree, oldest first
+      MB         of all trees in memory
+      seconds    of compression and training
+      error      mean squared error of the scores of rows of frames that the model had not seen
+      apart      share of such frames in which all of the object scores above all background
+
+    \b
+    EXAMPLES
+      catstream replay walk.rec --wait
+      catstream replay walk.rec --endpoint run --fast
+      catstream replay walk.rec --learn
+      catstream replay walk.rec --learn --set coreset_size=128 --output larger.rec
+    """
+    if not learns and (pairs or output or incomplete):
+        raise click.UsageError("--set, --output and --incomplete go with --learn")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    found, console = Recording(recording), Console(stderr=True)
+    console.print(f"{recording}: {found}", highlight=False, soft_wrap=True)
+    if learns:
+        _learn(found, pairs, output, incomplete, console)
+    else:
+        with suppress(KeyboardInterrupt):
+            _play(found, endpoint, None if fast else speed, wait, console)
+
+
+def _play(recording: Recording, endpoint: str, speed: float | None, wait: bool, console: Console) -> None:
+    with ExitStack() as stack:
+        place = stack.enter_context(meeting_place(endpoint, stack.enter_context(private_folder())))
+        player = stack.enter_context(Player(recording, place))
+        status = stack.enter_context(console.status(f"at {place}, waiting for a subscriber"))
+        if wait:
+            player.wait()
+        for message in player.play(speed):
+            if isinstance(message, Track):
+                status.update(f"at {place}, frame {message.frame} of {recording.counts[Track]} recorded")
+
+
+def _learn(
+    recording: Recording, pairs: tuple[str, ...], output: Path | None, incomplete: bool, console: Console
+) -> None:
+    then, total = recording.settings, recording.counts[Features]
+    trials = {"the same": then}
+    if pairs:
+        trials[" ".join(pairs)] = then.but(pairs).for_length(total)
+    newest = next(reversed(trials))
+    table = Table("settings", box=None, header_style="bold", pad_edge=False)
+    for name in ("models", "identical", "rows", "levels", "MB", "seconds", "error", "apart"):
+        table.add_column(name, justify="right")
+    recorded = recording.counts[Model]
+    table.add_row("as recorded", f"{recorded}", *["-"] * 5, *_shown(marks_of(recording)))
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn())
+    with ExitStack() as stack:
+        progress = stack.enter_context(Progress(*columns, console=console, transient=True))
+        writer = stack.enter_context(RecordingWriter(output, run_of(trials[newest]))) if output else None
+        for name, settings in trials.items():
+            task = progress.add_task(name, total=total)
+            lesson = learn(
+                recording,
+                settings,
+                incomplete=incomplete,
+                keep=writer.write if writer is not None and name == newest else None,
+                step=partial(progress.advance, task),
+            )
+            same = f"{lesson.identical} of {recorded}"
+            table.add_row(name, f"{lesson.models}", same, *_told(lesson), *_shown(lesson.marks))
+            if settings is then:
+                differing = recorded - lesson.identical
+    Console().print(table)
+    if differing and not incomplete:
+        raise RecordingError(
+            f"{differing} of {recorded} recorded models did not come out again: the machine, or the version of a "
+            f"library, is another than that of the recording by catstream {recording.run.program}"
+        )
+
+
+def _told(lesson: Lesson) -> list[str]:
+    levels = " ".join(map(str, lesson.levels))
+    rows, megabytes = lesson.counters["rows"], lesson.counters["bytes"] / 1e6
+    return [f"{rows:.0f}", levels, f"{megabytes:.1f}", f"{lesson.seconds:.2f}"]
+
+
+def _shown(marks: Marks) -> list[str]:
+    return [f"{marks.error:.4f}", f"{marks.apart:.3f}"]

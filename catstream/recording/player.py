@@ -1,0 +1,90 @@
+"""Play a recording to subscribers, on the channels on which the pipeline said it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any, Self
+
+from catstream.messages import End, Features, Health, Model, Run, Track
+from catstream.recording.file import Recording
+from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Publisher
+
+__all__ = ["Player"]
+
+_TURN_SECONDS = 0.05  # between two looks for who has come
+_CHANNEL = {Features: "lessons", Model: "models", Track: "tracks"}
+
+
+class Player:
+    """The sending side of a pipeline that is over; a context manager.
+
+    Subscribers cannot tell it from one that runs, but for commands, which nobody answers. A slow one misses
+    messages here too.
+
+    Parameters
+    ----------
+    recording : what is played
+    endpoint : where those who listen attach
+    """
+
+    def __init__(self, recording: Recording, endpoint: Endpoint) -> None:
+        self._recording = recording
+        with ExitStack() as stack:
+            self._publishers = {
+                name: stack.enter_context(Publisher(name, endpoint, greeting=greeting))
+                for name, greeting in (("lessons", recording.run), ("models", None), ("tracks", None))
+            }
+            for name in CHANNELS["health"].senders:
+                self._publishers[name] = stack.enter_context(Publisher("health", endpoint, name))
+            self._stack = stack.pop_all()
+
+    def wait(self) -> None:
+        """Wait until somebody listens to the tracks."""
+        while not self._publishers["tracks"].heard:
+            self._rest(_TURN_SECONDS)
+
+    def play(self, speed: float | None = 1.0) -> Iterator[Any]:
+        """Send every message, and yield it; the last is an `End`.
+
+        Parameters
+        ----------
+        speed : how many times as fast as it was recorded; None for as fast as it goes
+        """
+        began, first, seq = time.monotonic(), 0.0, 0
+        for moment, message in self._recording.messages():
+            if isinstance(message, Run | End):
+                continue
+            first = first or moment
+            while speed is not None and (rest := (moment - first) / speed - (time.monotonic() - began)) > 0:
+                self._rest(min(rest, _TURN_SECONDS))
+            if isinstance(message, Health):
+                self._publishers[message.process].send(replace(message, time=time.time()))
+            else:
+                self._publishers[_CHANNEL[type(message)]].send(message)
+            if isinstance(message, Track):
+                seq = message.seq
+            yield message
+        end = self._recording.end or End(seq + 1, "the recording ends here")
+        for channel in ("tracks", "lessons"):
+            self._publishers[channel].send(end)
+        yield end
+
+    def _rest(self, seconds: float) -> None:
+        for publisher in self._publishers.values():
+            publisher.welcome()
+        time.sleep(seconds)
+
+    def close(self) -> None:
+        """Send what is on its way, and leave."""
+        self._stack.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

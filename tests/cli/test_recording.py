@@ -1,0 +1,88 @@
+"""`catstream track --record`, `record` and `replay`."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+import pytest
+
+from catstream.messages import Features, Model, Track
+from catstream.pipeline import Pipeline
+from catstream.recording.file import Recording, RecordingWriter
+from catstream.settings import Settings
+
+
+@pytest.fixture(scope="module")
+def recorded(video, tmp_path_factory):
+    """A recorded run."""
+    source, box = video
+    path = tmp_path_factory.mktemp("recording") / "run.rec"
+    with Pipeline(source, [float(side) for side in box.split(",")], Settings(coreset_size=16), record=path) as pipeline:
+        assert len(list(pipeline)) == 60
+    return path
+
+
+def test_a_run_that_is_recorded_says_what_is_in_the_file(video, said, tmp_path):
+    source, box = video
+    code, _, errors = said("track", source, "--box", box, "--record", tmp_path / "run.rec")
+    assert code == 0
+    assert f"recording: {tmp_path / 'run.rec'}, 60 features, " in errors
+    assert "none missing" in errors
+
+
+def test_the_learning_is_replayed_and_compared_with_other_settings(recorded, said, tmp_path):
+    code, output, errors = said(
+        "replay", recorded, "--learn", "--set", "coreset_size=32", "--output", tmp_path / "larger.rec"
+    )
+    assert code == 0, errors
+    models = Recording(recorded).counts[Model]
+    rows = {line.split("  ")[0]: line.split() for line in output.splitlines()}
+    assert rows["the same"][3:6] == [str(models), "of", str(models)]
+    assert rows["coreset_size=32"][2:5] == ["0", "of", str(models)]
+    larger = Recording(tmp_path / "larger.rec")
+    assert larger.settings.coreset_size == 32
+    assert str(larger.counts[Model]) == rows["coreset_size=32"][1]
+
+
+def test_a_model_that_does_not_come_out_again_is_an_error(recorded, said, tmp_path):
+    recording = Recording(recorded)
+    with RecordingWriter(tmp_path / "other.rec", recording.run) as writer:
+        for _, message in list(recording.messages())[1:]:
+            writer.write(message if not isinstance(message, Model) else Model(message.version, 0, message.weights, 0.0))
+    code, output, errors = said("replay", tmp_path / "other.rec", "--learn")
+    assert code == 1
+    assert f"0 of {recording.counts[Model]}" in output
+    assert "recorded models did not come out again" in errors
+
+
+def test_a_recording_is_watched_like_a_pipeline(recorded, catstream, tmp_path):
+    player = catstream("replay", recorded, "--endpoint", tmp_path, "--fast", "--wait")
+    watcher = catstream("watch", "tracks", "--json", "--endpoint", tmp_path)
+    output, errors = watcher.communicate(timeout=60)
+    assert player.wait(60) == 0
+    tracks = [json.loads(line)["frame"] for line in output.splitlines()]
+    assert tracks == list(range(60 - len(tracks), 60))
+    assert "0 missed: the source came to its end" in errors
+
+
+@pytest.mark.parametrize("stopped", [False, True], ids=["to the end", "stopped"])
+def test_what_a_pipeline_says_is_recorded_from_outside(video, catstream, tmp_path, stopped):
+    source, box = video
+    settings, path = Settings(window=1, endpoint=str(tmp_path)), tmp_path / "run.rec"
+    with Pipeline(source, [float(side) for side in box.split(",")], settings) as pipeline:
+        tracks = iter(pipeline)
+        next(tracks)
+        recorder = catstream("record", "--output", path, "--endpoint", tmp_path)
+        for track in tracks:
+            if path.exists() and stopped and track.frame > 40:
+                recorder.send_signal(signal.SIGINT)
+                recorder.wait(60)
+        errors = recorder.communicate(timeout=60)[1]
+    assert recorder.returncode == 0, errors
+    recording = Recording(path)
+    assert recording.settings.window == 1
+    assert recording.counts[Features]
+    assert recording.counts[Track]
+    assert (recording.end is None) == stopped
+    assert f"{recording.missing[Features]} features" in errors

@@ -1,0 +1,53 @@
+"""A run that records itself: no features are missing, whatever dies, and the learning can be replayed."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from catstream.errors import RecordingError
+from catstream.messages import Features, Model, Track
+from catstream.pipeline import Pipeline
+from catstream.recording.file import Recording
+from catstream.recording.learning import learn
+from catstream.settings import Settings
+
+
+@pytest.mark.parametrize("victims", [(), ("compressor", "detector")], ids=str)
+def test_no_features_are_missing_and_every_model_comes_out_again(video, tmp_path, victims):
+    path, boxes = video
+    with Pipeline(path, boxes[0], Settings(window=16), record=tmp_path / "run.rec") as pipeline:
+        for track in pipeline:
+            if track.frame == 60:
+                for victim in victims:
+                    os.kill(pipeline.pids[victim], signal.SIGKILL)
+    recording = Recording(tmp_path / "run.rec")
+    assert [features.seq for features in recording.features()] == list(range(1, pipeline.frames + 1))
+    assert recording.end.totals == {"sent": pipeline.frames, "stored": pipeline.frames}
+    lesson = learn(recording, recording.settings)
+    assert lesson.identical == recording.counts[Model] > 5
+    assert recording.missing[Features] == 0
+    if not victims:
+        assert recording.missing[Track] == 0
+
+
+def test_a_recording_that_is_there_is_not_written_over(video, tmp_path):
+    path, boxes = video
+    (tmp_path / "run.rec").write_text("dear to somebody")
+    with pytest.raises(RecordingError, match="is there already"):
+        Pipeline(path, boxes[0], record=tmp_path / "run.rec")
+
+
+def test_a_run_goes_on_where_its_recording_cannot(video, tmp_path, monkeypatch):
+    path, boxes = video
+    preload = tmp_path / "sitecustomize.py"
+    preload.write_text("import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (12 << 20, resource.RLIM_INFINITY))")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with Pipeline(path, boxes[0], Settings(coreset_size=8), record=tmp_path / "run.rec") as pipeline:
+        assert len(list(pipeline)) == pipeline.frames
+        assert pipeline.health["compressor"]["unrecorded"] == 1
+    recording = Recording(tmp_path / "run.rec")
+    assert 0 < recording.counts[Features] < pipeline.frames
+    assert recording.torn == 0

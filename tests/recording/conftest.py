@@ -1,0 +1,54 @@
+"""What the tests of recordings share: what three stages said of a short video."""
+
+from __future__ import annotations
+
+import pytest
+
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
+from catstream.detection.detector import Detector
+from catstream.recording.file import RecordingWriter, run_of
+from catstream.settings import Settings
+from catstream.training.trainer import Trainer
+from catstream.video.demo import write
+from catstream.video.source import open_source
+from catstream.wire.endpoint import Endpoint, private_folder
+
+SETTINGS = Settings(coreset_size=16)
+
+
+@pytest.fixture(scope="session")
+def said(tmp_path_factory):
+    """Tracks, features and models of a lockstep run of 50 frames, in the order in which they came."""
+    path, boxes = write(tmp_path_factory.mktemp("video"), 50, (320, 240))
+    detector, compressor, trainer = Detector(SETTINGS), Compressor(SETTINGS), Trainer(SETTINGS)
+    messages = []
+    with open_source(str(path)) as frames:
+        for frame in frames:
+            first = detector.seq == 0
+            step = detector.init(frame.image, Box(*map(float, boxes[0]))) if first else detector.step(frame.image)
+            messages += step
+            if (sample := compressor.take(step[1])) is not None:
+                messages.append(trainer.train(sample))
+                detector.adopt(messages[-1])
+    return messages
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Writes messages to a file, and says where that is."""
+
+    def record(messages, settings=SETTINGS, **options):
+        with RecordingWriter(tmp_path / "run.rec", run_of(settings), **options) as writer:
+            for message in messages:
+                writer.write(message)
+        return tmp_path / "run.rec"
+
+    return record
+
+
+@pytest.fixture
+def endpoint():
+    """Where to meet."""
+    with private_folder() as folder:
+        yield Endpoint.parse(str(folder))

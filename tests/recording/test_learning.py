@@ -1,0 +1,67 @@
+"""Learning once more: the same settings give the same models, others give others, and both can be compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from catstream.errors import RecordingError
+from catstream.messages import Features, Model
+from catstream.recording.file import Recording
+from catstream.recording.learning import Marks, learn, marks_of
+from catstream.wire.codec import encode
+
+
+def models_of(said):
+    return [message for message in said if isinstance(message, Model)]
+
+
+def test_equal_settings_give_equal_models_bit_for_bit(said, written):
+    recording, again = Recording(written(said)), []
+    lesson = learn(recording, recording.settings, keep=again.append)
+    assert len(again) > 5
+    assert list(map(encode, again)) == list(map(encode, models_of(said)))
+    assert lesson.models == lesson.identical == recording.counts[Model]
+    assert lesson.levels[0] > 0
+    assert lesson.marks == marks_of(recording)
+
+
+def test_versions_that_a_trainer_skipped_are_made_and_the_others_are_the_same(said, written):
+    skipped = {model.version for model in models_of(said)[1::2]}
+    kept = [message for message in said if not (isinstance(message, Model) and message.version in skipped)]
+    recording = Recording(written(kept))
+    lesson = learn(recording, recording.settings)
+    assert lesson.identical == recording.counts[Model] == lesson.models - len(skipped)
+
+
+@pytest.mark.parametrize("change", [{"coreset_size": 8}, {"classifier": "one-class"}], ids=str)
+def test_other_settings_give_other_models_of_the_same_rows(said, written, change):
+    recording = Recording(written(said))
+    then, now = (learn(recording, settings) for settings in (recording.settings, replace(recording.settings, **change)))
+    assert now.models
+    assert now.identical == 0
+    assert now.counters["rows"] == then.counters["rows"]
+    assert now.marks.error != then.marks.error
+
+
+def test_where_features_are_missing_nothing_is_learned_unless_that_is_wanted(said, written):
+    recording = Recording(written([message for message in said if getattr(message, "seq", 0) != 4]))
+    with pytest.raises(RecordingError, match="misses the features of 1 frames"):
+        learn(recording, recording.settings)
+    lesson = learn(recording, recording.settings, incomplete=True)
+    assert lesson.models
+    assert lesson.counters["seq"] == sum(isinstance(message, Features) for message in said) - 1
+
+
+def test_marks_are_the_weighted_squared_error_and_the_share_of_frames_won(rng):
+    model = Model(1, 0, rng.normal(size=4).astype(np.float32), 0.25)
+    labels, weights = np.array([1, 1, 0, 0], np.float32), np.array([4, 1, 1, 1], np.float32)
+    marks, errors = Marks(), []
+    for objects in ([0.9, 0.8], [0.2, 0.9]):
+        rows = np.array([*objects, 0.5, 0.1], np.float32)[:, None] * model.weights / (model.weights @ model.weights)
+        marks.add(model, Features(1, 0, 0.0, None, rows, labels, weights, rows[:0], labels[:0]))
+        errors += [(float(row @ model.weights) + 0.25 - label) ** 2 for row, label in zip(rows, labels, strict=True)]
+    assert marks.error == pytest.approx(np.average(errors, weights=[*weights, *weights]), rel=1e-5)
+    assert marks.apart == 0.5

@@ -1,0 +1,74 @@
+"""A recording that is played is to subscribers what the pipeline was."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+import catstream
+from catstream.box import Box
+from catstream.messages import End, Features, Health, Model, Track
+from catstream.recording.file import Recording
+from catstream.recording.player import Player
+from catstream.wire.codec import encode
+from catstream.wire.sockets import Subscriber
+
+
+@pytest.fixture
+def playing(endpoint):
+    """Plays a recording to who listens, in a thread."""
+
+    def play(recording):
+        with Player(recording, endpoint) as player:
+            player.wait()
+            list(player.play(None))
+
+    threads = []
+
+    def start(recording):
+        threads.append(threading.Thread(target=play, args=(recording,), daemon=True))
+        threads[-1].start()
+
+    yield start
+    for thread in threads:
+        thread.join(30)
+        assert not thread.is_alive()
+
+
+def test_a_subscriber_gets_what_was_recorded_until_the_end(said, written, playing, endpoint):
+    end = End(51, "the source came to its end", totals={"sent": 50.0})
+    playing(Recording(written([*said, end])))
+    with catstream.subscribe(str(endpoint), "tracks", timeout=30) as tracks:
+        heard = list(tracks)
+    assert list(map(encode, heard)) == [encode(message) for message in said if isinstance(message, Track)]
+    assert tracks.end == end
+    assert tracks.missed == 0
+
+
+def test_features_and_settings_travel_too_and_a_cut_recording_has_an_end(said, written, playing, endpoint):
+    recording = Recording(written([message for message in said if not isinstance(message, Model)][:40]))
+    with Subscriber("lessons", endpoint) as lessons, Subscriber("tracks", endpoint):
+        playing(recording)
+        heard, deadline = [], time.monotonic() + 30
+        while not (heard and isinstance(heard[-1], End)) and time.monotonic() < deadline:
+            if (message := lessons.receive(0.1)) is not None:
+                heard.append(message)
+    assert recording.run in heard
+    seqs = [message.seq for message in heard if isinstance(message, Features)]
+    assert seqs == list(range(21 - len(seqs), 21))
+    assert (heard[-1].seq, heard[-1].reason) == (21, "the recording ends here")
+
+
+def test_it_is_not_played_faster_than_wanted(written, endpoint, monkeypatch):
+    moments = iter([99.0, 100.0, 101.0, 104.0])
+    track = Track(1, 0, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 0)
+    with monkeypatch.context() as clock:
+        clock.setattr("catstream.recording.file.time.time", lambda: next(moments))
+        path = written([track, Health("trainer", 101.0), Health("detector", 104.0)])
+    with Player(Recording(path), endpoint) as player:
+        started = time.monotonic()
+        played = list(player.play(20.0))
+    assert time.monotonic() - started >= (104 - 100) / 20
+    assert [type(message) for message in played] == [Track, Health, Health, End]
