@@ -1,0 +1,300 @@
+"""A pipeline whose processes, links, disk and clock can be made to fail, each on a loopback address of its own.
+
+The three processes run as on three hosts: 127.0.0.1, .2 and .3. Between them are links, TCP proxies that can be
+cut and slowed. Who dies is started again at once, as systemd or docker would do it; the arena itself is the owner,
+and takes every track.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from time import monotonic
+from typing import Any, Self
+
+from catstream.box import Box
+from catstream.errors import ServiceError
+from catstream.messages import End, Position, Track
+from catstream.services.loop import REFUSED
+from catstream.services.supervisor import NAMES
+from catstream.settings import Settings
+from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Receiver, Subscriber
+
+__all__ = ["HOSTS", "LINKS", "Arena", "Link", "small_disk"]
+
+#: The address of each process; the owner of the tracks is on the detector's.
+HOSTS = {"compressor": "127.0.0.1", "trainer": "127.0.0.2", "detector": "127.0.0.3"}
+
+#: Channel -> (who listens, who connects).
+LINKS = {
+    "features": ("compressor", "detector"),
+    "samples": ("compressor", "trainer"),
+    "models": ("trainer", "detector"),
+}
+
+_PATIENCE_SECONDS = 120.0  # without a track, after which the run counts as stuck
+_DISK = "32m"  # of the small disk: a few checkpoints
+#: What a process finds as `sitecustomize`: its wall clock is off by the seconds in a file. Clocks that only run
+#: forward (time.monotonic, ZeroMQ's own) go on, as they do when an administrator or NTP sets the clock.
+_CLOCK = """
+import os, time
+_true = time.time
+def _shifted():
+    try:
+        with open(os.environ["ARENA_CLOCK"]) as file:
+            return _true() + float(file.read() or 0)
+    except OSError:
+        return _true()
+time.time = _shifted
+"""
+
+
+class Link:
+    """A TCP proxy, in a thread of its own.
+
+    Parameters
+    ----------
+    listen, forward : host and port
+    """
+
+    def __init__(self, listen: tuple[str, int], forward: tuple[str, int]) -> None:
+        self._forward, self._delay, self._up = forward, 0.0, True
+        self._writers: set[asyncio.StreamWriter] = set()
+        self._loop = asyncio.new_event_loop()
+        self._socket = socket.create_server(listen)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def cut(self) -> None:
+        """Break all connections, and let none through until `mend`."""
+        self._up = False
+        self._loop.call_soon_threadsafe(self._break)
+
+    def slow(self, seconds: float) -> None:
+        """Hold each piece of up to 64 KiB up for so long."""
+        self._delay = seconds
+
+    def mend(self) -> None:
+        """All through, without delay."""
+        self._up, self._delay = True, 0.0
+
+    def close(self) -> None:
+        """Break all connections, and stop listening."""
+        self.cut()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._socket.close()
+
+    def _run(self) -> None:
+        self._loop.run_until_complete(asyncio.start_server(self._serve, sock=self._socket))
+        self._loop.run_forever()
+        for task in asyncio.all_tasks(self._loop):
+            task.cancel()
+        self._loop.run_until_complete(asyncio.sleep(0.01))
+        self._loop.close()
+
+    def _break(self) -> None:
+        for writer in self._writers:
+            writer.transport.abort()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writers = {writer}
+        try:
+            if self._up:
+                other, forth = await asyncio.open_connection(*self._forward)
+                writers.add(forth)
+                self._writers |= writers
+                await asyncio.gather(self._pass(reader, forth), self._pass(other, writer))
+        except OSError:  # nobody listens there, or one side is gone
+            pass
+        finally:
+            for one in writers:
+                one.transport.abort()
+            self._writers -= writers
+
+    async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(65536):
+            if self._delay:
+                await asyncio.sleep(self._delay)
+            writer.write(data)
+            await writer.drain()
+        raise ConnectionResetError
+
+
+class Arena:
+    """One run of a pipeline; open it, and `turn` it until `end` is there.
+
+    Parameters
+    ----------
+    source, box : what is followed
+    state : folder for the checkpoints
+    scratch : folder for logs
+
+    Attributes
+    ----------
+    tracks : all that came, in order
+    end : the last message of the stream, None before it
+    deaths : how often a process ended and was started again
+    links : by channel
+    """
+
+    def __init__(self, source: str, box: Box, settings: Settings, state: Path, scratch: Path) -> None:
+        self.state, self.tracks, self.deaths = state, list[Track](), 0
+        self.end: End | None = None
+        self._settings, self._source, self._first, self._folder = settings, source, box, scratch
+        self._box = box
+        self._clock = scratch / "clock"
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._places: dict[str, Endpoint] = {}
+        self._heard = monotonic()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            port = _free_port()
+            self._places = {name: Endpoint.parse(f"tcp://{host}:{port}") for name, host in HOSTS.items()}
+            self.links = {
+                name: Link((HOSTS[by], port + CHANNELS[name].port), (HOSTS[to], port + CHANNELS[name].port))
+                for name, (to, by) in LINKS.items()
+            }
+            for link in self.links.values():
+                stack.callback(link.close)
+            (self._folder / "sitecustomize.py").write_text(_CLOCK)
+            self._results = stack.enter_context(
+                Receiver("results", self._places["detector"], Position(), self._settings.window)
+            )
+            self._models = stack.enter_context(Subscriber("models", self._places["trainer"]))
+            stack.callback(self._stop)
+            for name in NAMES:
+                self._start(name)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def turn(self, seconds: float = 0.01) -> None:
+        """Take the next track, and start again who died.
+
+        Raises
+        ------
+        ServiceError
+            Where nothing comes for two minutes, or a process says that it would only fail again.
+        """
+        message = self._results.receive(seconds)
+        if message is not None:
+            self._heard = monotonic()
+            if isinstance(message, Track):
+                self.tracks.append(message)
+                self._box = message.box or self._box
+                self._results.acknowledge(Position(message.seq, message.frame, self._box))
+            else:
+                self._results.acknowledge(Position(message.seq))
+                self.end = message
+        elif monotonic() - self._heard > _PATIENCE_SECONDS:
+            raise ServiceError(f"no track came for {_PATIENCE_SECONDS:.0f} s after {len(self.tracks)}: {self.words()}")
+        for name, process in self._processes.items():
+            code = process.poll()
+            if code == REFUSED:
+                raise ServiceError(f"the {name} gave up: {self.words()}")
+            if code and self.end is None:
+                self.deaths += 1
+                self._start(name)
+
+    def until(self, done: Callable[[], bool]) -> None:
+        """Turn until something is so, or all is over."""
+        while self.end is None and not done():
+            self.turn()
+
+    def run(self, seconds: float) -> None:
+        """Turn for a while."""
+        over = monotonic() + seconds
+        self.until(lambda: monotonic() >= over)
+
+    def finish(self) -> None:
+        """Turn until the stream has ended, and all processes with it."""
+        self.until(lambda: False)
+        over = monotonic() + _PATIENCE_SECONDS
+        while any(process.poll() is None for process in self._processes.values()) and monotonic() < over:
+            self.turn()
+
+    def taught(self) -> bool:
+        """Whether a model came since this was last asked."""
+        return bool(self._models.waiting())
+
+    def signal(self, name: str, number: int) -> None:
+        """Send one to a process, where it runs."""
+        with suppress(ProcessLookupError):
+            self._processes[name].send_signal(number)
+
+    def set_clock(self, seconds: float) -> None:
+        """Put the wall clock of all processes wrong by so much."""
+        self._clock.write_text(str(seconds))
+
+    def words(self) -> str:
+        """The last line that each process logged."""
+        logs = {name: self._folder / f"{name}.log" for name in NAMES}
+        lines = {name: log.read_text(errors="replace").strip().splitlines() for name, log in logs.items()}
+        return "; ".join(f"{name}: {said[-1] if said else 'nothing'}" for name, said in lines.items())
+
+    def _start(self, name: str) -> None:
+        command: list[Any] = [sys.executable, "-m", "catstream.services", "--parent", os.getpid(), name]
+        for pair in (*self._settings.changed(), f"endpoint={self._places[name]}"):
+            command += ["--set", pair]
+        if name == "detector":
+            command += [self._source, "--box", ",".join(map(repr, self._first)), "--resume", "--owned"]
+        if name == "compressor":
+            command += ["--state", self.state]
+        path = os.pathsep.join([str(self._folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+        with (self._folder / f"{name}.log").open("ab") as log:
+            self._processes[name] = subprocess.Popen(
+                [str(word) for word in command],
+                stdin=subprocess.DEVNULL,
+                stderr=log,
+                env={**os.environ, "PYTHONPATH": path, "ARENA_CLOCK": str(self._clock)},
+            )
+
+    def _stop(self) -> None:
+        for process in self._processes.values():
+            process.kill()
+            process.wait()
+
+
+@contextmanager
+def small_disk(folder: Path) -> Iterator[Path]:
+    """A file system that is soon full, mounted on a folder; needs root.
+
+    Raises
+    ------
+    OSError
+        Where it cannot be mounted; says why.
+    """
+    folder.mkdir(exist_ok=True)
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={_DISK},mode=0700", "catstream", str(folder)]
+    done = subprocess.run(mount, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise OSError(f"a small disk cannot be mounted: {done.stderr.strip()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def _free_port() -> int:
+    """The first of enough ports in a row that are free on all hosts."""
+    span = max(channel.port + len(channel.senders) for channel in CHANNELS.values())
+    for first in range(21000 + os.getpid() % 500 * 20, 32000, span):
+        with ExitStack() as stack, suppress(OSError):
+            for host in HOSTS.values():
+                for port in range(first, first + span):
+                    stack.enter_context(socket.socket()).bind((host, port))
+            return first
+    raise ServiceError("there are no free ports on this machine")

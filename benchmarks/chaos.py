@@ -1,0 +1,239 @@
+"""Whether anything is lost when anything fails: a seeded random schedule of faults on a running pipeline.
+
+Processes are killed (kill -9) and frozen (SIGSTOP), links cut and slowed, the disk filled, the clock set wrong, one
+fault after the other. In lockstep, all that was sent must be in the trees exactly once, and the trees be those of a
+run without faults, bit for bit. Otherwise, the run must succeed as well as one without.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+
+import cv2
+import numpy as np
+from arena import LINKS, Arena, small_disk
+from sequences import named, scratch
+from table import Table, command, publish
+
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
+from catstream.errors import ServiceError
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.metrics import score
+from catstream.messages import Track
+from catstream.services.supervisor import NAMES
+from catstream.settings import Settings
+from catstream.video.source import open_source
+
+CALM = (1, 6)  # frames from one recovery to the next fault
+LAST = 20  # frames at the end without faults: who has ended well is not started again
+SECONDS = (0.1, 1.0)  # that a freeze, a cut, a slow link or a full disk lasts
+DELAY = (0.005, 0.05)  # of each 64 KiB on a slow link
+HOUR = 3600.0
+FULL = "disk full"
+
+Fault = Callable[[Arena, np.random.Generator], None]
+
+
+def kill(*names: str) -> Fault:
+    def strike(arena: Arena, _: np.random.Generator) -> None:
+        for name in names:
+            arena.signal(name, signal.SIGKILL)
+
+    return strike
+
+
+def freeze(arena: Arena, random: np.random.Generator) -> None:
+    name = str(random.choice(NAMES))
+    arena.signal(name, signal.SIGSTOP)
+    arena.run(random.uniform(*SECONDS))
+    arena.signal(name, signal.SIGCONT)
+
+
+def cut(arena: Arena, random: np.random.Generator) -> None:
+    link = arena.links[str(random.choice(list(LINKS)))]
+    link.cut()
+    arena.run(random.uniform(*SECONDS))
+    link.mend()
+
+
+def slow(arena: Arena, random: np.random.Generator) -> None:
+    link = arena.links[str(random.choice(list(LINKS)))]
+    link.slow(random.uniform(*DELAY))
+    arena.run(random.uniform(*SECONDS))
+    link.mend()
+
+
+def fill(arena: Arena, random: np.random.Generator) -> None:
+    ballast = arena.state / "ballast"
+    with ballast.open("wb", buffering=0) as file:
+        try:
+            while True:
+                file.write(bytes(1 << 20))
+        except OSError:  # no space is left
+            pass
+    arena.run(random.uniform(*SECONDS))
+    ballast.unlink()
+
+
+def jump(arena: Arena, random: np.random.Generator) -> None:
+    arena.set_clock(random.uniform(-HOUR, HOUR))
+
+
+#: Kinds of fault; how often each comes beside the others.
+FAULTS: dict[str, tuple[Fault, float]] = {
+    "kill -9 detector": (kill("detector"), 3),
+    "kill -9 compressor": (kill("compressor"), 3),
+    "kill -9 trainer": (kill("trainer"), 2),
+    "kill -9 all three": (kill(*NAMES), 2),
+    "SIGSTOP, SIGCONT": (freeze, 2),
+    "link cut": (cut, 2),
+    "link slow": (slow, 1),
+    FULL: (fill, 1),
+    "clock jump": (jump, 1),
+}
+
+
+@dataclass(slots=True)
+class Ordeal:
+    """What a run with faults came to.
+
+    recovery  of each kind of fault: seconds from its end until all goes on
+    tracks    of each frame
+    totals    features messages `sent` and `stored`, as the last message of the stream tells them
+    deaths    how often a process was started again
+    learned   the compressor, from its last checkpoint
+    """
+
+    recovery: dict[str, list[float]]
+    tracks: list[Track]
+    totals: dict[str, float]
+    deaths: int
+    learned: Compressor
+
+    @property
+    def boxes(self) -> np.ndarray:
+        """A row a frame, NaN where absent."""
+        return np.array([track.box or (np.nan,) * 4 for track in self.tracks])
+
+    @property
+    def rows(self) -> int:
+        """Rows in the trees."""
+        return sum(tree.rows_seen for tree in self.learned.trees.values())
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    cycles = 2 if options.quick else options.cycles
+    faults = schedule(cycles, options.seed)
+    source, truth = long(named(options, "TLD_01_david"), 60 if options.quick else 10 * cycles + 100)
+    box, times, ends = Box(*map(float, truth[0])), [], []
+    for label, settings in (("lockstep", Settings(lockstep=True)), ("default", Settings())):
+        calm, worn = (endure(source, box, settings, some, options.seed) for some in ([], faults))
+        times += [(label, *row) for row in quantiles(worn.recovery)]
+        same = ("yes" if identical(calm, worn) else "NO") if settings.lockstep else None
+        success = [score(run.boxes, truth).success for run in (worn, calm)]
+        met = sum(map(len, worn.recovery.values()))
+        ends.append((label, met, worn.deaths, *worn.totals.values(), len(worn.tracks), worn.rows, *success, same))
+    columns = ("run", "fault", "times", "p50 s", "p99 s", "slowest s")
+    yield Table("Recovery", columns, times, "from the end of a fault to the track two frames further, or a new model")
+    columns = ("run", "faults", "restarts", "sent", "stored", "tracks", "rows", "success", "without", "trees the same")
+    note = f"seed {options.seed}; sent, stored: messages of features; rows: in the trees; without: without faults"
+    yield Table(f"{len(truth)} frames", columns, ends, note)
+
+
+def long(sequence: Sequence, frames: int) -> tuple[str, np.ndarray]:
+    """Some frames of a sequence, forwards and backwards as often as it takes, as a folder; and their boxes."""
+    folder = scratch() / "frames"
+    folder.mkdir()
+    order = len(sequence) - 1 - abs(np.arange(frames) % (2 * len(sequence) - 2) - (len(sequence) - 1))
+    for number, image in zip(range(order.max() + 1), sequence.frames(), strict=False):
+        cv2.imwrite(str(scratch() / f"{number}.png"), image)
+    for place, number in enumerate(order):
+        (folder / f"{place:06d}.png").symlink_to(scratch() / f"{number}.png")
+    return str(folder), sequence.boxes[order]
+
+
+def schedule(cycles: int, seed: int) -> list[str]:
+    """Names of as many faults, drawn anew for each seed."""
+    share = np.array([often for _, often in FAULTS.values()])
+    return [str(name) for name in np.random.default_rng(seed).choice(list(FAULTS), cycles, p=share / share.sum())]
+
+
+def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: int = 0) -> Ordeal:
+    """Follow a source to its end, through some faults; progress is told on stderr.
+
+    The disk is a small one where it is to be filled, and these faults are left out where that cannot be mounted.
+
+    Raises
+    ------
+    ServiceError
+        Where the pipeline does not get to its end, or the source is too short for all faults.
+    """
+    random, recovery = np.random.default_rng(seed), defaultdict(list)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-arena-")))
+        if FULL in faults:
+            try:
+                stack.enter_context(small_disk(folder / "state"))
+            except OSError as error:
+                print(f"without full disks: {error}", file=sys.stderr)
+                faults = [name for name in faults if name != FULL]
+        frames = open_source(source).frames or 0
+        arena = stack.enter_context(Arena(source, box, settings, folder / "state", folder))
+        for number, name in enumerate(faults, start=1):
+            further(arena, int(random.integers(*CALM)))
+            if len(arena.tracks) > frames - LAST:
+                raise ServiceError(f"the video is over before fault {number} of {len(faults)}: take a longer one")
+            arena.taught()
+            FAULTS[name][0](arena, random)
+            begin = monotonic()
+            further(arena, 2)
+            if "trainer" in name:
+                arena.until(arena.taught)
+            recovery[name].append(monotonic() - begin)
+            print(f"{number} of {len(faults)}: {name}, {recovery[name][-1]:.2f} s", file=sys.stderr, flush=True)
+        arena.finish()
+        learned = Compressor.load(folder / "state" / "compressor.safetensors", settings)
+        return Ordeal(dict(recovery), arena.tracks, dict(arena.end.totals), arena.deaths, learned)
+
+
+def further(arena: Arena, frames: int) -> None:
+    """Until so many frames more were followed."""
+    goal = len(arena.tracks) + frames
+    arena.until(lambda: len(arena.tracks) >= goal)
+
+
+def identical(one: Ordeal, other: Ordeal) -> bool:
+    """Whether two runs gave the same tracks, and the same trees bit for bit."""
+    return one.tracks == other.tracks and fingerprint(one.learned) == fingerprint(other.learned)
+
+
+def fingerprint(compressor: Compressor) -> list[tuple[object, object]]:
+    """All that its trees hold, as bytes."""
+    states = [tree.state() for tree in compressor.trees.values()]
+    return [(facts, {name: (array.shape, array.tobytes()) for name, array in own.items()}) for own, facts in states]
+
+
+def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, float, float, float]]:
+    """A row for each kind of fault, and one for all."""
+    everything = [seconds for times in recovery.values() for seconds in times]
+    for name, times in [*sorted(recovery.items()), ("all", everything)]:
+        yield name, len(times), *map(float, np.quantile(times, [0.5, 0.99, 1]))
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--cycles", type=int, default=200, help="faults (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the schedule (default: %(default)s)")
+    options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # the small disk is taken away then, too
+    publish(figures(options), options.json)

@@ -1,0 +1,19 @@
+"""The faults are those of `benchmarks/chaos.py`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from catstream.video.demo import write
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+
+@pytest.fixture(scope="session")
+def video(tmp_path_factory):
+    """A short demo video, and the object's box in each of its frames."""
+    path, boxes = write(tmp_path_factory.mktemp("video"), 90, (320, 240))
+    return str(path), boxes

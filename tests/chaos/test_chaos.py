@@ -1,0 +1,75 @@
+"""Whatever fails, nothing is lost and nothing comes twice: real processes, links, disks and clocks."""
+
+from __future__ import annotations
+
+import arena
+import chaos
+import pytest
+import sequences
+import table
+
+from catstream.box import Box
+from catstream.evaluation.metrics import score
+from catstream.settings import Settings
+from catstream.tracker import Tracker
+from catstream.video.source import open_source
+
+LOCKSTEP = Settings(lockstep=True)
+
+
+@pytest.fixture(scope="module")
+def calm(video):
+    """The tracker after the same video, in one process and undisturbed, and its tracks."""
+    path, boxes = video
+    tracker, tracks = Tracker(LOCKSTEP), []
+    with open_source(path) as source:
+        for frame in source:
+            if tracks:
+                tracker.update(frame.image, frame.time)
+            else:
+                tracker.init(frame.image, boxes[0], frame.time)
+            tracks.append(tracker.track)
+    return tracker, tracks
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        ["kill -9 all three", "link cut", "kill -9 detector"],
+        ["kill -9 compressor", "clock jump", "SIGSTOP, SIGCONT", "link slow", "kill -9 trainer"],
+    ],
+    ids=", ".join,
+)
+def test_in_lockstep_all_is_as_without_faults_bit_for_bit(video, calm, faults):
+    assert_same(video, calm, faults)
+
+
+def test_a_disk_that_is_full_for_a_while_costs_nothing(video, calm, tmp_path):
+    try:
+        with arena.small_disk(tmp_path / "disk"):
+            pass
+    except OSError as error:
+        pytest.skip(f"{error}: needs root")
+    assert_same(video, calm, [chaos.FULL])
+
+
+def assert_same(video, calm, faults):
+    """One run through the faults stores what it sent, and learns what the tracker learned."""
+    path, boxes = video
+    tracker, tracks = calm
+    run = chaos.endure(path, boxes[0], LOCKSTEP, faults)
+    assert run.totals == {"sent": len(boxes), "stored": len(boxes)}
+    assert run.tracks == tracks
+    assert chaos.fingerprint(run.learned) == chaos.fingerprint(tracker.compressor)
+
+
+@pytest.mark.slow
+def test_forty_random_faults_cost_a_real_sequence_no_success():
+    options = table.command("").parse_args([])
+    if not options.data.is_dir():
+        pytest.skip(f"no real sequences at {options.data}: put some there, or set TRACKING_DATA")
+    source, truth = chaos.long(sequences.named(options, "TLD_01_david"), 600)
+    box = Box(*map(float, truth[0]))
+    calm, worn = (chaos.endure(source, box, Settings(), faults) for faults in ([], chaos.schedule(40, seed=1)))
+    assert worn.totals == {"sent": len(truth), "stored": len(truth)}
+    assert score(worn.boxes, truth).success > score(calm.boxes, truth).success - 0.02
