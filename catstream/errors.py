@@ -35,7 +35,14 @@ class VideoError(CatstreamError):
 
 
 class ProtocolError(CatstreamError, ValueError):
-    """A message that is not what the channel carries."""
+    """A message that is not what the channel carries.
+
+    reason  what is wrong with it, in one word: health counts the refused by it
+    """
+
+    def __init__(self, text: str, reason: str = "content") -> None:
+        super().__init__(text)
+        self.reason = reason
 
 
 class RecordingError(CatstreamError):

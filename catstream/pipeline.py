@@ -93,7 +93,7 @@ class Pipeline:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
-            endpoint = stack.enter_context(meeting_place(self.settings.endpoint, folder))
+            endpoint = stack.enter_context(meeting_place(self.settings.endpoint, folder, self.settings.keys))
             self.endpoint = str(endpoint)
             self._results = stack.enter_context(Receiver("results", endpoint, Position(), self.settings.window))
             self._reports = stack.enter_context(Subscriber("health", endpoint))

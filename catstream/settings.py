@@ -45,6 +45,13 @@ class Settings:
             "or tcp://HOST:PORT, the first of the ports that the channels take."
         ),
     ] = ""
+    keys: Annotated[
+        str,
+        _about(
+            "Folder of keys from `catstream keys new` (empty: none): with it all is encrypted, who connects must be "
+            "allowed, and others may reach the endpoint."
+        ),
+    ] = ""
     lockstep: Annotated[
         bool,
         _about("Repeat a run bit for bit: the detector waits for each model before it goes on."),

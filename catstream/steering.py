@@ -35,10 +35,12 @@ class Control:
         From each command, where the pipeline says why it is not carried out.
     SilenceError
         From each command, where no answer came in time; one that is on its way may still be carried out.
+    ServiceError
+        From each command, where the pipeline does not let these keys steer.
     """
 
-    def __init__(self, endpoint: str = "", *, timeout: float = 5.0) -> None:
-        place = find(endpoint)
+    def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "") -> None:
+        place = find(endpoint, keys)
         self.endpoint, self.timeout = str(place), timeout
         self._commands = Requester("control", place)
 
@@ -84,17 +86,18 @@ class Control:
         return answer
 
 
-def control(endpoint: str = "", *, timeout: float = 5.0) -> Control:
+def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "") -> Control:
     """Take the helm of a running pipeline.
 
     Parameters
     ----------
     endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
     timeout : seconds that a command may take
+    keys : the folder of keys of this client, where the pipeline asks for some; they must be allowed to steer
 
     Raises
     ------
     ServiceError
-        Where `endpoint` is empty and not just one pipeline runs.
+        Where `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
     """
-    return Control(endpoint, timeout=timeout)
+    return Control(endpoint, timeout=timeout, keys=keys)

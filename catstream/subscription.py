@@ -51,21 +51,24 @@ class Subscription(Generic[Message]):
     missed : tracks or features that never came, as the gaps in `seq` tell: this reader was too slow, or away
     refused : messages that were dropped because they were not what the channel carries
     end : the pipeline's `End`, None before it
-    endpoint : where it is attached
+    endpoint, keys : where it is attached, and with which
 
     Raises
     ------
     SilenceError
         While iterating, where nothing came for as long as `timeout` says. It may be iterated on.
+    ServiceError
+        While iterating, where the pipeline does not let these keys in.
     """
 
-    def __init__(self, endpoint: str, channel: str, *, timeout: float | None = None) -> None:
+    def __init__(self, endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> None:
         if channel not in _OPEN:
             raise ServiceError(
                 f"one can subscribe to {', '.join(_OPEN)}, got {channel!r}: the others have one receiver"
             )
-        place = find(endpoint)
+        place = find(endpoint, keys)
         self.endpoint, self.timeout = str(place), timeout
+        self.keys = str(place.keys.folder) if place.keys is not None else ""
         self.missed = 0
         self.end: End | None = None
         self._what, self._channel, self._seq = channel, CHANNELS[_OPEN[channel]], 0
@@ -191,20 +194,30 @@ def _mark(message: Health | Model | Sample | Preview) -> tuple[str, float]:
 
 
 @overload
-def subscribe(endpoint: str, channel: Literal["tracks"], *, timeout: float | None = ...) -> Subscription[Track]: ...
-@overload
-def subscribe(endpoint: str, channel: Literal["models"], *, timeout: float | None = ...) -> Subscription[Model]: ...
-@overload
-def subscribe(endpoint: str, channel: Literal["health"], *, timeout: float | None = ...) -> Subscription[Health]: ...
-@overload
-def subscribe(endpoint: str, channel: Literal["samples"], *, timeout: float | None = ...) -> Subscription[Sample]: ...
+def subscribe(
+    endpoint: str, channel: Literal["tracks"], *, timeout: float | None = ..., keys: str = ...
+) -> Subscription[Track]: ...
 @overload
 def subscribe(
-    endpoint: str, channel: Literal["features"], *, timeout: float | None = ...
+    endpoint: str, channel: Literal["models"], *, timeout: float | None = ..., keys: str = ...
+) -> Subscription[Model]: ...
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["health"], *, timeout: float | None = ..., keys: str = ...
+) -> Subscription[Health]: ...
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["samples"], *, timeout: float | None = ..., keys: str = ...
+) -> Subscription[Sample]: ...
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["features"], *, timeout: float | None = ..., keys: str = ...
 ) -> Subscription[Features]: ...
 @overload
-def subscribe(endpoint: str, channel: Literal["previews"], *, timeout: float | None = ...) -> Subscription[Preview]: ...
-def subscribe(endpoint: str, channel: str, *, timeout: float | None = None) -> Subscription:
+def subscribe(
+    endpoint: str, channel: Literal["previews"], *, timeout: float | None = ..., keys: str = ...
+) -> Subscription[Preview]: ...
+def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> Subscription:
     """Attach to a running pipeline.
 
     Parameters
@@ -212,16 +225,17 @@ def subscribe(endpoint: str, channel: str, *, timeout: float | None = None) -> S
     endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
     channel : "tracks", "models", "health", "samples", "features" or "previews"
     timeout : seconds without a message after which iterating raises `SilenceError`; None to wait for ever
+    keys : the folder of keys of this client, where the pipeline asks for some
 
     Raises
     ------
     ServiceError
-        Where there is no such channel, or `endpoint` is empty and not just one pipeline runs.
+        Where there is no such channel, `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
     """
-    return Subscription(endpoint, channel, timeout=timeout)
+    return Subscription(endpoint, channel, timeout=timeout, keys=keys)
 
 
-def knock(endpoint: str) -> Endpoint:
+def knock(endpoint: str, keys: str = "") -> Endpoint:
     """Where a pipeline runs, once it is heard: tracks and models may be silent for long where one does.
 
     Raises
@@ -231,6 +245,6 @@ def knock(endpoint: str) -> Endpoint:
     SilenceError
         Where none is heard within seconds.
     """
-    with subscribe(endpoint, "health", timeout=_PATIENCE) as health:
+    with subscribe(endpoint, "health", timeout=_PATIENCE, keys=keys) as health:
         next(health, None)
-        return Endpoint.parse(health.endpoint)
+        return Endpoint.parse(health.endpoint, health.keys)

@@ -53,7 +53,7 @@ def main(process: Process, state: Path | None, record: Path | None = None) -> No
         samples = stack.enter_context(Publisher("samples", process.endpoint))
 
         def counters() -> dict[str, float]:
-            own: dict[str, float] = {"stored": stored.seq, "refused": features.refused}
+            own: dict[str, float] = {"stored": stored.seq}
             if recorder is not None:
                 own |= {"recorded": writer.written, "unrecorded": float(recorder.failed != "")}
             return compressor.counters() | own

@@ -206,6 +206,5 @@ class _Line:
             "taken": self._features.taken,
             "stored": self._features.stored,
             "model_version": self._version,
-            "refused": self.models.refused,
             **(self.source.counters if self.source else {}),
         }

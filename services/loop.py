@@ -14,6 +14,7 @@ from catstream.messages import Health, Run
 from catstream.recording.file import run_of
 from catstream.settings import Settings
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.refusals import refusals
 from catstream.wire.sockets import Publisher
 
 __all__ = ["REFUSED", "Process", "run"]
@@ -34,7 +35,7 @@ class Process:
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
         self.settings = settings
-        self.endpoint = Endpoint.parse(settings.endpoint)
+        self.endpoint = Endpoint.parse(settings.endpoint, settings.keys)
         self._asked = float("inf")  # when it was asked to end
         self._health = Publisher("health", self.endpoint, sender=name)
         self._beat = 0.0
@@ -59,7 +60,7 @@ class Process:
         """Tell how it is, once a second; cheap to call in every turn of a loop."""
         if now or time.monotonic() - self._beat >= 1:
             self._beat = time.monotonic()
-            self._health.send(Health(self.name, time.time(), counters()))
+            self._health.send(Health(self.name, time.time(), counters() | refusals()))
         else:
             self._health.welcome()
 

@@ -209,7 +209,7 @@ def main(source: str, box: Box, settings: Settings, part: slice = WHOLE) -> None
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
-    with private_folder() as folder, meeting_place(settings.endpoint, folder) as endpoint:
+    with private_folder() as folder, meeting_place(settings.endpoint, folder, settings.keys) as endpoint:
         supervisor = Supervisor(source, box, replace(settings, endpoint=str(endpoint)), folder, owned=False, part=part)
         try:
             while not supervisor.finished and not ended.wait(0.05):

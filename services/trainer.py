@@ -17,7 +17,7 @@ def main(process: Process) -> None:
     with Subscriber("samples", process.endpoint) as samples, Publisher("models", process.endpoint) as models:
 
         def counters() -> dict[str, float]:
-            return {"version": version, "trained": trained, "refused": samples.refused}
+            return {"version": version, "trained": trained}
 
         while not process.ended:
             message = samples.receive(0.1)

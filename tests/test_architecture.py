@@ -35,7 +35,7 @@ HOMES = {
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
     "safetensors": ["catstream/compression"],
     "av": ["catstream/video"],
-    "zmq": ["catstream/wire/sockets.py"],
+    "zmq": ["catstream/wire/sockets.py", "catstream/wire/gate.py", "catstream/wire/keys.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
     "threadpoolctl": ["catstream/evaluation/onepass.py", "catstream/recording/learning.py"],

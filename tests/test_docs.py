@@ -82,6 +82,11 @@ def verbs() -> dict[str, click.Command]:
     return {name: getattr(import_module(f"catstream.cli.{name}"), name) for name in VERBS}
 
 
+def commands_of(verb: click.Command) -> Iterator[click.Command]:
+    """A verb, or the commands of one that has some."""
+    yield from verb.commands.values() if isinstance(verb, click.Group) else [verb]
+
+
 def test_every_setting_and_preset_has_its_row():
     shown = _TABLE.search(page("docs/settings.md"))
     assert shown, "docs/settings.md has lost the marks around its table"
@@ -102,7 +107,13 @@ def test_every_verb_is_shown(name):
 
 @pytest.mark.parametrize(
     ("verb", "option"),
-    [(name, option) for name, verb in verbs().items() for option in verb.params if isinstance(option, click.Option)],
+    [
+        (name, option)
+        for name, verb in verbs().items()
+        for command in commands_of(verb)
+        for option in command.params
+        if isinstance(option, click.Option)
+    ],
     ids=lambda part: part if isinstance(part, str) else part.name,
 )
 def test_every_option_is_explained(verb, option):
@@ -144,6 +155,11 @@ def test_commands_are_ones_that_exist(path):
             name, *words = words
             assert name in VERBS, f"{path.name} shows `catstream {name}`, which is no verb"
             verb = verbs()[name]
+            if isinstance(verb, click.Group):
+                assert words[0] in verb.commands, (
+                    f"{path.name} shows `catstream {name} {words[0]}`, which is no command"
+                )
+                verb = verb.commands[words.pop(0)]
             with click.Context(verb) as context:
                 known = {flag for option in verb.get_params(context) for flag in option.opts}
             wrong = {word for word in words if word.startswith("--")} - known

@@ -20,6 +20,7 @@ VERBS = {
     "record": "Keep what a running pipeline says, in one file.",
     "replay": "Play a recording to subscribers, or learn from it once more.",
     "status": "Ask a running pipeline how it is.",
+    "keys": "Make keys, and say who may connect to a pipeline.",
     "settings": "List all settings, with their defaults and meaning.",
 }
 

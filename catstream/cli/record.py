@@ -26,7 +26,8 @@ _END_SECONDS = 1.0  # between the end of the tracks and that of the features
 @click.command()
 @click.option("--output", required=True, type=click.Path(path_type=Path), help="The file; it must not be there yet.")
 @click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
-def record(output: Path, endpoint: str) -> None:
+@click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
+def record(output: Path, endpoint: str, keys: str) -> None:
     """Keep what a running pipeline says, in one file, until it ends or Ctrl-C.
 
     Features, models, tracks and health are written as they come, with the
@@ -43,7 +44,7 @@ def record(output: Path, endpoint: str) -> None:
       catstream record --output walk.rec --endpoint run
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    place = knock(endpoint)
+    place = knock(endpoint, keys)
     with suppress(KeyboardInterrupt):
         _record(output, place, Console(stderr=True))
     if output.exists():

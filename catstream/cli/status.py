@@ -21,9 +21,10 @@ _NAMES = CHANNELS["health"].senders
 
 @click.command()
 @click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
+@click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0), help="Seconds to listen at most.")
-def status(endpoint: str, as_json: bool, wait: float) -> None:
+def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
     """Ask a running pipeline how it is.
 
     Exits with 0 where all three processes were heard, and with 1 otherwise: a
@@ -44,7 +45,7 @@ def status(endpoint: str, as_json: bool, wait: float) -> None:
       catstream status
       catstream status --endpoint run --json
     """
-    place, reports = _listen(endpoint, wait)
+    place, reports = _listen(endpoint, keys, wait)
     found = _summary(place, reports)
     silent = [name for name in _NAMES if name not in reports]
     if as_json:
@@ -56,11 +57,11 @@ def status(endpoint: str, as_json: bool, wait: float) -> None:
         sys.exit(1)
 
 
-def _listen(endpoint: str, seconds: float) -> tuple[str, dict[str, list[Health]]]:
+def _listen(endpoint: str, keys: str, seconds: float) -> tuple[str, dict[str, list[Health]]]:
     """What each process said, oldest first, until all were heard and the detector twice: that gives its rate."""
     deadline = time.monotonic() + seconds
     reports: dict[str, list[Health]] = {}
-    with subscribe(endpoint, "health") as health:
+    with subscribe(endpoint, "health", keys=keys) as health:
         while len(reports) < len(_NAMES) or len(reports["detector"]) < 2:
             health.timeout = max(0.0, deadline - time.monotonic())
             try:

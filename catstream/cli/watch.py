@@ -107,9 +107,10 @@ _CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
 @click.command()
 @click.argument("channel", type=click.Choice(list(_CELLS)))
 @click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
+@click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
 @click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
 @click.option("--count", type=click.IntRange(min=1), help="End after so many messages.")
-def watch(channel: str, endpoint: str, as_json: bool, count: int | None) -> None:
+def watch(channel: str, endpoint: str, keys: str, as_json: bool, count: int | None) -> None:
     """Show what a running pipeline says, until it ends or Ctrl-C.
 
     The pipeline does not wait: what this reader was too slow for is counted as
@@ -132,9 +133,9 @@ def watch(channel: str, endpoint: str, as_json: bool, count: int | None) -> None
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     seen = 0
-    with subscribe(endpoint, channel) as messages:  # type: ignore[call-overload]
+    with subscribe(endpoint, channel, keys=keys) as messages:  # type: ignore[call-overload]
         with suppress(KeyboardInterrupt), ExitStack() as stack:
-            knock(messages.endpoint)
+            knock(messages.endpoint, messages.keys)
             if as_json:
                 show = _print_json
             elif Console().is_terminal:

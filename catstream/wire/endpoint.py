@@ -1,7 +1,9 @@
 """Endpoints: the one place where the processes of a pipeline meet, and the address of each channel there.
 
 A folder holds a Unix socket a channel, for this user alone: `FOLDER/features`. Or, from
-`tcp://127.0.0.1:5700` on, each channel takes a port, as its row in the table says.
+`tcp://127.0.0.1:5700` on, each channel takes a port, as its row in the table says. With keys the
+host may be one that others can reach, and processes may have hosts of their own:
+`tcp://10.0.0.1,compressor=10.0.0.2,trainer=10.0.0.3:5700`.
 """
 
 from __future__ import annotations
@@ -10,27 +12,33 @@ import contextlib
 import fcntl
 import ipaddress
 import os
+import re
 import shutil
 import socket
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS, Channel
+from catstream.wire.keys import Keys
 
 __all__ = ["Endpoint", "find", "meeting_place", "private_folder", "running"]
 
 _LONGEST_PATH = 107  # bytes that the kernel takes for the name of a Unix socket
 _PREFIX = "catstream-"  # of private folders
+_HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
 _NOTE = "endpoint"  # file in the private folder of a running pipeline that says where its processes meet
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where the processes meet: a folder, or a host and its first port.
+    """Where the processes meet: a folder, or hosts and the first port; and what is asked of who comes.
+
+    host   of all processes, as ZeroMQ takes it, but of those in `hosts`
+    hosts  of processes by name
+    keys   what all connect with, None where nobody is asked
 
     >>> Endpoint.parse("tcp://localhost:5700").address(CHANNELS["models"])
     'tcp://127.0.0.1:5702'
@@ -41,24 +49,29 @@ class Endpoint:
     folder: Path | None = None
     host: str = ""
     port: int = 0
+    hosts: dict[str, str] = field(default_factory=dict)
+    keys: Keys | None = None
 
     def __str__(self) -> str:
         """As the setting `endpoint` says it."""
-        return str(self.folder) if self.folder is not None else f"tcp://{self.host}:{self.port}"
+        if self.folder is not None:
+            return str(self.folder)
+        return f"tcp://{','.join([self.host, *map('='.join, self.hosts.items())])}:{self.port}"
 
     @classmethod
-    def parse(cls, text: str) -> Endpoint:
-        """Read the setting `endpoint`.
+    def parse(cls, text: str, keys: str = "") -> Endpoint:
+        """Read the settings `endpoint` and `keys`.
 
         Raises
         ------
         ServiceError
-            Where it is neither, or a host that others can reach.
+            Where one is not what it should be, or others can reach the host and there are no keys.
         """
         if not text:
             raise ServiceError("this process was not told where to meet the others: --set endpoint=FOLDER")
+        known = Keys.load(keys) if keys else None
         if text.startswith("tcp://"):
-            return cls._tcp(text)
+            return cls._tcp(text, known)
         if "://" in text:
             raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT, got {text!r}")
         folder = Path(text)
@@ -66,36 +79,48 @@ class Endpoint:
             for sender in channel.senders:
                 if len(os.fsencode(folder / _file(channel, sender))) > _LONGEST_PATH:
                     raise ServiceError(f"the name of the folder {text!r} is too long for a Unix socket: give another")
-        return cls(folder=folder)
+        return cls(folder=folder, keys=known)
 
     @classmethod
-    def _tcp(cls, text: str) -> Endpoint:
+    def _tcp(cls, text: str, keys: Keys | None) -> Endpoint:
         last = max(channel.port + len(channel.senders) for channel in CHANNELS.values()) - 1
-        try:
-            parts = urlsplit(text)
-            host, port = parts.hostname or "", parts.port or 0
-        except ValueError:
-            host, port = "", 0
-        if not host or not 1 <= port <= 65535 - last or parts.path:
+        hosts, _, port = text.removeprefix("tcp://").rpartition(":")
+        first, *others = hosts.split(",")
+        named = dict(other.partition("=")[::2] for other in others)
+        if not (port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
+            port = ""
+        if not port or not all(map(_is_host, [first, *named.values()])):
             raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
-        host = "127.0.0.1" if host == "localhost" else host
-        try:
-            private = ipaddress.ip_address(host).is_loopback
-        except ValueError:
-            private = False
-        if not private:
+        if unknown := named.keys() - _LISTENERS:
+            raise ServiceError(f"{text!r} names {', '.join(unknown)}, there are {', '.join(sorted(_LISTENERS))}")
+        first, named = _plain(first), {name: _plain(host) for name, host in named.items()}
+        if keys is None and not all(map(_is_loopback, [first, *named.values()])):
             raise ServiceError(
-                f"{text} can be reached from other machines, and nothing on it asks who is there: "
-                "give a folder, or tcp://127.0.0.1:PORT (between machines, through an ssh tunnel)"
+                f"{text} can be reached from other machines, and nothing on it asks who is there: make keys "
+                "(catstream keys new DIR) and give them to all (--set keys=DIR), or give a folder or "
+                "tcp://127.0.0.1:PORT"
             )
-        return cls(host=f"[{host}]" if ":" in host else host, port=port)
+        return cls(host=first, port=int(port), hosts=named, keys=keys)
 
     def address(self, channel: Channel, sender: str | None = None) -> str:
         """Of a channel, as ZeroMQ takes it; of the given sender where there are several."""
         sender = sender or channel.senders[0]
         if self.folder is not None:
             return f"ipc://{self.folder / _file(channel, sender)}"
-        return f"tcp://{self.host}:{self.port + channel.port + channel.senders.index(sender)}"
+        host = self.hosts.get(channel.receiver or sender, self.host)
+        return f"tcp://{host}:{self.port + channel.port + channel.senders.index(sender)}"
+
+    def listening(self, channel: Channel, sender: str | None = None) -> str:
+        """The address to listen on: of a host by name, what that means here."""
+        address = self.address(channel, sender)
+        protocol, _, place = address.partition("://")
+        host, _, port = place.rpartition(":")
+        if protocol == "ipc" or _address(host) is not None:
+            return address
+        try:
+            return f"tcp://{socket.gethostbyname(host)}:{port}"
+        except OSError:
+            return address  # ZeroMQ says what is wrong with it
 
     def taken(self, channel: Channel, sender: str | None = None) -> bool:
         """Whether a process listens at a channel's Unix socket: ZeroMQ would push it aside, and not say so."""
@@ -103,6 +128,36 @@ class Endpoint:
             return False
         with socket.socket(socket.AF_UNIX) as knock:
             return knock.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
+
+
+#: Processes that listen, the name of `hosts`.
+_LISTENERS = {
+    name for channel in CHANNELS.values() for name in ([channel.receiver] if channel.receiver else channel.senders)
+}
+
+
+def _plain(host: str) -> str:
+    """As ZeroMQ takes it, to listen and to connect."""
+    return {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
+
+
+def _is_host(host: str) -> bool:
+    """Whether it is a name, or an address; of IPv6 in brackets."""
+    if host.startswith("["):
+        return host.endswith("]") and _address(host) is not None
+    return bool(_HOST.fullmatch(host))
+
+
+def _is_loopback(host: str) -> bool:
+    address = _address(host)
+    return address is not None and address.is_loopback
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host.strip("[]"))
+    except ValueError:
+        return None
 
 
 def _file(channel: Channel, sender: str) -> str:
@@ -120,12 +175,12 @@ def private_folder() -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def meeting_place(text: str, default: Path) -> Iterator[Endpoint]:
+def meeting_place(text: str, default: Path, keys: str = "") -> Iterator[Endpoint]:
     """The endpoint for one pipeline, held for it alone; afterwards no socket file is left.
 
     Parameters
     ----------
-    text : the setting `endpoint`
+    text, keys : the settings `endpoint` and `keys`
     default : the pipeline's private folder, to use where that is empty; `running` finds the pipeline by it
 
     Raises
@@ -133,7 +188,7 @@ def meeting_place(text: str, default: Path) -> Iterator[Endpoint]:
     ServiceError
         Where another pipeline is there, or other users could be.
     """
-    endpoint = Endpoint.parse(text or str(default))
+    endpoint = Endpoint.parse(text or str(default), keys)
     if endpoint.folder is None:  # the kernel gives a port to one process only
         with _noted(endpoint, default):
             yield endpoint
@@ -156,7 +211,7 @@ def meeting_place(text: str, default: Path) -> Iterator[Endpoint]:
                 "wait for it, or give another folder (--set endpoint=FOLDER)"
             ) from None
         try:
-            endpoint = Endpoint.parse(str(folder))
+            endpoint = Endpoint.parse(str(folder), keys)
             with _noted(endpoint, default):
                 yield endpoint
         finally:
@@ -173,7 +228,7 @@ def _noted(endpoint: Endpoint, folder: Path) -> Iterator[None]:
     path = folder / _NOTE
     with path.open("w") as note:
         fcntl.flock(note, fcntl.LOCK_EX)
-        note.write(str(endpoint))
+        note.write("\n".join([str(endpoint), *([str(endpoint.keys.folder)] if endpoint.keys is not None else [])]))
         note.flush()
         try:
             yield
@@ -189,12 +244,16 @@ def running() -> list[Endpoint]:
             with contextlib.suppress(OSError), path.open() as note:  # it may be gone by now, or another user's
                 text = note.read()
                 if text and os.fstat(note.fileno()).st_uid == os.geteuid() and _locked(note.fileno()):
-                    endpoints.append(Endpoint.parse(text))
+                    endpoints.append(Endpoint.parse(*text.split("\n")))
     return endpoints
 
 
-def find(text: str = "") -> Endpoint:
+def find(text: str = "", keys: str = "") -> Endpoint:
     """The endpoint of a running pipeline: the one given, or where none is that of the only one of this user.
+
+    Parameters
+    ----------
+    text, keys : the settings `endpoint` and `keys`; the only one of this user has its keys noted
 
     Raises
     ------
@@ -202,7 +261,7 @@ def find(text: str = "") -> Endpoint:
         Where there is none, or more than one.
     """
     if text:
-        return Endpoint.parse(text)
+        return Endpoint.parse(text, keys)
     endpoints = running()
     if not endpoints:
         raise ServiceError(

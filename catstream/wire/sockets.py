@@ -13,12 +13,14 @@ the same message twice calmly.
 
 Commands (`Requester`, `Responder`) are asked again until they are answered. The responder
 remembers its answers, so that a command whose answer was lost is not carried out twice.
+
+Where the endpoint has keys, all is encrypted, who listens is known by its key, and who connects
+needs one that may (`catstream.wire.gate`). What is refused is counted and dropped (`catstream.wire.refusals`).
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections import deque
 from collections.abc import Callable
 from time import monotonic
@@ -32,6 +34,8 @@ from catstream.messages import Answer, Command, End, Position, Stored
 from catstream.wire.channels import CHANNELS, Channel
 from catstream.wire.codec import decode, encode, opening
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.gate import GATE
+from catstream.wire.refusals import count, refuse
 
 __all__ = ["Publisher", "Receiver", "Requester", "Responder", "Sender", "Subscriber"]
 
@@ -41,8 +45,16 @@ _LINGER = 2000  # milliseconds that a closed socket still has for its last messa
 _NEWEST = 8  # messages of a burst that are on their way at once where only the newest counts
 _SAMPLES = 65536  # that a sender remembers, at most one a message: as many as `lag_frames` may be
 _COMMANDS = 64  # that wait, or were answered last, and that are taken in at once
+_HANDSHAKE = 5000  # milliseconds that a peer has to say who it is
 
-_log = logging.getLogger(__name__)
+#: What ZeroMQ tells of a connection, where it is asked to.
+_EVENTS = (
+    zmq.EVENT_MONITOR_STOPPED
+    | zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+)
 
 
 class _Socket:
@@ -52,32 +64,49 @@ class _Socket:
         self.channel: Channel = CHANNELS[channel]
         self.refused = 0  #: messages that were dropped because they were not what the channel carries
         self._endpoint = endpoint
-        self._bound = ""  # the address, where it listens
+        self._listens = False
+        self._domain = b""  # by which the gate knows it, where it listens and there are keys
         context: Any = zmq.Context.instance()  # its types do not know a socket's options
         self._socket = context.socket(kind)
         self._socket.linger = _LINGER
-        self._socket.ipv6 = endpoint.host.startswith("[")
+        self._socket.ipv6 = "[" in str(endpoint)
         self._socket.sndhwm = self._socket.rcvhwm = depth
         self._socket.maxmsgsize = self.channel.limit
+        self._socket.handshake_ivl = _HANDSHAKE
         # No heartbeats: ZeroMQ aborts the process where one is due to a peer that went away while the queue of
         # its messages was full (libzmq issue 4767). On one machine the kernel tells when a peer is gone.
         self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 20, 500
+        self._events: Any = None  # hears of connections
+        self._left = False  # whether one ended
 
     def _bind(self, sender: str | None = None) -> None:
-        address = self._endpoint.address(self.channel, sender)
+        address = self._endpoint.listening(self.channel, sender)
+        keys = self._endpoint.keys
         try:
+            if keys is not None:
+                self._socket.curve_secretkey, self._socket.curve_server = keys.listening(), True
+                self._domain = self._socket.zap_domain = GATE.guard(self.channel, keys)
+                self._socket.zap_enforce_domain = True  # were the gate ever gone, nobody comes in
             if self._endpoint.taken(self.channel, sender):
                 raise zmq.ZMQError(zmq.EADDRINUSE)
+            self._watch()
             self._socket.bind(address)
-            self._bound = address
+            self._listens = True
         except zmq.ZMQError as error:
-            self._socket.close(linger=0)
+            self.close()
             raise ServiceError(
                 f"cannot listen on {address} ({error.strerror}): another pipeline may be running there, "
                 "wait for it or give another endpoint (--set endpoint=...)"
             ) from None
+        except ServiceError:
+            self.close()
+            raise
 
     def _connect(self) -> None:
+        if (keys := self._endpoint.keys) is not None:
+            self._socket.curve_serverkey = keys.server
+            self._socket.curve_publickey, self._socket.curve_secretkey = keys.public, keys.secret
+            self._watch()
         for sender in self.channel.senders:
             self._socket.connect(self._endpoint.address(self.channel, sender))
 
@@ -86,28 +115,69 @@ class _Socket:
         try:
             return decode(data, *kinds)
         except ProtocolError as error:
-            self.refused += 1
-            if self.refused == 1:
-                _log.warning("%s: a message was dropped: %s", self.channel.name, error)
+            self._drop(error.reason, error)
             return None
 
+    def _drop(self, reason: str, text: object) -> None:
+        """Count a message that is not what the channel carries, and say so once."""
+        self.refused += 1
+        refuse(self.channel.name, reason, f"a message was dropped: {text}")
+
     def _wait(self, seconds: float) -> bool:
+        self._look()
         return bool(self._socket.poll(max(0, round(seconds * 1000))))
+
+    def _watch(self) -> None:
+        """Have ZeroMQ tell of connections from now on."""
+        address = f"inproc://events-{id(self)}"
+        self._socket.monitor(address, _EVENTS)
+        self._events = self._socket.context.socket(zmq.PAIR)
+        self._events.rcvhwm = 0  # with a limit ZeroMQ would stand still until they are taken
+        self._events.connect(address)
+
+    def _look(self, milliseconds: int = 0, until: int = 0) -> None:
+        """Take in what became of connections, waiting so long for a certain event.
+
+        Raises
+        ------
+        ServiceError
+            Where this end connects, and its key is not let in: ZeroMQ does not try again.
+        """
+        while self._events is not None and self._events.poll(milliseconds):
+            event = recv_monitor_message(self._events)["event"]
+            if event == zmq.EVENT_DISCONNECTED:
+                self._left = True
+                if self._listens:
+                    count("disconnected")
+            elif event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+                if not self._listens:  # a listener's gate has counted it
+                    raise ServiceError(
+                        f"{self._endpoint} does not let this key take part in {self.channel.name}: "
+                        "ask who runs it for one that may (catstream keys allow)"
+                    )
+            elif event != zmq.EVENT_MONITOR_STOPPED and self._listens:
+                needed = "does not speak ZeroMQ" if self._endpoint.keys is None else "has not the pipeline's keys"
+                refuse(self.channel.name, "handshake", f"a stranger was turned away: it {needed}")
+            if event == until:
+                break
 
     def close(self) -> None:
         """Send what is on its way, then close; the address is free for the next one."""
-        if not self._bound or self._socket.closed:
-            self._socket.close()
-            return
+        if not self._listens and not self._socket.closed:
+            self._socket.disable_monitor()
+        self._socket.close()
         # ZeroMQ stops listening some time later, and would take the next one's socket file with it. To unbind
-        # first would be sooner, but drops what is on its way.
-        with self._monitor() as monitor:
-            self._socket.close()
-            _hear(monitor, zmq.EVENT_CLOSED)
-
-    def _monitor(self) -> Any:
-        """A socket on which ZeroMQ tells of endings, from the first call on."""
-        return self._socket.get_monitor_socket(zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED)
+        # first would be sooner, but drops what is on its way. Its thread stands still for ever where it has
+        # something to tell and nobody to tell it to: so nobody leaves before it stops to tell.
+        if self._listens:
+            self._look(2 * _LINGER, until=zmq.EVENT_MONITOR_STOPPED)
+            self._listens = False
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+        if self._domain:
+            GATE.leave(self._domain)
+            self._domain = b""
 
     def __enter__(self) -> Self:
         return self
@@ -242,7 +312,7 @@ class Receiver(_Socket):
         self._position, self._store = position, store
         self._peer: bytes | None = None
         self._asked = 0.0  # when a message was last found missing
-        self._gone: Any = None  # hears of the sender's leaving, once it has sent its end
+        self._ended = False  # whether the sender has sent its end
         self._bind()
 
     def receive(self, seconds: float) -> Any:
@@ -271,7 +341,7 @@ class Receiver(_Socket):
         self._asked = 0.0
         self.taken = message.seq
         if isinstance(message, End):
-            self._gone = self._monitor()
+            self._ended, self._left = True, False
         return message
 
     def acknowledge(self, position: Position) -> None:
@@ -281,8 +351,8 @@ class Receiver(_Socket):
 
     def close(self) -> None:
         """Close, after the sender where it has sent its end: a connection that breaks may cost it the last answer."""
-        if self._gone is not None and not self._socket.closed:
-            _hear(self._gone, zmq.EVENT_DISCONNECTED)
+        if self._ended and not self._left:
+            self._look(_LINGER, until=zmq.EVENT_DISCONNECTED)
         super().close()
 
     def _answer(self, message: Stored | Position) -> None:
@@ -329,6 +399,7 @@ class Publisher(_Socket):
 
     def welcome(self) -> None:
         """Send the greeting, or the last message, to those who came since or missed it; call it now and then."""
+        self._look()
         late = monotonic() >= self._repeat
         while True:
             try:
@@ -445,9 +516,3 @@ class Responder(_Socket):
     def _send(self, peer: bytes, data: bytes) -> None:
         with contextlib.suppress(zmq.Again):  # one that does not listen asks again
             self._socket.send_multipart([peer, data], zmq.NOBLOCK)
-
-
-def _hear(monitor: Any, event: int) -> None:
-    """Wait until ZeroMQ tells of an event, but not for ever."""
-    while monitor.poll(_LINGER) and recv_monitor_message(monitor)["event"] != event:
-        pass

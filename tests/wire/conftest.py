@@ -34,10 +34,16 @@ def folder():
         yield path
 
 
+@pytest.fixture
+def tcp():
+    """A tcp endpoint that is free."""
+    return f"tcp://127.0.0.1:{free_ports()}"
+
+
 @pytest.fixture(params=["ipc", "tcp"])
 def endpoint(request, folder):
     """Where to meet, over each transport."""
-    return Endpoint.parse(str(folder) if request.param == "ipc" else f"tcp://127.0.0.1:{free_ports()}")
+    return Endpoint.parse(str(folder) if request.param == "ipc" else request.getfixturevalue("tcp"))
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ def test_every_channel_has_its_row(channel):
     ports = ", ".join(f"+{channel.port + offset}" for offset in range(len(channel.senders)))
     cells = (
         f"`{channel.name}`", kinds, ", ".join(channel.senders), channel.receiver or "anyone", channel.keeps, ports,
-        f"{channel.megabytes} MiB",
+        f"{channel.megabytes} MiB", channel.role,
     )  # fmt: skip
     assert f"| {' | '.join(cells)} |" in PAGE, "docs/protocol.md, table of channels"
 

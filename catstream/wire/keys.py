@@ -1,0 +1,241 @@
+"""Keys: who may connect, and as what.
+
+A pipeline that can be reached from other machines has a folder of keys, made by `catstream keys new`:
+
+    server.key       key pair of the sockets that listen
+    server.pub       its public half, by which all others know them
+    client.key       key pair of the pipeline's own processes, for the sockets that connect
+    clients/NAME     a client that may connect: its role and its public key
+
+A client has a folder of `server.pub` and its own `client.key`. Every file is TOML, and from its
+first byte for its owner alone. The files in `clients` are read at each handshake: who is added or
+removed needs no restart.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import get_args
+
+import zmq
+
+from catstream.errors import ServiceError
+from catstream.wire.channels import Role
+
+__all__ = ["ROLES", "Client", "Keys", "allow", "clients", "create", "revoke"]
+
+#: What a client may be: each may do what those before it may.
+ROLES: tuple[Role, ...] = get_args(Role)
+
+_SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS = "server.key", "server.pub", "client.key", "clients"
+_OWN = "pipeline"  # the name of the pipeline's own processes among the clients
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_KEY = re.compile(r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}")  # Z85, as ZeroMQ writes a key
+_LONGEST = 4096  # bytes of a file
+
+
+@dataclass(frozen=True, slots=True)
+class Client:
+    """Who may connect: the role, and the public key."""
+
+    role: Role
+    public: str
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """What a process connects with, and where it looks up who may connect to it.
+
+    server          public key of the sockets that listen
+    public, secret  key pair of the sockets that connect
+    """
+
+    folder: Path
+    server: bytes
+    public: bytes
+    secret: bytes = field(repr=False)
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike[str]) -> Keys:
+        """Read a folder of keys, a pipeline's or a client's.
+
+        Raises
+        ------
+        ServiceError
+            Where one is missing, damaged, or can be read by others.
+        """
+        folder = Path(folder).absolute()
+        server, own = _read(folder / _SERVER_PUBLIC), _read(folder / _CLIENT)
+        return cls(folder, _key(server, "public", folder), _key(own, "public", folder), _key(own, "secret", folder))
+
+    def listening(self) -> bytes:
+        """The secret key of the sockets that listen.
+
+        Raises
+        ------
+        ServiceError
+            Where this is the folder of a client.
+        """
+        if not (self.folder / _SERVER).exists():
+            raise ServiceError(
+                f"{self.folder} holds the keys of a client, a pipeline needs those that `catstream keys new` made: "
+                "give that folder"
+            )
+        return _key(_read(self.folder / _SERVER), "secret", self.folder)
+
+    def client(self, public: str) -> tuple[str, Role] | None:
+        """Name and role of the client with this public key, as of now; None where it may not connect."""
+        for name, client in clients(self.folder).items():
+            if client.public == public:
+                return name, client.role
+        return None
+
+
+def create(folder: Path) -> None:
+    """Make the keys of a pipeline: of its sockets that listen, and of its processes that connect.
+
+    Raises
+    ------
+    ServiceError
+        Where the folder holds keys already, or cannot be written.
+    """
+    if any((folder / name).exists() for name in (_SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS)):
+        raise ServiceError(f"{folder} holds keys already, and who has them would be locked out: give another folder")
+    server = zmq.curve_keypair()
+    _write(folder / _SERVER, public=server[0], secret=server[1])
+    _write(folder / _SERVER_PUBLIC, public=server[0])
+    _write(folder / _CLIENTS / _OWN, role=b"pipeline", public=_pair(folder))
+
+
+def allow(folder: Path, name: str, role: Role, output: Path | None = None, public: str | None = None) -> None:
+    """Let a client connect from now on.
+
+    Parameters
+    ----------
+    output : folder for the keys of the client, to be given to it; or
+    public : the public key of a client that has its pair already
+
+    Raises
+    ------
+    ServiceError
+        Where there is a client of that name, or of that key, or something in `output`.
+    """
+    if not _NAME.fullmatch(name):
+        raise ServiceError(f"a client's name is of letters, digits, dots and dashes, at most 64, got {name!r}")
+    if public is not None and not _KEY.fullmatch(public):
+        raise ServiceError(f"a public key is 40 characters of Z85, got {public!r}")
+    server = _key(_read(folder / _SERVER_PUBLIC), "public", folder)
+    known = clients(folder)
+    if name in known:
+        raise ServiceError(f"there is a client {name} already: take another name, or `catstream keys revoke` it first")
+    for other, client in known.items():
+        if client.public == public:
+            raise ServiceError(f"this key is that of {other}, a {client.role} client: `catstream keys revoke` it first")
+    if output is not None:
+        _write(output / _SERVER_PUBLIC, public=server)
+        public = _pair(output).decode()
+    if public is None:
+        raise ServiceError("a new client needs a folder for its keys, or its public key")
+    _write(folder / _CLIENTS / name, role=role.encode(), public=public.encode())
+
+
+def revoke(folder: Path, name: str) -> None:
+    """Let a client connect no more.
+
+    Raises
+    ------
+    ServiceError
+        Where there is no client of that name.
+    """
+    known = clients(folder)
+    if name not in known:
+        raise ServiceError(f"there is no client {name!r}: there are {', '.join(known)}")
+    (folder / _CLIENTS / name).unlink(missing_ok=True)
+
+
+def clients(folder: Path) -> dict[str, Client]:
+    """Who may connect, by name.
+
+    Raises
+    ------
+    ServiceError
+        Where the folder holds no keys, or one of its files is damaged.
+    """
+    found = {}
+    for path in _listed(folder):
+        try:
+            facts = _read(path)
+        except ServiceError:
+            if not path.exists():  # revoked in this moment
+                continue
+            raise
+        role = facts.get("role")
+        if role not in ROLES:
+            raise ServiceError(
+                f"{path} gives the role {role!r}, there are {', '.join(ROLES)}: revoke it, allow it anew"
+            )
+        found[path.name] = Client(role, _key(facts, "public", path).decode())
+    return found
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in (folder / _CLIENTS).iterdir() if _NAME.fullmatch(path.name))
+    except OSError as error:
+        raise ServiceError(f"no keys in {folder} ({error.strerror}): make them with `catstream keys new`") from None
+
+
+def _pair(folder: Path) -> bytes:
+    """Make the key pair of what connects; returns its public half."""
+    public, secret = zmq.curve_keypair()
+    _write(folder / _CLIENT, public=public, secret=secret)
+    return public
+
+
+def _write(path: Path, **facts: bytes) -> None:
+    """A new file, whole or not at all, that only its owner can ever read."""
+    text = b"".join(b'%s = "%s"\n' % (name.encode(), value) for name, value in facts.items())
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle, part = tempfile.mkstemp(dir=path.parent, prefix=".")  # mode 0600; no client's name begins with a dot
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(handle)
+            os.link(part, path)  # unlike a rename it takes no other file's place
+        finally:
+            Path(part).unlink()
+    except FileExistsError:
+        raise ServiceError(f"{path} is there already, and is not written over: give another folder") from None
+    except OSError as error:
+        raise ServiceError(f"cannot write {path} ({error.strerror}): give another folder") from None
+
+
+def _read(path: Path) -> dict[str, object]:
+    others = 0o077 if path.suffix == ".key" else 0o022  # a secret is not read by others, the rest not written
+    try:
+        with path.open("rb") as file:
+            facts = os.fstat(file.fileno())
+            if facts.st_uid not in (os.geteuid(), 0) or facts.st_mode & others:
+                raise ServiceError(f"{path} is not yours alone: chmod 600, and make new keys if others had it")
+            return tomllib.loads(file.read(_LONGEST).decode())
+    except OSError as error:
+        raise ServiceError(
+            f"cannot read {path} ({error.strerror}): a folder of keys is made with `catstream keys new` for a "
+            "pipeline, with `catstream keys allow` for a client"
+        ) from None
+    except ValueError as error:
+        raise ServiceError(f"{path} is damaged ({error}): make new keys") from None
+
+
+def _key(facts: dict[str, object], name: str, path: Path) -> bytes:
+    key = facts.get(name)
+    if not isinstance(key, str) or not _KEY.fullmatch(key):
+        raise ServiceError(f"{path} holds no {name} key as ZeroMQ writes it, 40 characters: make new keys")
+    return key.encode()

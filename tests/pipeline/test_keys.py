@@ -1,0 +1,65 @@
+"""A whole pipeline where nobody comes in without a key."""
+
+from __future__ import annotations
+
+import pytest
+
+from catstream.errors import ServiceError
+from catstream.pipeline import Pipeline
+from catstream.services.supervisor import NAMES
+from catstream.settings import Settings
+from catstream.subscription import subscribe
+from catstream.wire.keys import allow, create
+
+
+@pytest.fixture
+def keys(folder):
+    """The folder of a pipeline's keys; beside it those of a client that may watch."""
+    create(folder / "keys")
+    allow(folder / "keys", "phone", "watch", output=folder / "phone")
+    return folder / "keys"
+
+
+def test_a_pipeline_with_keys_loses_no_frame_and_is_heard_by_who_may(video, folder, keys, tcp):
+    path, boxes = video
+    settings = Settings(endpoint=tcp.replace("127.0.0.1", "0.0.0.0"), keys=str(keys), window=16)
+    with (
+        Pipeline(path, boxes[0], settings) as pipeline,
+        subscribe(tcp, "tracks", keys=str(folder / "phone"), timeout=60) as heard,
+        subscribe(tcp, "health", keys=str(keys), timeout=60) as health,
+    ):
+        tracks = iter(pipeline)
+        first = next(tracks)
+        while not heard._messages.pending():
+            next(tracks)
+        named = {next(health).process for _ in NAMES}
+        rest = list(tracks)
+        assert next(heard).state
+        assert pipeline.health["detector"]["refused"] == 0
+    assert (first.frame, rest[-1].frame) == (0, pipeline.frames - 1)
+    assert pipeline.totals == {"sent": pipeline.frames, "stored": pipeline.frames}
+    assert pipeline.restarts == 0
+    assert named <= set(NAMES)
+
+
+def test_a_stranger_at_the_door_of_a_pipeline_is_counted_in_its_health(video, keys, tcp):
+    path, boxes = video
+    with (
+        Pipeline(path, boxes[0], Settings(endpoint=tcp, keys=str(keys), window=16)) as pipeline,
+        subscribe(tcp, "health", keys=str(keys), timeout=60) as health,
+    ):
+        tracks = iter(pipeline)
+        next(tracks)
+        create(keys.parent / "wrong")
+        with subscribe(tcp, "tracks", keys=str(keys.parent / "wrong")) as stranger:
+            while not next(health).counters.get("refused_handshake"):
+                next(tracks, None)
+            assert not stranger._messages.pending()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "example.org"])
+def test_a_pipeline_that_others_can_reach_does_not_start_without_keys(video, host):
+    path, boxes = video
+    settings = Settings(endpoint=f"tcp://{host}:5700")
+    with pytest.raises(ServiceError, match="catstream keys new"), Pipeline(path, boxes[0], settings):
+        pass

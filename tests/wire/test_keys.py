@@ -1,0 +1,303 @@
+"""Who comes in, where a pipeline has keys: with real sockets, on every channel."""
+
+from __future__ import annotations
+
+import os
+import stat
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+import zmq
+
+from catstream.errors import ServiceError
+from catstream.messages import Answer, Command, End, Health, Model, Position, Preview, Run, Sample, Track
+from catstream.wire.channels import CHANNELS
+from catstream.wire.codec import encode
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.keys import ROLES, Keys, allow, clients, create, revoke
+from catstream.wire.refusals import refusals
+from catstream.wire.sockets import Publisher, Receiver, Requester, Responder, Sender, Subscriber
+
+WINDOW = 4
+CLIENTS = {"watcher": "watch", "helm": "steer", "host": "pipeline"}  # name and role of some
+WATCHED = [name for name, channel in CHANNELS.items() if channel.role == "watch"]
+
+#: Of each channel, who has no place there.
+OUTSIDE = [(name, who) for name in CHANNELS for who in ("none", "wrong", "revoked")] + [
+    (name, who)
+    for name, channel in CHANNELS.items()
+    for who, role in CLIENTS.items()
+    if ROLES.index(role) < ROLES.index(channel.role)
+]
+
+
+def track(seq):
+    return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0)
+
+
+#: What is said on a watched channel, by its first kind.
+SAID = {
+    Track: track(1),
+    Sample: End(1, "nothing was learned"),
+    Model: Model(1, 1, np.ones(3, np.float32), 0.0),
+    Health: Health("detector", 0.0),
+    Preview: Preview(1, 64, 48, None, b"\xff\xd8\xff"),
+    Run: End(1, "nothing was learned"),
+}
+
+
+def refused(reason):
+    return refusals().get(f"refused_{reason}", 0)
+
+
+@pytest.fixture
+def keys(folder):
+    """The folder of a pipeline's keys; beside it those of a client of each role."""
+    create(folder / "keys")
+    for name, role in CLIENTS.items():
+        allow(folder / "keys", name, role, output=folder / name)
+    return folder / "keys"
+
+
+@pytest.fixture
+def place(keys, tcp):
+    """The endpoint as who holds a folder of keys sees it: the pipeline's, a client's, another pipeline's or none."""
+
+    def seen_with(who="keys"):
+        if who == "wrong":
+            create(keys.parent / "wrong")
+        return Endpoint.parse(tcp, "" if who == "none" else str(keys.parent / who))
+
+    return seen_with
+
+
+@pytest.fixture
+def listener(place):
+    """The listening side of a channel, and one turn of it: what it took."""
+    with ExitStack() as stack:
+
+        def listen(name):
+            channel = CHANNELS[name]
+            if channel.acknowledged and name != "control":
+                receiver = stack.enter_context(Receiver(name, place(), Position(), WINDOW))
+                return lambda: receiver.receive(0.02)
+            if name == "control":
+                responder = stack.enter_context(Responder(name, place()))
+                return lambda: responder.waiting() or None
+            publisher = stack.enter_context(Publisher(name, place(), channel.senders[0]))
+            return lambda: publisher.send(SAID[channel.messages[0]])
+
+        yield listen
+
+
+@pytest.fixture
+def stranger():
+    """A raw socket that says on a channel what is said there, and hears all."""
+    with ExitStack() as stack:
+
+        def connect(name, endpoint):
+            kind = zmq.DEALER if CHANNELS[name].acknowledged else zmq.SUB
+            socket = stack.enter_context(zmq.Context.instance().socket(kind))
+            socket.linger = 0
+            if endpoint.keys is not None:
+                socket.curve_serverkey = endpoint.keys.server
+                socket.curve_publickey, socket.curve_secretkey = endpoint.keys.public, endpoint.keys.secret
+            if kind == zmq.SUB:
+                socket.subscribe(b"")
+            socket.connect(endpoint.address(CHANNELS[name]))
+            if kind == zmq.DEALER:
+                socket.send(encode(Command("1", "stop") if name == "control" else End(1, "forged")))
+            return socket
+
+        yield connect
+
+
+def test_keys_are_for_their_owner_from_the_first_byte(folder, monkeypatch):
+    modes, fsync = [], os.fsync
+    monkeypatch.setattr(os, "fsync", lambda handle: (modes.append(os.fstat(handle).st_mode), fsync(handle)))
+    before = os.umask(0)
+    try:
+        create(folder / "keys")
+        allow(folder / "keys", "phone", "watch", output=folder / "phone")
+    finally:
+        os.umask(before)
+    files = [path for path in folder.glob("*/**/*") if path.is_file()]
+    assert len(files) == len(modes) == 7
+    assert {stat.S_IMODE(mode) for mode in [*modes, *(path.stat().st_mode for path in files)]} == {0o600}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in folder.glob("**/") if path != folder} == {0o700}
+
+
+def test_keys_are_not_written_over(keys):
+    before = {path: path.read_bytes() for path in keys.parent.glob("**/*") if path.is_file()}
+    with pytest.raises(ServiceError, match="holds keys already"):
+        create(keys)
+    with pytest.raises(ServiceError, match="not written over"):
+        allow(keys, "other", "watch", output=keys.parent / "watcher")
+    with pytest.raises(ServiceError, match="a client helm already"):
+        allow(keys, "helm", "steer", output=keys.parent / "other")
+    assert before == {path: path.read_bytes() for path in keys.parent.glob("**/*") if path.is_file()}
+
+
+def test_a_client_with_keys_of_its_own_is_allowed_by_the_public_one(keys):
+    public, _ = zmq.curve_keypair()
+    allow(keys, "desk", "steer", public=public.decode())
+    assert Keys.load(keys).client(public.decode()) == ("desk", "steer")
+    with pytest.raises(ServiceError, match="that of desk"):
+        allow(keys, "again", "watch", public=public.decode())
+
+
+@pytest.mark.parametrize("name", ["", ".", "../keys", "a/b", ".hidden", "a b", "x" * 65])
+def test_a_client_has_a_name_that_is_no_path(keys, name):
+    with pytest.raises(ServiceError, match="a client's name"):
+        allow(keys, name, "watch", output=keys.parent / "new")
+    assert set(clients(keys)) == {*CLIENTS, "pipeline"}
+
+
+def test_a_secret_that_others_can_read_is_not_used(keys):
+    (keys / "client.key").chmod(0o640)
+    with pytest.raises(ServiceError, match="chmod 600"):
+        Keys.load(keys)
+
+
+def test_a_damaged_file_is_named(keys):
+    (keys / "server.pub").write_text("public = 'short'\n")
+    with pytest.raises(ServiceError, match=r"server|no public key"):
+        Keys.load(keys)
+    (keys / "client.key").write_bytes(b"\xff\x00")
+    with pytest.raises(ServiceError, match=r"damaged|no public key"):
+        Keys.load(keys)
+
+
+def test_a_secret_is_not_printed(keys):
+    known = Keys.load(keys)
+    assert known.secret.decode() not in repr(known)
+
+
+def test_a_client_cannot_listen_in_the_pipelines_place(place):
+    with pytest.raises(ServiceError, match="keys of a client"):
+        Publisher("tracks", place("watcher"))
+
+
+@pytest.mark.parametrize("name", WATCHED)
+def test_who_may_watch_hears(name, place, listener, until):
+    turn, heard = listener(name), []
+    with Subscriber(name, place("watcher")) as reader:
+        until(lambda: heard, lambda: (turn(), heard.extend(reader.waiting())))
+    assert heard
+
+
+def test_who_may_steer_is_answered(place, until):
+    with Responder("control", place()) as detector, Requester("control", place("helm")) as helm:
+        answers = []
+
+        def turn():
+            for command in detector.waiting():
+                detector.answer(Answer(command.id, True, "", 1))
+            answers.append(helm.ask(Command("1", "pause"), 0.2))
+
+        turn()
+        until(lambda: answers[-1] is not None, turn)
+
+
+def test_the_pipelines_own_keys_carry_an_acknowledged_channel(place, until):
+    taken = []
+    with Receiver("results", place(), Position(), WINDOW) as receiver, Sender("results", place(), WINDOW) as sender:
+
+        def turn():
+            sender.send(track(sender.sent + 1)) if sender.sent < 50 else sender.listen(0)
+            if (message := receiver.receive(0.02)) is not None:
+                taken.append(message.seq)
+                receiver.acknowledge(Position(message.seq))
+
+        until(lambda: sender.stored == 50, turn)
+    assert taken == list(range(1, 51))
+
+
+@pytest.mark.parametrize(("name", "who"), OUTSIDE)
+def test_who_may_not_take_part_gets_nothing_is_counted_and_named_once(
+    name, who, keys, place, listener, stranger, until, caplog
+):
+    reason = "role" if who in CLIENTS else "handshake"
+    if who == "revoked":
+        who, reason = "host", "key"
+        revoke(keys, who)
+    turn, taken, before = listener(name), [], refused(reason)
+    one, two = stranger(name, place(who)), stranger(name, place("none" if who == "wrong" else who))
+    until(lambda: refused(reason) >= before + 2, lambda: taken.append(turn()))
+    assert not any(taken)
+    assert not one.poll(50)
+    assert not two.poll(0)
+    told = [record.message for record in caplog.records if "turned away" in record.message]
+    assert len(told) <= 1, "once for all, where it was not told before"
+    if reason != "handshake":
+        assert who in told[0] if reason == "role" else Keys.load(keys.parent / who).public.decode() in told[0]
+
+
+@pytest.mark.parametrize("name", ["features", "results", "control"])
+def test_an_allowed_watcher_that_sends_is_told_why_it_cannot(name, place, listener, until):
+    turn = listener(name)
+    client = Requester(name, place("watcher")) if name == "control" else Sender(name, place("watcher"), WINDOW)
+    with client, pytest.raises(ServiceError, match=f"does not let this key take part in {name}"):
+        until(lambda: False, lambda: (turn(), client._wait(0.02)))
+
+
+def test_a_revoked_client_hears_until_its_connection_ends_and_never_again(keys, place, until):
+    heard = []
+    with Subscriber("tracks", place("watcher")) as reader:
+        with Publisher("tracks", place()) as tracks:
+            until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.waiting())))
+            revoke(keys, "watcher")
+            until(
+                lambda: heard[-1].seq == 2,
+                lambda: (tracks.send(track(2)), heard.extend(reader.waiting())),
+            )
+            with (
+                Subscriber("tracks", place("watcher")) as another,
+                pytest.raises(ServiceError, match="does not let this key"),
+            ):
+                until(lambda: False, lambda: (tracks.send(track(3)), another.receive(0.02)))
+        list(iter(lambda: reader.receive(0.05), None))  # what was on its way
+        with Publisher("tracks", place()) as tracks, pytest.raises(ServiceError, match="does not let this key"):
+            until(lambda: False, lambda: (tracks.send(track(4)), heard.append(reader.receive(0.02))))
+    assert {message.seq for message in heard if message} <= {1, 2, 3}
+
+
+def test_who_is_allowed_later_needs_no_restart(keys, place, until):
+    heard = []
+    with Publisher("tracks", place()) as tracks:
+        tracks.send(track(1))
+        allow(keys, "late", "watch", output=keys.parent / "late")
+        with Subscriber("tracks", place("late")) as reader:
+            until(lambda: heard, lambda: (tracks.send(track(2)), heard.extend(reader.waiting())))
+
+
+def test_while_the_clients_cannot_be_read_nobody_comes_in_and_afterwards_they_do(keys, place, until):
+    heard, before = [], refused("unreadable")
+    good = (keys / "clients" / "helm").read_bytes()
+    (keys / "clients" / "helm").write_bytes(b"role = ")
+    with Publisher("tracks", place()) as tracks, Subscriber("tracks", place("watcher")) as reader:
+
+        def turn():
+            tracks.send(track(1))
+            heard.extend(reader.waiting())
+
+        until(lambda: refused("unreadable") > before, turn)
+        assert not heard
+        (keys / "clients" / "helm").write_bytes(good)
+        until(lambda: heard, turn)
+
+
+def test_two_pipelines_of_one_program_have_each_their_own_clients(place, keys, folder, until):
+    create(folder / "second")
+    second = str(folder / "second.d"), str(folder / "second")
+    (folder / "second.d").mkdir(mode=0o700)
+    model, heard = SAID[Model], []
+    with (
+        Publisher("models", place()) as one,
+        Publisher("models", Endpoint.parse(*second)) as two,
+        Subscriber("models", Endpoint.parse(*second)) as reader,
+        Subscriber("models", Endpoint.parse(second[0], str(keys))) as stranger,
+    ):
+        until(lambda: heard, lambda: (one.send(model), two.send(model), heard.extend(reader.waiting())))
+        assert stranger.receive(0.1) is None
