@@ -7,35 +7,25 @@ what readers do with a track.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import os
-import select
-import signal
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from statistics import median
 from time import perf_counter
-from typing import Any, Self
 
 import psutil
 from sequences import rendered, video
 from table import Table, command, publish
 
 import catstream
-from catstream.messages import End
+from catstream.loadtest.crowd import Crowd
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
-from catstream.wire.endpoint import Endpoint, private_folder
-from catstream.wire.sockets import Subscriber
+from catstream.wire.endpoint import private_folder
 
 SIZE = (320, 240)
-TOGETHER = 20  # readers in one process: a process each would be more than most machines hold
-LAST_WORDS_SECONDS = 20.0  # that readers have to take what is still on its way
 PAUSE_SECONDS = 2.0  # from one late joiner to the next
-
-_SPAWN = multiprocessing.get_context("spawn")
 
 
 @dataclass(slots=True)
@@ -103,7 +93,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 def travel(frames: int, readers: int, frozen: int) -> Run:
     """Run a pipeline to the end of the video, with readers that attach as it starts."""
     sequence, run, ended = rendered(frames, SIZE), Run(), threading.Event()
-    with private_folder() as folder, Crowd(str(folder), readers, frozen) as crowd:
+    with private_folder() as folder, Crowd(str(folder), readers, frozen=frozen) as crowd:
         late = threading.Thread(target=join, args=(str(folder), ended, run.joined))
         with Pipeline(video(sequence), sequence.boxes[0], Settings(endpoint=str(folder))) as pipeline:
             try:
@@ -119,7 +109,8 @@ def travel(frames: int, readers: int, frozen: int) -> Run:
                 ended.set()
                 if late.ident is not None:
                     late.join()
-        run.frozen, run.heard = crowd.frozen, crowd.heard()
+        crowd.wait()
+        run.frozen, run.heard = crowd.frozen_seconds, crowd.heard()
     return run
 
 
@@ -138,70 +129,6 @@ def join(endpoint: str, ended: threading.Event, seconds: list[float]) -> None:
             if next(models, None) is not None:
                 seconds.append(perf_counter() - begin)
         ended.wait(PAUSE_SECONDS)
-
-
-class Crowd:
-    """Readers of tracks, in processes of their own; some of them are frozen once they hear.
-
-    frozen   seconds for which they have been
-    """
-
-    def __init__(self, endpoint: str, readers: int, frozen: int) -> None:
-        self._counts = _SPAWN.RawArray("l", readers + 1)  # tracks that each has heard; the last one is nobody's
-        self._awake, self._since = readers - frozen, 0.0
-        self._processes: list[Any] = []
-        self._sleepers: list[Any] = []
-        for start, end, processes in ((0, self._awake, self._processes), (self._awake, readers, self._sleepers)):
-            for first in range(start, end, TOGETHER):
-                numbers = range(first, min(first + TOGETHER, end))
-                processes.append(_SPAWN.Process(target=listen, args=(endpoint, numbers, self._counts)))
-
-    @property
-    def frozen(self) -> float:
-        return perf_counter() - self._since if self._since else 0.0
-
-    def freeze(self) -> None:
-        """Stop those that are to be frozen, once all of them have heard a track."""
-        if not self._since and self._sleepers and all(self._counts[self._awake : -1]):
-            for process in self._sleepers:
-                os.kill(process.pid, signal.SIGSTOP)
-            self._since = perf_counter()
-
-    def heard(self) -> list[int]:
-        """Tracks that each of the others has heard, when all is over."""
-        deadline = perf_counter() + LAST_WORDS_SECONDS
-        for process in self._processes:
-            process.join(max(0.0, deadline - perf_counter()))
-        return self._counts[: self._awake]
-
-    def __enter__(self) -> Self:
-        for process in self._processes + self._sleepers:
-            process.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for process in self._processes + self._sleepers:
-            process.kill()
-            process.join()
-
-
-def listen(endpoint: str, numbers: range, counts: Any) -> None:
-    """Be some of the readers, until the end."""
-    os.nice(19)
-    poller, readers = select.poll(), {}
-    for number in numbers:
-        reader = Subscriber("tracks", Endpoint.parse(endpoint))
-        readers[reader.fileno()] = number, reader
-        poller.register(reader.fileno(), select.POLLIN)
-    while readers:
-        for handle, _ in poller.poll():
-            number, reader = readers[handle]
-            for message in reader.waiting():
-                if isinstance(message, End):
-                    poller.unregister(handle)
-                    del readers[handle]
-                else:
-                    counts[number] += 1
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.sockets import Subscriber
 
-__all__ = ["Subscription", "knock", "subscribe"]
+__all__ = ["Gaps", "Subscription", "knock", "subscribe"]
 
 #: Seconds that the last messages have to come in after the end was heard: it travels by itself.
 _LAST_WORDS = 0.5
@@ -37,6 +37,22 @@ _OPEN = {
 }
 
 Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features | Preview)
+
+
+class Gaps:
+    """Counts messages of a stream that never came, by what is missing between their `seq`.
+
+    missed  so far; who comes late has missed nothing, and a restarted sender may go back
+    """
+
+    def __init__(self) -> None:
+        self.missed = self._seq = 0
+
+    def take(self, seq: int) -> None:
+        """The next message that came, or the end."""
+        if self._seq:
+            self.missed += max(0, seq - self._seq - 1)
+        self._seq = seq
 
 
 class Subscription(Generic[Message]):
@@ -69,14 +85,18 @@ class Subscription(Generic[Message]):
         place = find(endpoint, keys)
         self.endpoint, self.timeout = str(place), timeout
         self.keys = str(place.keys.folder) if place.keys is not None else ""
-        self.missed = 0
         self.end: End | None = None
-        self._what, self._channel, self._seq = channel, CHANNELS[_OPEN[channel]], 0
+        self._what, self._channel, self._gaps = channel, CHANNELS[_OPEN[channel]], Gaps()
         self._newest: dict[str, float] = {}  # of each process that sends: what was taken last
         self._closing = float("inf")  # when to wait no more
         self._messages = Subscriber(self._channel.name, place)
         # By itself: a reader that is so slow that messages are dropped would miss the end among them.
         self._ends = Subscriber("tracks", place, only=End)
+
+    @property
+    def missed(self) -> int:
+        """Tracks or features that never came: this reader was too slow, or away."""
+        return self._gaps.missed
 
     @property
     def refused(self) -> int:
@@ -153,23 +173,18 @@ class Subscription(Generic[Message]):
         if isinstance(message, Run):
             return False
         if isinstance(message, Track | Features):
-            self._count(message.seq)
+            self._gaps.take(message.seq)
             return True
         name, mark = _mark(message)
         known = self._newest.get(name)
         self._newest[name] = mark
         return mark != known
 
-    def _count(self, seq: int) -> None:
-        if self._seq:  # who comes late has missed nothing; a restarted detector goes back
-            self.missed += max(0, seq - self._seq - 1)
-        self._seq = seq
-
     def _ended(self) -> bool:
         if self.end is None or monotonic() < self._closing:
             return False
         if self._channel.keeps == "every":
-            self._count(self.end.seq)
+            self._gaps.take(self.end.seq)
         return True
 
     def _patience(self) -> float:

@@ -17,7 +17,7 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.refusals import refusals
 from catstream.wire.sockets import Publisher
 
-__all__ = ["REFUSED", "Process", "run"]
+__all__ = ["REFUSED", "Process", "die_with", "run"]
 
 #: Exit code of a process that would fail the same way again: it is not restarted.
 REFUSED = 2
@@ -85,7 +85,7 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
     """
     logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
     if parent is not None:
-        _die_with(parent)
+        die_with(parent)
     try:
         process = Process(name, settings)
         try:
@@ -98,7 +98,7 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
     return 0
 
 
-def _die_with(parent: int) -> None:
+def die_with(parent: int) -> None:
     """Have the kernel kill this process when the one that started it is gone: no orphan is left."""
     ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # it went before the kernel was told

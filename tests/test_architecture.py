@@ -22,6 +22,7 @@ FLOORS = [
     {"services"},
     {"pipeline"},
     {"evaluation"},
+    {"loadtest"},
     {"cli"},
 ]
 
@@ -39,6 +40,8 @@ HOMES = {
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
     "threadpoolctl": ["catstream/evaluation/onepass.py", "catstream/recording/learning.py"],
+    "psutil": ["catstream/loadtest/usage.py"],
+    "hdrh": ["catstream/loadtest/latencies.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "rich": ["catstream/cli"],
 }
@@ -125,7 +128,7 @@ def test_a_stage_could_run_on_a_desert_island(path):
 
 def test_every_dependency_has_a_home():
     """What pyproject.toml asks for, and nothing else."""
-    distributions = {"opencv-python-headless": "cv2", "scikit-learn": "sklearn", "pyzmq": "zmq"}
+    distributions = {"opencv-python-headless": "cv2", "scikit-learn": "sklearn", "pyzmq": "zmq", "hdrhistogram": "hdrh"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {dependency.partition(">=")[0] for dependency in project["dependencies"]}
     assert {distributions.get(name, name) for name in names} == set(HOMES)

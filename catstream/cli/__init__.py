@@ -16,6 +16,7 @@ VERBS = {
     "track": "Follow an object through a video.",
     "demo": "See it work, on a video that is rendered for it.",
     "evaluate": "Measure accuracy on annotated sequences, beside other trackers.",
+    "loadtest": "Put pipelines under load, and measure what they bear.",
     "watch": "Show what a running pipeline says, as it says it.",
     "record": "Keep what a running pipeline says, in one file.",
     "replay": "Play a recording to subscribers, or learn from it once more.",

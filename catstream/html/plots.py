@@ -16,7 +16,7 @@ __all__ = ["COLOURS", "SHARES", "Axis", "plot"]
 COLOURS = ("#e8590c", "#1c7ed6", "#2f9e44", "#9c36b5", "#c9a227", "#868e96")
 
 _WIDTH, _HEIGHT = 460, 320
-_LEFT, _TOP, _RIGHT, _BOTTOM = 46, 34, 16, 44
+_LEFT, _TOP, _RIGHT, _BOTTOM = 46, 34, 24, 44
 _LETTER, _ROW = 6.6, 18  # pixels of a letter and of a row of the legend
 
 

@@ -12,7 +12,6 @@ NUT: FFmpeg gives its frames at once, and holds one back of others.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 from collections.abc import Iterator, Sequence
@@ -118,8 +117,8 @@ class Broadcast:
         """Send a stream to a reader until it is gone."""
         import av
 
-        clock = Fraction(1, _TICKS)
-        with av.open(_Pipe(file), "w", format="nut", options={"flush_packets": "1"}) as container:
+        clock, pipe = Fraction(1, _TICKS), _Pipe(file)
+        with av.open(pipe, "w", format="nut", options={"flush_packets": "1"}) as container:
             track: Any = container.add_stream("mjpeg", rate=Fraction(_STILL))
             track.width, track.height, track.pix_fmt, track.time_base = *self._size, "yuvj420p", clock
             for moment, picture in self._frames(stream):
@@ -127,6 +126,8 @@ class Broadcast:
                 packet.stream, packet.time_base, packet.is_keyframe = track, clock, True
                 packet.pts = packet.dts = round(moment * _TICKS)
                 container.mux(packet)
+                if pipe.broken:
+                    break
 
     def close(self) -> None:
         """Close all connections, and take no more."""
@@ -173,19 +174,25 @@ class _Viewer(BaseHTTPRequestHandler):
         self.send_response(200)
         self.send_header("Content-Type", "video/x-nut")
         self.end_headers()
-        with contextlib.suppress(OSError):  # the reader has left
-            self._broadcast.send(int(name), self.wfile)
+        self._broadcast.send(int(name), self.wfile)
 
     def log_message(self, *_: object) -> None:
         pass
 
 
 class _Pipe:
-    """A file that can only be written to, as PyAV takes it: the whole of a packet at once."""
+    """A file that can only be written to, as PyAV takes it; an error in it would be one of FFmpeg's, and unlike others.
+
+    broken  whether the reader has left
+    """
 
     def __init__(self, file: BufferedIOBase) -> None:
-        self._file = file
+        self._file, self.broken = file, False
 
     def write(self, data: bytes) -> int:
-        self._file.write(data)
+        if not self.broken:
+            try:
+                self._file.write(data)
+            except OSError:
+                self.broken = True
         return len(data)

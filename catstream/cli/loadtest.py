@@ -1,0 +1,241 @@
+"""`catstream loadtest`: what pipelines on this machine bear."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from catstream.errors import CatstreamError
+from catstream.services.options import with_settings
+from catstream.settings import Settings
+
+if TYPE_CHECKING:
+    from catstream.loadtest.limits import Limit
+    from catstream.loadtest.run import Result
+    from catstream.loadtest.trial import Step
+
+__all__ = ["loadtest"]
+
+_BROKEN, _INTERRUPTED = 1, 130
+_FIND = ("p99=0.1", "skipped=0.01")  # what a rate must hold where nothing else is given
+
+
+def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    if not found or min(size := (int(found[1]), int(found[2]))) < 64:
+        raise click.BadParameter(f"a size is WIDTHxHEIGHT, 64x64 to 9999x9999, got {text!r}: for example 640x480")
+    return size
+
+
+@click.command()
+@click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Pipelines side by side.")
+@click.option("--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Attached to each.")
+@click.option("--slow-subscribers", "slow", type=click.IntRange(0), default=0, help="Of them slow or frozen.")
+@click.option(
+    "--rate", type=click.FloatRange(0.5, 1000), default=25.0, show_default=True, help="Frames a second of each."
+)
+@click.option("--duration", type=click.FloatRange(1, 86400), default=10.0, show_default=True, help="Seconds.")
+@click.option("--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Of a frame, pixels.")
+@click.option("--chaos", is_flag=True, help="Kill a random process every few seconds.")
+@click.option("--find-limit", is_flag=True, help="Look for the highest rate that holds.")
+@click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="To be held; may be repeated; see below.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all figures.")
+@click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and .hgrm.")
+@with_settings
+def loadtest(
+    settings: Settings,
+    streams: int,
+    subscribers: int,
+    slow: int,
+    rate: float,
+    duration: float,
+    size: tuple[int, int],
+    chaos: bool,
+    find_limit: bool,
+    limits: tuple[str, ...],
+    json_file: Path | None,
+    output: Path | None,
+) -> None:
+    """Put pipelines under load, and measure what they bear.
+
+    A camera of the load test broadcasts a rendered video with known truth over
+    HTTP on loopback; each stream is followed by a detector, a compressor and a
+    trainer of its own. The camera does not wait: frame i is due at start + i /
+    RATE, and latency counts from then. A frame that was skipped waits for the
+    track of a newer one.
+
+    Slow subscribers take two tracks a second, every other one is frozen
+    instead. Chaos kills by SIGKILL, the same in each run with --set seed=N.
+
+    \b
+    LIMITS, of the worst stream
+      p50 p95 p99 p99.9 max     seconds from a frame to its track, at most
+      model-p50 ... model-max   seconds from a frame to the model that has seen it, at most
+      skipped                   share of frames that were not followed, at most
+      missed                    share of tracks that quick subscribers missed, at most
+      recovery                  seconds from a kill to the next track, at most
+      success                   share of frames with an overlap above 0.5, at least
+
+    With --find-limit, RATE is where to begin, each rate runs for DURATION, and
+    the limits are p99=0.1 and skipped=0.01 where none is given.
+
+    \b
+    Writes
+      OUTPUT/report.html             figures and plots
+      OUTPUT/track.hgrm, model.hgrm  HDR histograms: percentiles of both latencies, in milliseconds
+
+    The exit code is 0, 1 where a limit was broken or a stream failed, and 130
+    after Ctrl-C, which ends all processes and tells what was measured so far.
+
+    \b
+    EXAMPLES
+      catstream loadtest --rate 30 --limit p99=0.1
+      catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
+      catstream loadtest --duration 60 --chaos --limit recovery=5
+      catstream loadtest --find-limit --size 320x240
+    """
+    # Here, so that --help and the other verbs need not wait for these.
+    from catstream.loadtest.figures import to_json
+    from catstream.loadtest.limits import Limit
+    from catstream.loadtest.plan import Plan
+    from catstream.loadtest.report import write_report
+    from catstream.loadtest.run import News
+    from catstream.loadtest.trial import hold
+
+    asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
+    plan = Plan(streams, subscribers, slow, rate, duration, size, chaos, settings)
+    _writable(json_file, output)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[figures]}")
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("starting", total=1.0, figures="")
+
+        def tell(news: News) -> None:
+            progress.update(task, description=news.doing, completed=news.share, figures=news.figures)
+
+        def tried(step: Step) -> None:
+            if find_limit:
+                console.print(_step(step))
+
+        trial = hold(plan, asked, find=find_limit, tell=tell, tried=tried)
+    if trial.steps:
+        _print(console, trial.result, asked)
+        if json_file is not None:
+            json_file.write_text(json.dumps(to_json(trial), indent=1) + "\n", encoding="utf-8")
+        if output is not None:
+            trial.result.track.write(output / "track.hgrm")
+            trial.result.model.write(output / "model.hgrm")
+            console.print(f"report: {write_report(output / 'report.html', trial)}", soft_wrap=True)
+    if trial.interrupted:
+        console.print("stopped: these are the figures so far" if trial.steps else "stopped: nothing was measured yet")
+        sys.exit(_INTERRUPTED)
+    if trial.found:
+        console.print(f"the highest rate that holds {', '.join(map(str, asked))}: {trial.found:g} frames/s a stream")
+    for line in trial.broken:
+        click.echo(f"catstream: broken: {line}", err=True)
+    if trial.broken:
+        sys.exit(_BROKEN)
+
+
+def _writable(json_file: Path | None, output: Path | None) -> None:
+    """Refuse places that cannot be written to before minutes are spent."""
+    if output is not None:
+        try:
+            output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CatstreamError(f"cannot write to {str(output)!r} ({error.strerror}): give another folder") from None
+    if json_file is not None and not json_file.absolute().parent.is_dir():
+        raise CatstreamError(f"cannot write {str(json_file)!r}: its folder does not exist, make it first")
+
+
+def _step(step: Step) -> str:
+    verdict = f"[red]{'; '.join(step.broken)}[/]" if step.broken else "[green]holds[/]"
+    p99 = _ms(step.result.track["p99"])
+    return f"{step.rate:g} frames/s due, {step.followed:.1f} followed, p99 {p99} ms: {verdict}"
+
+
+def _print(console: Console, result: Result, limits: list[Limit]) -> None:
+    from catstream.loadtest.figures import usage
+
+    plan = result.plan
+    console.print(
+        f"{plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most {_ms(result.camera_late)} ms late",
+    )
+    console.print(_streams(result))
+    if result.usage:
+        console.print(
+            _table(
+                ("process", "cores", "most", "MB", "most"),
+                [
+                    (
+                        name,
+                        *(f"{found[key]:.2f}" for key in ("cores", "cores_most")),
+                        *(f"{found[key] / 1e6:.0f}" for key in ("memory", "memory_most")),
+                    )
+                    for name, found in ((name, usage(samples)) for name, samples in result.usage.items())
+                ],
+            )
+        )
+    if plan.subscribers:
+        console.print(
+            f"subscribers: {plan.subscribers * plan.streams}, {plan.slow * plan.streams} of them slow or frozen; the "
+            f"others heard {sum(result.heard)} tracks and missed {sum(result.missed)}"
+        )
+    if plan.chaos:
+        rows = [
+            (f"{recovery.kill.process} {recovery.kill.stream}", *map(_seconds, (recovery.track, recovery.model)))
+            for recovery in result.recoveries
+        ]
+        console.print(_table((f"{len(rows)} killed", "s to the next track", "s to the next model"), rows))
+    for limit in limits:
+        mark = "[green]held[/]" if limit.held(result) else "[red]broken[/]"
+        console.print(f"{mark}: {limit.told(result)}")
+
+
+def _streams(result: Result) -> Table:
+    from catstream.loadtest.latencies import PERCENTILES
+
+    heads = ("stream", "frames/s", "skipped", *PERCENTILES, "model p50", "p99", "lag", "not stored", "success")
+    rows: list[tuple[Any, ...]] = []
+    for number, measures in enumerate(result.streams):
+        stored = "-" if measures.sent is None or measures.stored is None else measures.sent - measures.stored
+        rows.append(
+            (
+                number,
+                f"{measures.rate(result.plan.rate):.1f}",
+                f"{100 * measures.skipped_share:.1f} %",
+                *(_ms(measures.track[name]) for name in PERCENTILES),
+                *(_ms(measures.model[name]) for name in ("p50", "p99")),
+                measures.most_lag,
+                stored,
+                "-" if measures.success is None else f"{measures.success:.3f}",
+            )
+        )
+    return _table(heads, rows)
+
+
+def _table(heads: tuple[str, ...], rows: list[tuple[Any, ...]]) -> Table:
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for number, head in enumerate(heads):
+        table.add_column(head, justify="right" if number else "left")
+    for row in rows:
+        table.add_row(*map(str, row))
+    return table
+
+
+def _ms(seconds: float) -> str:
+    return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
+
+
+def _seconds(seconds: float | None) -> str:
+    return "none" if seconds is None else f"{seconds:.3f}"

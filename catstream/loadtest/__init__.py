@@ -1,0 +1,1 @@
+"""Load tests: real pipelines on a broadcast whose every frame is known, at a rate that does not wait for them."""

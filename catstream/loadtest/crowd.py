@@ -1,0 +1,109 @@
+"""A crowd of subscribers: real sockets in processes of their own, most of them quick, some slow, some frozen."""
+
+from __future__ import annotations
+
+import os
+import signal
+from time import monotonic
+from typing import Any, Self
+
+from catstream.loadtest.children import SPAWN, start
+from catstream.loadtest.listening import arrivals, dawdling
+from catstream.messages import End
+from catstream.services.loop import die_with
+from catstream.subscription import Gaps
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Subscriber
+
+__all__ = ["Crowd"]
+
+_TOGETHER = 20  # readers in one process: a process each would be more than most machines hold
+_PAUSE_SECONDS = 0.5  # from one message to the next of a slow reader
+_LAST_WORDS_SECONDS = 20.0  # that quick readers have to take what is still on its way
+
+
+class Crowd:
+    """Readers of the tracks of one pipeline, while it is open. They run at the lowest priority: what is measured
+    is the pipeline, not what readers do with a track.
+
+    Parameters
+    ----------
+    readers : how many in all
+    slow : of them take two messages a second
+    frozen : of them are stopped by `freeze`
+    """
+
+    def __init__(self, endpoint: str, readers: int, *, slow: int = 0, frozen: int = 0) -> None:
+        self._quick, self._readers = readers - slow - frozen, readers
+        self._heard, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
+        self._since = 0.0  # when they were frozen
+        self._groups: list[list[Any]] = []
+        first = 0
+        for size, pause in ((self._quick, 0.0), (slow, _PAUSE_SECONDS), (frozen, 0.0)):
+            self._groups.append([])
+            for begin in range(first, first + size, _TOGETHER):
+                numbers = range(begin, min(begin + _TOGETHER, first + size))
+                arguments = (endpoint, numbers, pause, self._heard, self._missed, os.getpid())
+                self._groups[-1].append(SPAWN.Process(target=_listen, args=arguments))
+            first += size
+
+    @property
+    def pids(self) -> list[int]:
+        return [process.pid for group in self._groups for process in group]
+
+    @property
+    def attached(self) -> bool:
+        """Whether each of them has heard a track."""
+        return all(self._heard[: self._readers])
+
+    @property
+    def frozen_seconds(self) -> float:
+        """For how long some have been frozen."""
+        return monotonic() - self._since if self._since else 0.0
+
+    def freeze(self) -> None:
+        """Stop those that are to be frozen, once all are attached."""
+        if not self._since and self._groups[2] and self.attached:
+            for process in self._groups[2]:
+                os.kill(process.pid, signal.SIGSTOP)
+            self._since = monotonic()
+
+    def wait(self) -> None:
+        """Until each quick reader has heard the end, but not for ever."""
+        deadline = monotonic() + _LAST_WORDS_SECONDS
+        for process in self._groups[0]:
+            process.join(max(0.0, deadline - monotonic()))
+
+    def heard(self) -> list[int]:
+        """Tracks that each quick reader has heard."""
+        return self._heard[: self._quick]
+
+    def missed(self) -> list[int]:
+        """Tracks that each quick reader has missed, by the gaps in `seq`."""
+        return self._missed[: self._quick]
+
+    def __enter__(self) -> Self:
+        for group in self._groups:
+            for process in group:
+                start(process)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for group in self._groups:
+            for process in group:
+                if process.pid is not None:
+                    process.kill()
+                    process.join()
+
+
+def _listen(endpoint: str, numbers: range, pause: float, heard: Any, missed: Any, parent: int) -> None:
+    """Be some of the readers, until the end."""
+    die_with(parent)
+    os.nice(19)
+    readers = {number: Subscriber("tracks", Endpoint.parse(endpoint)) for number in numbers}
+    gaps = {number: Gaps() for number in numbers}
+    for number, _, message in dawdling(readers, pause) if pause else arrivals(readers):
+        gaps[number].take(message.seq)
+        missed[number] = gaps[number].missed
+        if not isinstance(message, End):
+            heard[number] += 1

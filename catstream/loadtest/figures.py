@@ -1,0 +1,103 @@
+"""All figures of a load test, as JSON holds them."""
+
+from __future__ import annotations
+
+import os
+import platform
+from typing import Any
+
+from catstream.loadtest.measures import Measures
+from catstream.loadtest.trial import Trial
+from catstream.loadtest.usage import Sample
+
+__all__ = ["machine", "to_json", "usage"]
+
+
+def to_json(trial: Trial) -> dict[str, Any]:
+    """The figures of the run that counts, and of the steps that led to it; seconds, shares from 0 to 1, bytes."""
+    result = trial.result
+    plan = result.plan
+    return {
+        "plan": {
+            "streams": plan.streams,
+            "subscribers": plan.subscribers,
+            "slow_subscribers": plan.slow,
+            "rate": plan.rate,
+            "duration": plan.duration,
+            "size": list(plan.size),
+            "chaos": plan.chaos,
+            "settings": plan.settings.changed(),
+        },
+        "machine": machine(),
+        "seconds": result.seconds,
+        "interrupted": trial.interrupted,
+        "latency": {"track": result.track.figures(), "model": result.model.figures()},
+        "streams": [_stream(measures, plan.rate) for measures in result.streams],
+        "processes": {name: usage(samples) for name, samples in result.usage.items()},
+        "subscribers": {
+            "quick": len(result.heard),
+            "heard": sum(result.heard),
+            "missed": result.missed,
+            "frozen_seconds": round(result.frozen, 3),
+        },
+        "chaos": [
+            {
+                "stream": recovery.kill.stream,
+                "process": recovery.kill.process,
+                "to_track": recovery.track,
+                "to_model": recovery.model,
+            }
+            for recovery in result.recoveries
+        ],
+        "restarts": result.restarts,
+        "camera_late": round(result.camera_late, 6),
+        "limits": {limit.name: {"value": limit.value, "held": limit.held(result)} for limit in trial.limits},
+        "broken": trial.broken,
+        "found": trial.found,
+        "steps": [
+            {
+                "rate": step.rate,
+                "followed": step.followed,
+                "track": step.result.track.figures(),
+                "broken": step.broken,
+            }
+            for step in trial.steps
+        ],
+    }
+
+
+def _stream(measures: Measures, rate: float) -> dict[str, Any]:
+    return {
+        "frames": measures.frames,
+        "frames_per_second": measures.rate(rate),
+        "skipped": measures.skipped,
+        "never": measures.never,
+        "track": measures.track.figures(),
+        "model": measures.model.figures(),
+        "lag": measures.most_lag,
+        "sent": measures.sent,
+        "stored": measures.stored,
+        "success": measures.success,
+        "success_followed": measures.success_followed,
+    }
+
+
+def usage(samples: list[Sample]) -> dict[str, float]:
+    """Of one process: mean and most of its processor in cores, and of its memory."""
+    cores, memory = [sample.cores for sample in samples], [sample.memory for sample in samples]
+    return {
+        "cores": sum(cores) / len(cores),
+        "cores_most": max(cores),
+        "memory": sum(memory) / len(memory),
+        "memory_most": max(memory),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What it ran on."""
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)),
+        "load_before": os.getloadavg()[0],
+        "python": platform.python_version(),
+    }

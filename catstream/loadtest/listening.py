@@ -1,0 +1,45 @@
+"""Listening to many sockets at once, quickly or slowly."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeVar
+
+from catstream.messages import End
+from catstream.wire.sockets import Subscriber
+
+__all__ = ["arrivals", "dawdling"]
+
+_TURN_SECONDS = 0.1
+
+Key = TypeVar("Key")
+
+
+def arrivals(
+    readers: Mapping[Key, Subscriber], over: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[Key, float, Any]]:
+    """Who received, when by `time.monotonic`, and what; each until its End, all until `over`."""
+    poller, keys = select.poll(), {}
+    for key, reader in readers.items():
+        keys[reader.fileno()] = key
+        poller.register(reader.fileno(), select.POLLIN)
+    while keys and not over():
+        for handle, _ in poller.poll(1000 * _TURN_SECONDS):
+            key = keys[handle]
+            while (message := readers[key].receive(0)) is not None:
+                yield key, time.monotonic(), message
+                if isinstance(message, End):
+                    poller.unregister(handle)
+                    del keys[handle]
+                    break
+
+
+def dawdling(readers: Mapping[Key, Subscriber], pause: float) -> Iterator[tuple[Key, float, Any]]:
+    """The same, but a message of each reader, then a pause, for ever."""
+    while True:
+        for key, reader in readers.items():
+            if (message := reader.receive(0)) is not None:
+                yield key, time.monotonic(), message
+        time.sleep(pause)

@@ -1,0 +1,171 @@
+"""From what was seen of a stream to what it is worth under load.
+
+Every frame that was due counts once, whether it was followed or skipped: its latency ends with the first track of
+it or of a newer frame, and with the first model whose sample summarises it or a newer one. So a pipeline that
+skips what comes while it is slow gets no better figures for it (no coordinated omission).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from catstream.evaluation.metrics import overlaps
+from catstream.loadtest.latencies import Latencies
+from catstream.loadtest.observer import Seen
+from catstream.video.broadcast import Schedule
+
+__all__ = ["Measures", "held", "measure", "waits"]
+
+_SUCCESS = 0.5  # overlap with the truth above which a frame counts as followed well
+
+
+@dataclass(slots=True)
+class Measures:
+    """Of one stream.
+
+    due              moment at which each frame was due, float64 (frames,)
+    followed         which of them have a track, bool (frames,)
+    track            seconds from each frame's moment to the track that covers it
+    model            the same to the model; of those before the first model's, the first one counts
+    never            frames that no track covered until the end of the run: their latency counts as if one came then
+    success          share of frames with the object whose overlap is above 0.5; a skipped frame has the box before it
+    success_followed the same of the followed frames alone; None where there is none
+    lag              messages that the compressor had not taken: moment and number of each report
+    sent, stored     features messages at the end; None where the stream did not come to its end
+    """
+
+    due: np.ndarray
+    followed: np.ndarray
+    track: Latencies
+    model: Latencies
+    never: int
+    success: float | None
+    success_followed: float | None
+    lag: list[tuple[float, int]] = field(default_factory=list)
+    sent: int | None = None
+    stored: int | None = None
+
+    @property
+    def frames(self) -> int:
+        """That were due."""
+        return len(self.due)
+
+    @property
+    def skipped(self) -> int:
+        """Frames without a track of their own: a newer one came, or nobody was there."""
+        return self.frames - int(self.followed.sum())
+
+    @property
+    def skipped_share(self) -> float:
+        return self.skipped / self.frames
+
+    def rate(self, rate: float) -> float:
+        """Frames a second that were followed, of so many due."""
+        return rate * (1 - self.skipped_share)
+
+    @property
+    def most_lag(self) -> int:
+        return max((behind for _, behind in self.lag), default=0)
+
+
+def measure(
+    seen: Seen, schedule: Schedule, frames: int, truth: np.ndarray, end: float, totals: dict[str, int]
+) -> Measures:
+    """What one stream is worth.
+
+    Parameters
+    ----------
+    schedule : the camera's
+    frames : how many were due: all of the schedule, or those before an interruption
+    truth : float64 (pictures, 4), NaN where absent
+    end : when nobody looked any more
+    totals : of the pipeline, at its end
+    """
+    due = np.array([schedule.due(number) for number in range(frames)])
+    tracks = [(moment, track, schedule.number(track.pts)) for moment, track in seen.tracks if track.pts is not None]
+    numbers = np.array([number for *_, number in tracks], int)
+    to_track, never = waits(due, numbers, np.array([moment for moment, *_ in tracks]), end)
+    models = _models(seen, schedule)
+    to_model, _ = waits(due, np.array([number for _, number in models], int), np.array([at for at, _ in models]), end)
+
+    boxes = np.full((frames, 4), np.nan)
+    followed = np.zeros(frames, bool)
+    for _, track, number in tracks:
+        if 0 <= number < frames:
+            boxes[number], followed[number] = track.box or np.nan, True
+    true = truth[[schedule.picture(number, len(truth)) for number in range(frames)]]
+    return Measures(
+        due=due,
+        followed=followed,
+        track=Latencies(to_track),
+        model=Latencies(to_model),
+        never=never,
+        success=_success(held(boxes, followed), true),
+        success_followed=_success(boxes[followed], true[followed]),
+        lag=[
+            (moment, int(health.counters["sent"] - health.counters["taken"]))
+            for moment, health in seen.health
+            if health.process == "detector" and schedule.start <= moment <= end
+        ],
+        sent=totals.get("sent"),
+        stored=totals.get("stored"),
+    )
+
+
+def waits(due: np.ndarray, numbers: np.ndarray, moments: np.ndarray, end: float) -> tuple[np.ndarray, int]:
+    """Seconds from each frame's moment to the first answer to it or to a newer frame.
+
+    Parameters
+    ----------
+    due : float64 (frames,), moments
+    numbers, moments : of each answer, the frame and when it came, int and float64 (answers,)
+    end : when an answer to a frame that has none is taken to have come
+
+    Returns
+    -------
+    float64 (frames,), and how many of them have no answer
+
+    >>> waits(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0, 2]), np.array([0.5, 2.5]), end=9.0)
+    (array([0.5, 1.5, 0.5, 6. ]), 1)
+    """
+    frames = len(due)
+    first = np.full(frames, np.inf)
+    known = numbers >= 0
+    np.minimum.at(first, np.minimum(numbers[known], frames - 1), moments[known])
+    first = np.minimum.accumulate(first[::-1])[::-1]
+    return np.minimum(first, end) - due, int(np.isinf(first).sum())
+
+
+def held(boxes: np.ndarray, followed: np.ndarray) -> np.ndarray:
+    """The boxes that were known at each frame: its own, or of the last one before it that was followed.
+
+    >>> held(np.array([[1.0], [2.0], [3.0]]), np.array([False, True, False])).ravel()
+    array([nan,  2.,  2.])
+    """
+    last = np.maximum.accumulate(np.where(followed, np.arange(len(boxes)), -1))
+    return np.where(last[:, None] >= 0, boxes[last], np.nan)
+
+
+def _success(boxes: np.ndarray, truth: np.ndarray) -> float | None:
+    present = np.isfinite(truth).all(axis=1)
+    return float((overlaps(boxes, truth)[present] > _SUCCESS).mean()) if present.any() else None
+
+
+def _models(seen: Seen, schedule: Schedule) -> list[tuple[float, int]]:
+    """When each model came, and the newest frame that it summarises, in the numbers of the schedule.
+
+    A restarted detector gives frames that were lost with it new pictures: what a number stands for depends on the time.
+    """
+    stood_for: dict[int, int] = {}
+    models, tracks = [], iter(seen.tracks)
+    ahead = next(tracks, None)
+    for moment, frame in seen.models:
+        while ahead is not None and ahead[0] <= moment:
+            if ahead[1].pts is not None:
+                stood_for[ahead[1].frame] = schedule.number(ahead[1].pts)
+            ahead = next(tracks, None)
+        if frame in stood_for:
+            models.append((moment, stood_for[frame]))
+    return models

@@ -1,0 +1,72 @@
+"""What can be seen of running pipelines from outside, and when: their tracks, models and health."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+from catstream.loadtest.listening import arrivals
+from catstream.messages import Health, Model, Track
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Subscriber
+
+__all__ = ["Observer", "Seen"]
+
+
+@dataclass(slots=True)
+class Seen:
+    """What came from one pipeline, each with its moment by `time.monotonic`, oldest first.
+
+    tracks  as they came; a restarted detector may repeat a `seq`, with another frame
+    models  the frame of each, in the numbers that tracks had when it came
+    health  counters of each process
+    moving  version of the first model that knows how the object moves, 0 before it
+    """
+
+    tracks: list[tuple[float, Track]] = field(default_factory=list)
+    models: list[tuple[float, int]] = field(default_factory=list)
+    health: list[tuple[float, Health]] = field(default_factory=list)
+    moving: int = 0
+
+    @property
+    def warm(self) -> bool:
+        """Whether all that happens only once has happened: the detector has gone on with such a model."""
+        return self.moving > 0 and self.tracks[-1][1].model_version >= self.moving
+
+
+class Observer(threading.Thread):
+    """Subscribes like anybody else, and writes down the moment; `end` it.
+
+    Attributes
+    ----------
+    seen : of each endpoint
+    """
+
+    def __init__(self, endpoints: list[str]) -> None:
+        super().__init__(name="observer", daemon=True)
+        self.seen = [Seen() for _ in endpoints]
+        self._endpoints, self._over = endpoints, threading.Event()
+
+    def run(self) -> None:
+        with ExitStack() as stack:
+            readers = {
+                (number, channel): stack.enter_context(Subscriber(channel, Endpoint.parse(endpoint)))
+                for number, endpoint in enumerate(self._endpoints)
+                for channel in ("tracks", "models", "health")
+            }
+            for (number, _), moment, message in arrivals(readers, self._over.is_set):
+                match message:
+                    case Track():
+                        self.seen[number].tracks.append((moment, message))
+                    case Model():
+                        seen = self.seen[number]
+                        seen.models.append((moment, message.frame))
+                        if message.motion is not None:
+                            seen.moving = seen.moving or message.version
+                    case Health():
+                        self.seen[number].health.append((moment, message))
+
+    def end(self) -> None:
+        self._over.set()
+        self.join()

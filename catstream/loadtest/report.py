@@ -1,0 +1,240 @@
+"""The report of a load test: one HTML file with its figures and plots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from catstream.html.page import table, write_page
+from catstream.html.plots import Axis, plot
+from catstream.loadtest.figures import usage
+from catstream.loadtest.latencies import PERCENTILES, Latencies
+from catstream.loadtest.measures import Measures
+from catstream.loadtest.run import Result
+from catstream.loadtest.trial import Trial
+
+__all__ = ["write_report"]
+
+_STREAMS = 6  # curves that can be told apart
+_POINTS = 200  # of a curve over time
+
+
+def write_report(path: Path, trial: Trial) -> Path:
+    """Write the report of the run that counts, and of the steps that led to it.
+
+    Raises
+    ------
+    VideoError
+        Where the file cannot be written.
+    """
+    result = trial.result
+    plan = result.plan
+    about = (
+        f"{plan}, {result.seconds:.1f} s{', interrupted' if result.interrupted else ''}. Latency counts from the "
+        "moment at which a frame was due; a skipped one waits for the track of a newer one."
+    )
+    return write_page(
+        path,
+        "load test",
+        [
+            "<h1>How it bears the load</h1>",
+            f'<p class="about">{about}</p>',
+            *(f'<p class="bad">{escape(error)}</p>' for error in result.errors),
+            _limits(trial),
+            _steps(trial),
+            "<h2>Streams</h2>",
+            _streams(result),
+            _plots(result),
+            "<h2>Processes</h2>",
+            _processes(result),
+            _subscribers(result),
+            _chaos(result),
+            "<h2>The camera</h2>",
+            f'<p class="about">It sent no frame more than {_ms(result.camera_late)} ms after it was due by its own '
+            "fault: latencies are not better known than that.</p>",
+            "<h2>Settings that are not the default</h2>",
+            f"<pre>{escape(chr(10).join(plan.settings.changed()) or 'none')}</pre>",
+        ],
+    )
+
+
+def _limits(trial: Trial) -> str:
+    lines = []
+    for limit in trial.limits:
+        style, word = ("good", "held") if limit.held(trial.result) else ("bad", "broken")
+        lines.append(f'<li class="{style}">{word}: {escape(limit.told(trial.result))}</li>')
+    return f"<ul>{''.join(lines)}</ul>" if lines else ""
+
+
+def _steps(trial: Trial) -> str:
+    if not trial.searched:
+        return ""
+    rows = [
+        [
+            f"{step.rate:g}",
+            f"{step.followed:.1f}",
+            *(_ms(step.result.track[name]) for name in PERCENTILES),
+            f'<span class="bad">{escape("; ".join(step.broken))}</span>'
+            if step.broken
+            else '<span class="good">holds</span>',
+        ]
+        for step in trial.steps
+    ]
+    heads = ["frames/s due", "followed", *(f"{name} ms" for name in PERCENTILES), ""]
+    found = f"The highest rate that holds: {trial.found:g} frames/s" if trial.found else "No rate holds"
+    return f'<h2>{found}</h2><p class="about">What was tried, in this order.</p>{table(heads, rows, texts=0)}'
+
+
+def _streams(result: Result) -> str:
+    heads = ["stream", "frames", "frames/s", "skipped", *(f"track {name}" for name in PERCENTILES)]
+    heads += [f"model {name}" for name in ("p50", "p99")] + ["lag", "not stored", "success", "of followed"]
+    rows = [
+        [
+            number,
+            measures.frames,
+            f"{measures.rate(result.plan.rate):.1f}",
+            f"{100 * measures.skipped_share:.1f} %",
+            *(_ms(measures.track[name]) for name in PERCENTILES),
+            *(_ms(measures.model[name]) for name in ("p50", "p99")),
+            measures.most_lag,
+            "-" if measures.sent is None or measures.stored is None else measures.sent - measures.stored,
+            _share(measures.success),
+            _share(measures.success_followed),
+        ]
+        for number, measures in enumerate(result.streams)
+    ]
+    several = len(rows) > 1
+    if several:
+        latencies = [_ms(result.track[name]) for name in PERCENTILES] + [
+            _ms(result.model[name]) for name in ("p50", "p99")
+        ]
+        rows.append(["all", sum(stream.frames for stream in result.streams), "", "", *latencies, "", "", "", ""])
+    note = (
+        '<p class="about">Milliseconds. Lag: messages that the compressor had not taken, at most. Success: share of '
+        "frames with an overlap with the truth above 0.5; a skipped frame has the box that was known before it.</p>"
+    )
+    return table(heads, rows, means=several) + note
+
+
+def _plots(result: Result) -> str:
+    shown = list(enumerate(result.streams))[:_STREAMS]
+    start = min(measures.due[0] for _, measures in shown)
+    seconds = Axis.upto(result.seconds, "seconds")
+    over_time, lag, rates = {}, {}, {}
+    for number, measures in shown:
+        when = measures.due - start
+        over_time[f"stream {number}"] = _thinned(when, 1000 * measures.track.seconds)
+        rates[f"stream {number}"] = _rate(measures, when, result.plan.rate)
+        reports = np.array(measures.lag, float).reshape(-1, 2)
+        lag[f"stream {number}"] = reports[:, 0] - start, reports[:, 1]
+    parts = [
+        _percentiles("From frame to track", [measures.track for _, measures in shown]),
+        _percentiles("From frame to the model that has seen it", [measures.model for _, measures in shown]),
+        _lines("Latency to the track over time", seconds, "ms", over_time),
+        _lines("Frames followed", seconds, "frames/s", rates, least=result.plan.rate),
+        _lines("Lag of the compressor", seconds, "messages", lag, least=5),
+    ]
+    for title, unit, column, scale in (("Processor", "cores", 1, 1.0), ("Memory", "MB", 2, 1e-6)):
+        parts.append(_lines(title, seconds, unit, _kinds(result, column, scale, start)))
+    return f'<div class="plots">{"".join(parts)}</div>'
+
+
+def _percentiles(title: str, streams: Iterable[Latencies]) -> str:
+    """Latency by percentile; each step to the right is a tenth of the frames."""
+    streams = list(streams)
+    nines = max(1, math.ceil(math.log10(max(map(len, streams)))))  # no percentile is known beyond one frame of all
+    ticks = tuple((float(nine), f"{100 - 100 / 10**nine:g} %") for nine in range(nines + 1))
+    curves = {}
+    for number, latencies in enumerate(streams):
+        ordered = 1000 * np.sort(latencies.seconds)
+        above = 1 - np.arange(len(ordered)) / len(ordered)  # share of the frames that waited as long, or longer
+        curves[f"stream {number}"] = _thinned(-np.log10(above), ordered)
+    most = max(float(ys.max()) for _, ys in curves.values())
+    return plot(title, Axis("share of frames that waited less", nines, ticks), Axis.upto(most, "ms"), curves)
+
+
+def _lines(title: str, x: Axis, unit: str, curves: dict[str, tuple[np.ndarray, np.ndarray]], least: float = 1.0) -> str:
+    most = max((float(ys.max()) for _, ys in curves.values() if len(ys)), default=0.0)
+    return plot(title, x, Axis.upto(max(most, least), unit), curves)
+
+
+def _thinned(xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The largest value of each of `_POINTS` stretches: no peak is lost."""
+    if len(xs) <= _POINTS:
+        return xs, ys
+    places = np.linspace(xs[0], xs[-1], _POINTS)
+    stretch = np.searchsorted(places, xs)
+    most = np.full(_POINTS, np.nan)
+    np.fmax.at(most, stretch, ys)
+    known = np.isfinite(most)
+    return places[known], most[known]
+
+
+def _rate(measures: Measures, when: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frames a second that were followed, in each second."""
+    seconds = (when - when[0]).astype(int)
+    share = np.bincount(seconds, measures.followed) / np.bincount(seconds)
+    return np.arange(len(share)) + 0.5, rate * share
+
+
+def _kinds(result: Result, column: int, scale: float, start: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Samples of all processes of a kind, added up over the streams."""
+    kinds: dict[str, list[np.ndarray]] = {}
+    for name, samples in result.usage.items():
+        kinds.setdefault(name.rstrip(" 0123456789"), []).append(np.array(samples, float))
+    moments = np.unique(np.concatenate([series[:, 0] for several in kinds.values() for series in several]))
+    added = {}
+    for kind, several in kinds.items():
+        total = np.zeros(len(moments))
+        for series in several:
+            total[np.searchsorted(moments, series[:, 0])] += scale * series[:, column]
+        added[kind] = moments - start, total
+    return added
+
+
+def _processes(result: Result) -> str:
+    rows = []
+    for name, samples in result.usage.items():
+        found = usage(samples)
+        cores, memory = (found["cores"], found["cores_most"]), (found["memory"], found["memory_most"])
+        rows.append([escape(name), *(f"{value:.2f}" for value in cores), *(f"{value / 1e6:.0f}" for value in memory)])
+    return table(["process", "cores, mean", "most", "MB, mean", "most"], rows)
+
+
+def _subscribers(result: Result) -> str:
+    plan = result.plan
+    if not plan.subscribers:
+        return ""
+    heard, missed = result.heard or [0], result.missed or [0]
+    return (
+        f'<h2>Subscribers</h2><p class="about">{plan.subscribers} to each stream, of which {plan.slow} slow: '
+        f"{plan.slow // 2} of these frozen for {result.frozen:.0f} s. The quick ones heard {min(heard)} to "
+        f"{max(heard)} tracks each, and missed {sum(missed)} in all, {max(missed)} at most.</p>"
+    )
+
+
+def _chaos(result: Result) -> str:
+    if not result.plan.chaos:
+        return ""
+    rows = [
+        [f"{recovery.kill.process} {recovery.kill.stream}", _seconds(recovery.track), _seconds(recovery.model)]
+        for recovery in result.recoveries
+    ]
+    heads = ["killed", "s to the next track", "s to the next model"]
+    return f"<h2>Chaos: {len(rows)} processes killed, {result.restarts} restarted</h2>{table(heads, rows)}"
+
+
+def _ms(seconds: float) -> str:
+    return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
+
+
+def _seconds(seconds: float | None) -> str:
+    return "none" if seconds is None else f"{seconds:.3f}"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

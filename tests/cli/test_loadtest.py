@@ -1,0 +1,58 @@
+"""The verb `loadtest`: a real run, its figures in three forms, and an exit code that says whether it held."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+
+def test_a_run_counts_every_frame_and_says_which_limit_was_broken(said, tmp_path):
+    arguments = ["--rate", 20, "--duration", 3, "--size", "320x240", "--subscribers", 3, "--slow-subscribers", 2]
+    limits = ["--limit", "max=0", "--limit", "missed=1"]
+    code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
+    assert code == 1
+    assert re.fullmatch(
+        r"catstream: broken: max is .*, to be at most 0 \(seconds from a frame to its track\)", errors.strip()
+    )
+    assert re.search(r"^0 +\d+\.\d +\d+\.\d %", output, re.MULTILINE)
+    assert "held: missed" in output
+
+    figures = json.loads((tmp_path / "x.json").read_text())
+    (stream,) = figures["streams"]
+    assert stream["frames"] == 60
+    assert stream["frames_per_second"] == pytest.approx(20 * (1 - stream["skipped"] / 60))
+    assert stream["sent"] == stream["stored"] >= 60 - stream["skipped"]
+    assert 0 < stream["track"]["p50"] <= stream["track"]["max"]
+    assert 0 < stream["model"]["p50"] <= stream["model"]["max"]
+    assert stream["success_followed"] > 0.5
+    assert figures["subscribers"]["heard"] > 0
+    assert figures["subscribers"]["frozen_seconds"] >= 3
+    assert {"detector 0", "compressor 0", "trainer 0", "camera", "subscribers"} <= set(figures["processes"])
+    assert figures["processes"]["detector 0"]["cores"] > 0
+
+    page = (tmp_path / "load" / "report.html").read_text()
+    assert page.count("<svg") == 7
+    assert not re.search(r"(src|href)=|<script|@import|url\(|nan", page)
+    for name in ("track", "model"):
+        assert "TotalCount" in (tmp_path / "load" / f"{name}.hgrm").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--size", "640"], "a size is WIDTHxHEIGHT"),
+        (["--size", "20x20"], "for example 640x480"),
+        (["--subscribers", 1, "--slow-subscribers", 2], "2 of 1 subscribers cannot be slow"),
+        (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
+        (["--rate", 0], "0.5<=x<=1000"),
+        (["--json", "missing/x.json"], "its folder does not exist"),
+        (["--output", "/dev/null/load"], "give another folder"),
+        (["--set", "lockstep=true"], "leave lockstep away"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_anything_starts(said, tmp_path, arguments, message):
+    code, _, errors = said("loadtest", *arguments, cwd=tmp_path)
+    assert code in (1, 2)
+    assert message in " ".join(errors.split())

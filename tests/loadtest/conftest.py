@@ -1,0 +1,62 @@
+"""What the tests of load tests share: tracks and models as an observer sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from catstream.box import Box
+from catstream.loadtest.latencies import Latencies
+from catstream.loadtest.measures import Measures
+from catstream.loadtest.plan import Plan
+from catstream.loadtest.run import Result
+from catstream.messages import Track
+from catstream.video.broadcast import Schedule
+
+BOX = Box(10.0, 10.0, 20.0, 20.0)
+
+
+@pytest.fixture
+def schedule() -> Schedule:
+    """Ten frames a second from moment 100 on."""
+    return Schedule(start=100.0, rate=10.0, frames=10)
+
+
+@pytest.fixture
+def track(schedule) -> Callable[..., tuple[float, Track]]:
+    """A track of a frame of the schedule that came some seconds after the frame."""
+
+    def made(number: int, after: float, *, frame: int | None = None, box: Box | None = BOX) -> tuple[float, Track]:
+        due = schedule.due(number)
+        frame = number if frame is None else frame
+        return due + after, Track(frame + 1, frame, 0.0, "present", box, 0.9, 1, due)
+
+    return made
+
+
+@pytest.fixture
+def result() -> Callable[..., Result]:
+    """A result of streams with these latencies to the track."""
+
+    def made(*streams: list[float], followed: float = 1.0, success: float = 1.0, **others) -> Result:
+        measures = []
+        for seconds in streams:
+            frames = np.arange(len(seconds))
+            measures.append(
+                Measures(
+                    due=100 + frames / 10,
+                    followed=frames < followed * len(seconds),
+                    track=Latencies(seconds),
+                    model=Latencies(seconds),
+                    never=0,
+                    success=success,
+                    success_followed=success,
+                    lag=[(100.5, 3)],
+                )
+            )
+        facts = {"restarts": 0, "recoveries": [], "usage": {}, "heard": [], "missed": [], "frozen": 0.0}
+        return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, "camera_late": 0.001, **others})
+
+    return made

@@ -1,0 +1,41 @@
+"""The histogram: three digits of every latency, from microseconds to an hour, and a file that others read."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from catstream.errors import VideoError
+from catstream.loadtest.latencies import PERCENTILES, Latencies
+
+
+def test_percentiles_are_those_of_the_sorted_latencies_to_three_digits(rng):
+    seconds = rng.lognormal(-4, 1, 20_001)
+    latencies = Latencies(seconds)
+    for name, percentile in PERCENTILES.items():
+        exact = np.percentile(seconds, percentile, method="inverted_cdf")
+        assert latencies[name] == pytest.approx(exact, rel=2e-3), name
+
+
+def test_what_takes_longer_than_an_hour_is_not_left_out():
+    assert Latencies([0.01, 1e6])["max"] == pytest.approx(3600, rel=1e-2)
+
+
+def test_no_latency_has_no_percentile():
+    assert set(Latencies([]).figures().values()) == {None}
+
+
+def test_the_file_is_a_distribution_that_hdr_tools_read(tmp_path):
+    Latencies([0.001] * 90 + [0.050] * 10).write(tmp_path / "track.hgrm")
+    lines = (tmp_path / "track.hgrm").read_text().splitlines()
+    assert lines[0].split() == ["Value", "Percentile", "TotalCount", "1/(1-Percentile)"]
+    rows = [list(map(float, line.split())) for line in lines if re.match(r" *\d", line)]
+    assert rows[0][0] == pytest.approx(1.0, rel=1e-3)
+    assert rows[-1][:3] == pytest.approx([50.0, 1.0, 100], rel=1e-3)
+
+
+def test_a_place_that_cannot_be_written_to_is_refused(tmp_path):
+    with pytest.raises(VideoError, match="give another folder"):
+        Latencies([0.1]).write(tmp_path / "missing" / "track.hgrm")

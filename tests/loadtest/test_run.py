@@ -1,0 +1,124 @@
+"""Real runs: pipelines on a camera that does not wait, ended early, and under chaos."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from multiprocessing import resource_tracker
+
+import psutil
+import pytest
+
+from catstream.loadtest.chaos import Chaos
+from catstream.loadtest.limits import Limit
+from catstream.loadtest.plan import Plan
+from catstream.loadtest.trial import hold
+from catstream.loadtest.usage import Usage
+
+
+class Sleepers:
+    """What chaos kills, in place of a stream."""
+
+    def __init__(self) -> None:
+        self.children = {name: self.start() for name in ("detector", "compressor", "trainer")}
+
+    def start(self):
+        return subprocess.Popen(["sleep", "600"])
+
+    @property
+    def pids(self):
+        return {name: child.pid for name, child in self.children.items() if child.poll() is None}
+
+    def close(self):
+        for child in self.children.values():
+            child.kill()
+            child.wait()
+
+
+@pytest.fixture
+def sleepers():
+    streams = [Sleepers(), Sleepers()]
+    yield streams
+    for stream in streams:
+        stream.close()
+
+
+def children():
+    """Processes of this one, but for the one that Python leaves to tidy up."""
+    tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
+    return [child for child in psutil.Process().children(recursive=True) if child.pid != tracker]
+
+
+def test_chaos_kills_whom_it_says(sleepers):
+    chaos = Chaos(seed=7)
+    for _ in range(3):
+        chaos._due = 0.0
+        chaos.turn(sleepers)
+        kill = chaos.kills[-1]
+        assert sleepers[kill.stream].children[kill.process].wait(30) == -signal.SIGKILL
+    assert sum(len(stream.pids) for stream in sleepers) == 3
+
+
+def test_chaos_spares_whom_a_supervisor_would_give_up(sleepers):
+    (stream, _), chaos = sleepers, Chaos(seed=1)
+    for _ in range(40):
+        before, chaos._due = len(chaos.kills), 0.0
+        chaos.turn([stream])
+        for kill in chaos.kills[before:]:
+            stream.children[kill.process].wait(30)
+            stream.children[kill.process] = stream.start()
+    names = [kill.process for kill in chaos.kills]
+    assert {name: names.count(name) for name in names} == {"detector": 4, "compressor": 4, "trainer": 4}
+
+
+def test_usage_tells_who_is_busy(sleepers):
+    usage, busy = Usage(), psutil.Process().pid
+    usage.look(0.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
+    deadline = time.process_time() + 0.3
+    while time.process_time() < deadline:
+        pass
+    usage.look(1.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
+    assert usage.samples["busy"][0].cores >= 0.29
+    assert usage.samples["idle"][0].cores < usage.samples["busy"][0].cores
+    assert 0 < usage.samples["idle"][0].memory < usage.samples["busy"][0].memory
+
+
+def test_an_interrupted_run_tells_what_it_measured_and_leaves_nobody_behind():
+    def tell(news):
+        if news.share > 0.05 and "tracks" in news.figures:
+            raise KeyboardInterrupt
+
+    plan = Plan(rate=20.0, duration=20.0, size=(320, 240))
+    trial = hold(plan, [Limit("p99", 60.0)], find=False, tell=tell)
+    assert trial.interrupted
+    assert trial.broken == []
+    (stream,) = trial.result.streams
+    assert 10 <= stream.frames < plan.frames
+    assert stream.frames == len(stream.track)
+    assert trial.result.seconds == pytest.approx(stream.frames / 20)
+    assert stream.sent == stream.stored > stream.frames  # what it learned before counts too
+    assert children() == []
+
+
+@pytest.mark.slow
+def test_all_processes_come_back_from_chaos():
+    trial = hold(Plan(streams=2, rate=8.0, duration=40.0, size=(320, 240), chaos=True), [], find=False)
+    assert not trial.broken
+    assert len(trial.result.recoveries) >= 5
+    early = [
+        recovery for recovery in trial.result.recoveries if recovery.kill.moment < trial.result.streams[0].due[200]
+    ]
+    assert all(recovery.track is not None and recovery.model is not None for recovery in early)
+    assert all(stream.sent == stream.stored for stream in trial.result.streams)
+    assert children() == []
+
+
+@pytest.mark.slow
+def test_a_search_ends_with_a_rate_that_held_below_one_that_did_not():
+    plan = Plan(rate=30.0, duration=3.0, size=(320, 240))
+    trial = hold(plan, [Limit("p99", 1.0), Limit("skipped", 0.05)], find=True)
+    held = {step.rate for step in trial.steps if not step.broken}
+    assert trial.found in held
+    assert trial.result.plan.rate == max(held)
+    assert any(step.broken for step in trial.steps) or trial.found == 1000.0
