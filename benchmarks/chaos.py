@@ -142,7 +142,9 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         same = ("yes" if identical(calm, worn) else "NO") if settings.lockstep else None
         success = [score(run.boxes, truth).success for run in (worn, calm)]
         met = sum(map(len, worn.recovery.values()))
-        ends.append((label, met, worn.deaths, *worn.totals.values(), len(worn.tracks), worn.rows, *success, same))
+        ends.append(
+            (label, met, worn.deaths, *map(int, worn.totals.values()), len(worn.tracks), worn.rows, *success, same)
+        )
     columns = ("run", "fault", "times", "p50 s", "p99 s", "slowest s")
     yield Table("Recovery", columns, times, "from the end of a fault to the track two frames further, or a new model")
     columns = ("run", "faults", "restarts", "sent", "stored", "tracks", "rows", "success", "without", "trees the same")

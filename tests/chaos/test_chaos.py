@@ -11,25 +11,8 @@ import table
 from catstream.box import Box
 from catstream.evaluation.metrics import score
 from catstream.settings import Settings
-from catstream.tracker import Tracker
-from catstream.video.source import open_source
 
 LOCKSTEP = Settings(lockstep=True)
-
-
-@pytest.fixture(scope="module")
-def calm(video):
-    """The tracker after the same video, in one process and undisturbed, and its tracks."""
-    path, boxes = video
-    tracker, tracks = Tracker(LOCKSTEP), []
-    with open_source(path) as source:
-        for frame in source:
-            if tracks:
-                tracker.update(frame.image, frame.time)
-            else:
-                tracker.init(frame.image, boxes[0], frame.time)
-            tracks.append(tracker.track)
-    return tracker, tracks
 
 
 @pytest.mark.parametrize(
