@@ -28,12 +28,13 @@ class Crowd:
 
     Parameters
     ----------
+    endpoint, keys : where the pipeline is, as the settings say it
     readers : how many in all
     slow : of them take two messages a second
     frozen : of them are stopped by `freeze`
     """
 
-    def __init__(self, endpoint: str, readers: int, *, slow: int = 0, frozen: int = 0) -> None:
+    def __init__(self, endpoint: str, readers: int, *, slow: int = 0, frozen: int = 0, keys: str = "") -> None:
         self._quick, self._readers = readers - slow - frozen, readers
         self._heard, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
         self._since = 0.0  # when they were frozen
@@ -43,7 +44,7 @@ class Crowd:
             self._groups.append([])
             for begin in range(first, first + size, _TOGETHER):
                 numbers = range(begin, min(begin + _TOGETHER, first + size))
-                arguments = (endpoint, numbers, pause, self._heard, self._missed, os.getpid())
+                arguments = (endpoint, keys, numbers, pause, self._heard, self._missed, os.getpid())
                 self._groups[-1].append(SPAWN.Process(target=_listen, args=arguments))
             first += size
 
@@ -96,11 +97,11 @@ class Crowd:
                     process.join()
 
 
-def _listen(endpoint: str, numbers: range, pause: float, heard: Any, missed: Any, parent: int) -> None:
+def _listen(endpoint: str, keys: str, numbers: range, pause: float, heard: Any, missed: Any, parent: int) -> None:
     """Be some of the readers, until the end."""
     die_with(parent)
     os.nice(19)
-    readers = {number: Subscriber("tracks", Endpoint.parse(endpoint)) for number in numbers}
+    readers = {number: Subscriber("tracks", Endpoint.parse(endpoint, keys)) for number in numbers}
     gaps = {number: Gaps() for number in numbers}
     for number, _, message in dawdling(readers, pause) if pause else arrivals(readers):
         gaps[number].take(message.seq)

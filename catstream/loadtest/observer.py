@@ -32,7 +32,7 @@ class Seen:
     @property
     def warm(self) -> bool:
         """Whether all that happens only once has happened: the detector has gone on with such a model."""
-        return self.moving > 0 and self.tracks[-1][1].model_version >= self.moving
+        return self.moving > 0 and bool(self.tracks) and self.tracks[-1][1].model_version >= self.moving
 
 
 class Observer(threading.Thread):
@@ -43,16 +43,17 @@ class Observer(threading.Thread):
     seen : of each endpoint
     """
 
-    def __init__(self, endpoints: list[str]) -> None:
+    def __init__(self, endpoints: list[str], keys: str) -> None:
         super().__init__(name="observer", daemon=True)
         self.seen = [Seen() for _ in endpoints]
-        self._endpoints, self._over = endpoints, threading.Event()
+        self._places = [Endpoint.parse(endpoint, keys) for endpoint in endpoints]
+        self._over = threading.Event()
 
     def run(self) -> None:
         with ExitStack() as stack:
             readers = {
-                (number, channel): stack.enter_context(Subscriber(channel, Endpoint.parse(endpoint)))
-                for number, endpoint in enumerate(self._endpoints)
+                (number, channel): stack.enter_context(Subscriber(channel, place))
+                for number, place in enumerate(self._places)
                 for channel in ("tracks", "models", "health")
             }
             for (number, _), moment, message in arrivals(readers, self._over.is_set):

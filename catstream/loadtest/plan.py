@@ -17,7 +17,7 @@ class Plan:
 
     streams      pipelines side by side, each of three processes
     subscribers  of the tracks of each stream
-    slow         of them slow: every other one frozen
+    slow         of them slow, and every other one of these frozen
     rate         frames a second of each stream, due whether or not the pipeline keeps up
     duration     seconds
     size         (width, height) of a frame, pixels
@@ -56,6 +56,11 @@ class Plan:
     def __str__(self) -> str:
         streams = f"{self.streams} streams" if self.streams > 1 else "1 stream"
         return f"{streams} of {self.size[0]}x{self.size[1]} pixels, {self.rate:g} frames/s due in each"
+
+    @property
+    def frozen(self) -> int:
+        """Subscribers that are frozen, of those that are slow."""
+        return self.slow // 2
 
     @property
     def frames(self) -> int:

@@ -186,7 +186,7 @@ def _kinds(result: Result, column: int, scale: float, start: float) -> dict[str,
     kinds: dict[str, list[np.ndarray]] = {}
     for name, samples in result.usage.items():
         kinds.setdefault(name.rstrip(" 0123456789"), []).append(np.array(samples, float))
-    moments = np.unique(np.concatenate([series[:, 0] for several in kinds.values() for series in several]))
+    moments = np.unique([sample.moment for samples in result.usage.values() for sample in samples])
     added = {}
     for kind, several in kinds.items():
         total = np.zeros(len(moments))
@@ -212,7 +212,7 @@ def _subscribers(result: Result) -> str:
     heard, missed = result.heard or [0], result.missed or [0]
     return (
         f'<h2>Subscribers</h2><p class="about">{plan.subscribers} to each stream, of which {plan.slow} slow: '
-        f"{plan.slow // 2} of these frozen for {result.frozen:.0f} s. The quick ones heard {min(heard)} to "
+        f"{plan.frozen} of these frozen for {result.frozen:.0f} s. The quick ones heard {min(heard)} to "
         f"{max(heard)} tracks each, and missed {sum(missed)} in all, {max(missed)} at most.</p>"
     )
 

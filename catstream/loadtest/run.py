@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from os import getpid
 from time import monotonic
 
@@ -119,15 +120,14 @@ def run(plan: Plan, camera: Camera, tell: Callable[[News], None] = lambda _: Non
             stream.start()
         stack.callback(_ask_to_stop, streams)
         _until(lambda: all(stream.ready.is_set() for stream in streams), streams, "starting processes", tell)
-        observer = Observer([stream.endpoint for stream in streams])
+        observer = Observer([stream.endpoint for stream in streams], plan.settings.keys)
         observer.start()
         stack.callback(observer.end)
         _until(lambda: all(seen.warm for seen in observer.seen), streams, "learning the first models", tell)
-        slow, frozen = plan.slow - plan.slow // 2, plan.slow // 2
-        crowds = [
-            stack.enter_context(Crowd(stream.endpoint, plan.subscribers, slow=slow, frozen=frozen))
-            for stream in streams
-        ]
+        gather = partial(
+            Crowd, readers=plan.subscribers, slow=plan.slow - plan.frozen, frozen=plan.frozen, keys=plan.settings.keys
+        )
+        crowds = [stack.enter_context(gather(stream.endpoint)) for stream in streams]
         _until(lambda: all(crowd.attached for crowd in crowds), streams, "attaching subscribers", tell)
         for crowd in crowds:
             crowd.freeze()
