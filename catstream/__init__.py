@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from catstream.adapters import to_supervision
     from catstream.box import Box
     from catstream.errors import CatstreamError
     from catstream.messages import Track
@@ -37,6 +38,7 @@ __all__ = [
     "__version__",
     "control",
     "subscribe",
+    "to_supervision",
 ]
 
 __version__ = "0.1.0"
@@ -52,6 +54,7 @@ _HOMES = {
     "Tracker": "tracker",
     "control": "steering",
     "subscribe": "subscription",
+    "to_supervision": "adapters",
 }
 
 

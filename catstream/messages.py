@@ -256,7 +256,7 @@ class Run:
     """What a pipeline runs with: who keeps its features can learn from them once more, detector -> anyone.
 
     program   version of catstream
-    settings  name -> value of all settings but `endpoint`, each as the text that `--set` takes
+    settings  name -> value of all settings but `endpoint` and `keys`, each as the text that `--set` takes
     """
 
     program: str

@@ -17,8 +17,8 @@ FLOORS = [
     {"errors"},
     {"box"},
     {"messages", "settings", "ridge", "html"},
-    {"detection", "compression", "training", "wire", "video"},
-    {"tracker", "subscription", "steering", "recording"},
+    {"detection", "compression", "training", "wire", "video", "adapters"},
+    {"tracker", "subscription", "steering", "recording", "sinks"},
     {"services"},
     {"pipeline"},
     {"evaluation"},
@@ -35,6 +35,8 @@ HOMES = {
     "filterpy": ["catstream/training/motion_em.py"],
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
     "safetensors": ["catstream/compression"],
+    "pyarrow": ["catstream/sinks/parquet.py"],
+    "supervision": ["catstream/adapters.py"],
     "av": ["catstream/video"],
     "zmq": ["catstream/wire/sockets.py", "catstream/wire/gate.py", "catstream/wire/keys.py"],
     "msgpack": ["catstream/wire/codec.py"],
@@ -47,7 +49,7 @@ HOMES = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"sklearn", "filterpy", "av", "scipy"}
+SLOW = {"sklearn", "filterpy", "av", "scipy", "pyarrow", "supervision"}
 
 #: What a stage does not touch: it could run on a desert island.
 MAINLAND = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
@@ -130,5 +132,7 @@ def test_every_dependency_has_a_home():
     """What pyproject.toml asks for, and nothing else."""
     distributions = {"opencv-python-headless": "cv2", "scikit-learn": "sklearn", "pyzmq": "zmq", "hdrhistogram": "hdrh"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    names = {dependency.partition(">=")[0] for dependency in project["dependencies"]}
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *extras["parquet"], *extras["supervision"]]
+    names = {dependency.partition(">=")[0] for dependency in wanted}
     assert {distributions.get(name, name) for name in names} == set(HOMES)

@@ -35,6 +35,29 @@ def command(example):
     return [node, EXAMPLES / example]
 
 
+def test_the_rerun_subscriber_writes_what_the_viewer_would_show(tmp_path):
+    pytest.importorskip("rerun", reason="rerun is missing: pip install 'catstream[rerun]'")
+    (source, boxes), shown = write(tmp_path, 60, (320, 240)), tmp_path / "walk.rrd"
+    with (
+        Pipeline(str(source), boxes[0], Settings(window=1)) as pipeline,
+        subprocess.Popen(
+            [sys.executable, EXAMPLES / "rerun_subscriber.py", pipeline.endpoint, "--save", shown],
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as reader,
+    ):
+        for _ in pipeline:
+            if reader.poll() is None and not (shown.exists() and shown.stat().st_size > 20_000):
+                select.select([reader.stdout], [], [], 0.5)  # while it starts, few pass
+        printed = reader.communicate(timeout=60)[0]
+    assert reader.returncode == 0
+    assert re.fullmatch(r"[1-9]\d* tracks, 0 missed: the source came to its end\n", printed)
+    data = shown.read_bytes()
+    assert data.startswith(b"RRF2")
+    for entity in (b"/camera/object", b"/score", b"/model", b"/state", b"Boxes2D"):
+        assert entity in data, "it was logged"
+
+
 @pytest.mark.parametrize("example", ["subscriber.py", "subscriber.mjs"])
 def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(example, tmp_path):
     words, (source, boxes) = command(example), write(tmp_path, 60, (320, 240))

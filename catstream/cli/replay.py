@@ -17,7 +17,7 @@ from catstream.messages import Features, Model, Track
 from catstream.recording.file import Recording, RecordingWriter, run_of
 from catstream.recording.learning import Lesson, Marks, learn, marks_of
 from catstream.recording.player import Player
-from catstream.wire.endpoint import meeting_place, private_folder
+from catstream.wire.endpoint import Endpoint, meeting_place, private_folder
 
 __all__ = ["replay"]
 
@@ -25,6 +25,7 @@ __all__ = ["replay"]
 @click.command()
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--endpoint", default="", metavar="PLACE", help="Where subscribers attach; a fresh place if not given.")
+@click.option("--keys", default="", metavar="DIR", help="Folder of keys: who attaches must be let in by them.")
 @click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Times as fast as it was recorded.")
 @click.option("--fast", is_flag=True, help="As fast as it goes.")
 @click.option("--wait", is_flag=True, help="Begin once somebody listens to the tracks.")
@@ -37,6 +38,7 @@ __all__ = ["replay"]
 def replay(
     recording: Path,
     endpoint: str,
+    keys: str,
     speed: float,
     fast: bool,
     wait: bool,
@@ -81,15 +83,12 @@ def replay(
     if learns:
         _learn(found, pairs, output, incomplete, console)
     else:
-        with suppress(KeyboardInterrupt):
-            _play(found, endpoint, None if fast else speed, wait, console)
+        with suppress(KeyboardInterrupt), private_folder() as folder, meeting_place(endpoint, folder, keys) as place:
+            _play(found, place, None if fast else speed, wait, console)
 
 
-def _play(recording: Recording, endpoint: str, speed: float | None, wait: bool, console: Console) -> None:
-    with ExitStack() as stack:
-        place = stack.enter_context(meeting_place(endpoint, stack.enter_context(private_folder())))
-        player = stack.enter_context(Player(recording, place))
-        status = stack.enter_context(console.status(f"at {place}, waiting for a subscriber"))
+def _play(recording: Recording, place: Endpoint, speed: float | None, wait: bool, console: Console) -> None:
+    with Player(recording, place) as player, console.status(f"at {place}, waiting for a subscriber") as status:
         if wait:
             player.wait()
         for message in player.play(speed):

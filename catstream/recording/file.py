@@ -44,9 +44,8 @@ _OPENINGS = {opening(kind): kind for kind in KINDS}
 
 def run_of(settings: Settings) -> Run:
     """What a pipeline of this catstream runs with."""
-    texts = settings.texts()
-    del texts["endpoint"]  # of one machine, and of no meaning to others
-    return Run(version("catstream"), texts)
+    own = ("endpoint", "keys")  # of one machine, and of no meaning to others
+    return Run(version("catstream"), {name: text for name, text in settings.texts().items() if name not in own})
 
 
 class RecordingWriter:

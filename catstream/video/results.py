@@ -16,12 +16,26 @@ import contextlib
 from pathlib import Path
 from typing import Self
 
+from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import Track
 
-__all__ = ["ResultsWriter"]
+__all__ = ["COLUMNS", "ResultsWriter", "row"]
+
+#: Of tracks.csv.
+COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version"
 
 _ABSENT = "nan,nan,nan,nan"
+
+
+def row(track: Track) -> str:
+    """The row of a track in tracks.csv."""
+    box = ",,," if track.box is None else _sides(track.box)
+    return f"{track.frame},{track.time:.6f},{track.state},{box},{track.score:.6f},{track.model_version}"
+
+
+def _sides(box: Box) -> str:
+    return ",".join(f"{value:.4f}" for value in box)
 
 
 class ResultsWriter:
@@ -58,7 +72,7 @@ class ResultsWriter:
                     "give a folder that exists or can be made, and that you may write to"
                 ) from None
             self._files = files.pop_all()
-        self._tracks.write("frame,seconds,state,x,y,w,h,score,model_version\n")
+        self._tracks.write(COLUMNS + "\n")
 
     def write(self, track: Track, seconds: float) -> None:
         """Add one frame, and the seconds of work it took. A frame that has its row already is skipped."""
@@ -66,13 +80,8 @@ class ResultsWriter:
             return
         for _ in range(track.frame - self.rows):
             self._row(_ABSENT, "nan", "nan")
-        box = _ABSENT if track.box is None else ",".join(f"{value:.4f}" for value in track.box)
-        score = f"{track.score:.6f}"
-        self._row(box, score, f"{seconds:.6f}")
-        self._tracks.write(
-            f"{track.frame},{track.time:.6f},{track.state},"
-            f"{',,,' if track.box is None else box},{score},{track.model_version}\n"
-        )
+        self._row(_ABSENT if track.box is None else _sides(track.box), f"{track.score:.6f}", f"{seconds:.6f}")
+        self._tracks.write(row(track) + "\n")
         self.rows = track.frame + 1
 
     def _row(self, box: str, score: str, seconds: str) -> None:

@@ -1,0 +1,49 @@
+"""The video with its tracks drawn in, from its frames read once more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from catstream.errors import VideoError
+from catstream.messages import Track
+from catstream.video.annotate import AnnotatedVideo
+from catstream.video.source import is_live, open_source
+
+__all__ = ["VideoSink"]
+
+
+class VideoSink:
+    """Frames with their tracks as MP4, which gets its name when it is closed; those without a track are left out.
+
+    Parameters
+    ----------
+    source, part : as the pipeline has them, so that frames have the same numbers
+
+    Raises
+    ------
+    VideoError
+        From the constructor, where the source is live or cannot be read, or the file cannot be written.
+    """
+
+    def __init__(self, path: Path, source: str, part: slice) -> None:
+        if is_live(source):
+            raise VideoError(f"a video of {source} needs its frames once more, and those of a live source are gone")
+        self._frames = open_source(source, part=part)
+        try:
+            self._video = AnnotatedVideo(path, self._frames.rate, self._frames.size)
+        except VideoError:
+            self._frames.close()
+            raise
+
+    def write(self, track: Track) -> None:
+        """Draw a track over its frame."""
+        for frame in self._frames:
+            if frame.number == track.frame:
+                self._video.write(frame.image, track)
+                return
+        raise VideoError(f"the source has no frame {track.frame}: is it what the pipeline follows?")
+
+    def close(self) -> None:
+        """Finish the video."""
+        self._video.close()
+        self._frames.close()

@@ -1,0 +1,66 @@
+"""A running pipeline in the Rerun viewer: pictures, box, score, state and model, frame by frame.
+
+    pip install 'catstream[rerun]'
+    catstream track walk.mp4 --box 120,80,64,48 --set endpoint=run
+    python examples/rerun_subscriber.py run
+    python examples/rerun_subscriber.py run --save walk.rrd
+
+The viewer is a window; where there is no screen, --save writes what it would show to a file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+
+import cv2
+import numpy as np
+import rerun as rr
+
+import catstream
+
+
+async def show_tracks(endpoint: str) -> None:
+    """Draw each track."""
+    count, state = 0, None
+    with catstream.subscribe(endpoint, "tracks") as tracks:
+        async for track in tracks:
+            count += 1
+            rr.set_time("frame", sequence=track.frame)
+            rr.set_time("video", duration=track.time)
+            if track.box is None:
+                rr.log("camera/object", rr.Clear(recursive=False))
+            else:
+                box = rr.Boxes2D(array=[track.box], array_format=rr.Box2DFormat.XYWH, labels=[track.state])
+                rr.log("camera/object", box)
+            rr.log("score", rr.Scalars(track.score))
+            rr.log("model", rr.Scalars(track.model_version))
+            if track.state != state:
+                rr.log("state", rr.TextLog(track.state))
+                state = track.state
+        print(f"{count} tracks, {tracks.missed} missed: {tracks.end.reason}")
+
+
+async def show_pictures(endpoint: str) -> None:
+    """Show the newest picture now and then, at the size of its frame."""
+    with catstream.subscribe(endpoint, "previews") as previews:
+        async for preview in previews:
+            picture = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
+            rr.set_time("frame", sequence=preview.frame)
+            rr.log("camera", rr.Image(cv2.resize(picture, (preview.width, preview.height)), "BGR").compress())
+
+
+async def main() -> None:
+    """Attach until the pipeline ends."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("endpoint", nargs="?", default="", help="where the pipeline runs; the only one if not given")
+    parser.add_argument("--save", metavar="FILE", help="write an .rrd file, and open no window")
+    options = parser.parse_args()
+    rr.init("catstream", spawn=not options.save)
+    if options.save:
+        rr.save(options.save)
+    await asyncio.gather(show_tracks(options.endpoint), show_pictures(options.endpoint))
+
+
+if __name__ == "__main__":
+    asyncio.run(main())

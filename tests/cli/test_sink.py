@@ -1,0 +1,50 @@
+"""`catstream sink`, beside a pipeline that runs."""
+
+from __future__ import annotations
+
+import json
+import select
+import signal
+import sqlite3
+from contextlib import closing
+
+import pytest
+
+from catstream.pipeline import Pipeline
+from catstream.settings import Settings
+from catstream.video.source import open_source
+
+
+@pytest.mark.parametrize("stopped", [False, True], ids=["to the end", "stopped"])
+def test_tracks_go_to_files_and_stay_there(video, catstream, tmp_path, stopped):
+    source, box = video
+    files = [tmp_path / name for name in ("tracks.ndjson", "tracks.sqlite", "walk.mp4")]
+    with Pipeline(source, [float(side) for side in box.split(",")], Settings(window=1)) as pipeline:
+        sink = catstream(
+            "sink", *files, "--source", source, "--endpoint", pipeline.endpoint, "--parquet", tmp_path / "t.parquet"
+        )
+        for track in pipeline:
+            if sink.poll() is None:
+                select.select([sink.stderr], [], [], 0.3)  # while it starts, few pass
+            if stopped and files[0].exists() and files[0].stat().st_size and track.frame > 30:
+                sink.send_signal(signal.SIGINT)
+                sink.wait(60)
+        errors = sink.communicate(timeout=60)[1]
+    assert sink.returncode == 0, errors
+    frames = [json.loads(line)["frame"] for line in files[0].read_text().splitlines()]
+    assert frames == list(range(frames[0], frames[0] + len(frames)))
+    assert (frames[-1] == 59) != stopped
+    assert f"{len(frames)} tracks, 0 missed" in errors
+    with closing(sqlite3.connect(files[1])) as database:
+        assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == frames
+    with open_source(str(files[2])) as shown:
+        assert sum(1 for _ in shown) == len(frames)
+    assert (tmp_path / "t.parquet").stat().st_size > 0
+    assert not files[1].with_name("tracks.sqlite-wal").exists()
+
+
+def test_where_no_pipeline_is_heard_no_file_is_left(said, tmp_path):
+    code, _, errors = said("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path)
+    assert code == 1
+    assert "is a pipeline running there?" in errors
+    assert not (tmp_path / "tracks.csv").exists()

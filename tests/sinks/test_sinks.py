@@ -1,0 +1,119 @@
+"""Sinks: what each kind of file holds, and that it holds it at once."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sqlite3
+from contextlib import closing
+from dataclasses import asdict
+
+import pytest
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages import Track
+from catstream.sinks import parquet
+from catstream.sinks.sink import SUFFIXES, open_sink
+from catstream.video.demo import write
+from catstream.video.results import ResultsWriter
+from catstream.video.source import open_source
+
+TRACKS = [
+    Track(1, 0, 0.0, "bootstrapping", Box(10.0, 20.0, 30.5, 40.0), 1.0, 0),
+    Track(2, 1, 0.04, "absent", None, 0.125, 3),
+    Track(4, 3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.75, 4, 17.5),
+]
+
+
+@pytest.fixture
+def filled(tmp_path):
+    """An open sink that holds the tracks: what was written is there before it is closed."""
+    opened = []
+
+    def fill(name):
+        opened.append(open_sink(tmp_path / name))
+        for track in TRACKS:
+            opened[-1].write(track)
+        return tmp_path / name
+
+    yield fill
+    for sink in opened:
+        sink.close()
+
+
+def test_ndjson_has_every_field_of_a_track(filled):
+    objects = [json.loads(line) for line in filled("tracks.ndjson").read_text().splitlines()]
+    assert objects == [{**asdict(track), "box": track.box and list(track.box)} for track in TRACKS]
+
+
+def test_csv_is_that_of_the_results(filled, tmp_path):
+    path = filled("tracks.csv")
+    with ResultsWriter(tmp_path / "results", "run") as results:
+        for track in TRACKS:
+            results.write(track, 0.0)
+    assert path.read_text() == (tmp_path / "results" / "tracks.csv").read_text()
+    assert [row["state"] for row in csv.DictReader(path.read_text().splitlines())] == [track.state for track in TRACKS]
+
+
+def test_mot_counts_from_one_and_has_no_line_where_the_object_is_absent(filled):
+    assert filled("tracks.txt").read_text() == (
+        "1,1,11.00,21.00,30.50,40.00,1.0000,-1,-1,-1\n4,1,-1.00,22.00,30.00,40.00,0.7500,-1,-1,-1\n"
+    )
+
+
+def test_a_database_can_be_read_while_it_is_written(filled):
+    path = filled("tracks.sqlite")
+    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database:
+        rows = database.execute("SELECT frame, seq, state, x, w, score, model_version, pts FROM tracks").fetchall()
+        assert database.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    assert rows == [
+        (0, 1, "bootstrapping", 10.0, 30.5, 1.0, 0, None),
+        (1, 2, "absent", None, None, 0.125, 3, None),
+        (3, 4, "present", -2.0, 30.0, 0.75, 4, 17.5),
+    ]
+
+
+def test_a_database_is_exported_as_parquet(filled, tmp_path):
+    arrow = pytest.importorskip("pyarrow.parquet")
+    assert parquet.export(filled("tracks.sqlite"), tmp_path / "tracks.parquet") == len(TRACKS)
+    table = arrow.read_table(tmp_path / "tracks.parquet").to_pydict()
+    assert table["frame"] == [0, 1, 3]
+    assert table["state"] == [track.state for track in TRACKS]
+    assert table["h"] == [40.0, None, 40.0]
+
+
+def test_a_video_has_the_frames_of_its_tracks(tmp_path):
+    source, _ = write(tmp_path, 8, (320, 240))
+    sink = open_sink(tmp_path / "walk.mp4", str(source), slice(1, 8, 2))  # frames 1, 3, 5, 7, counted 0 to 3
+    for track in TRACKS:
+        sink.write(track)
+    with pytest.raises(VideoError, match="has no frame 4"):
+        sink.write(Track(5, 4, 0.2, "absent", None, 0.0, 4))
+    sink.close()
+    with open_source(str(tmp_path / "walk.mp4")) as frames:
+        assert sum(1 for _ in frames) == len(TRACKS)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_file_that_is_there_is_kept(tmp_path, suffix):
+    path = tmp_path / f"tracks{suffix}"
+    path.write_text("dear to somebody")
+    with pytest.raises(VideoError, match="is there already"):
+        open_sink(path, "0")
+    assert path.read_text() == "dear to somebody"
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "words"),
+    [
+        ("tracks.xls", None, "ends with .ndjson, .csv, .txt, .sqlite, .mp4"),
+        ("none/tracks.csv", None, "give a place that you may write to"),
+        ("none/tracks.sqlite", None, "give a place that you may write to"),
+        ("walk.mp4", None, "say where they come from"),
+        ("walk.mp4", "rtsp://127.0.0.1/cam", "those of a live source are gone"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_any_work(tmp_path, name, source, words):
+    with pytest.raises(VideoError, match=words):
+        open_sink(tmp_path / name, source)

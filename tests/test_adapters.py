@@ -1,0 +1,50 @@
+"""Tracks for other libraries."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+
+import numpy as np
+import pytest
+
+import catstream
+from catstream.box import Box
+from catstream.messages import Track
+
+needs_supervision = pytest.mark.skipif(
+    importlib.util.find_spec("supervision") is None,
+    reason="supervision is missing: .ci/run installs it without its opencv-python",
+)
+
+
+@needs_supervision
+def test_a_track_is_one_detection_of_supervision():
+    found = catstream.to_supervision(Track(3, 2, 0.1, "present", Box(10.0, 20.0, 30.0, 40.0), 1.25, 7))
+    assert np.array_equal(found.xyxy, [[10, 20, 40, 60]])
+    assert (found.confidence, found.class_id, found.tracker_id) == (1, 0, 1)
+    assert {name: list(values) for name, values in found.data.items()} == {
+        "frame": [2],
+        "state": ["present"],
+        "model_version": [7],
+    }
+
+
+@needs_supervision
+def test_an_absent_object_is_no_detection_and_both_can_be_drawn_and_filtered():
+    import supervision
+
+    absent = catstream.to_supervision(Track(3, 2, 0.1, "absent", None, 0.1, 7))
+    present = catstream.to_supervision(Track(4, 3, 0.1, "present", Box(10.0, 20.0, 30.0, 40.0), 0.9, 7))
+    assert len(absent) == 0
+    assert len(present[present.confidence > 0.5]) == 1
+    image = np.zeros((80, 80, 3), np.uint8)
+    drawn = [supervision.BoxAnnotator().annotate(image.copy(), each) for each in (absent, present)]
+    assert not drawn[0].any()
+    assert drawn[1].any()
+
+
+def test_without_supervision_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "supervision", None)
+    with pytest.raises(ImportError, match=r"pip install 'catstream\[supervision\]'"):
+        catstream.to_supervision(Track(3, 2, 0.1, "absent", None, 0.1, 7))
