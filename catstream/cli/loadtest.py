@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["loadtest"]
 
 _BROKEN, _INTERRUPTED = 1, 130
+_QUIET_CORES = 0.25  # busy with other things: more is worth a word
 _FIND = ("p99=0.1", "skipped=0.01")  # what a rate must hold where nothing else is given
 
 
@@ -165,7 +166,7 @@ def _step(step: Step) -> str:
 
 
 def _print(console: Console, result: Result, limits: list[Limit]) -> None:
-    from catstream.loadtest.figures import usage
+    from catstream.loadtest.usage import summary
 
     plan = result.plan
     console.print(
@@ -182,7 +183,7 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
                         *(f"{found[key]:.2f}" for key in ("cores", "cores_most")),
                         *(f"{found[key] / 1e6:.0f}" for key in ("memory", "memory_most")),
                     )
-                    for name, found in ((name, usage(samples)) for name, samples in result.usage.items())
+                    for name, found in ((name, summary(samples)) for name, samples in result.usage.items())
                 ],
             )
         )
@@ -197,6 +198,10 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
             for recovery in result.recoveries
         ]
         console.print(_table((f"{len(rows)} killed", "s to the next track", "s to the next model"), rows))
+    if result.others > _QUIET_CORES:
+        console.print(
+            f"others kept {result.others:.1f} cores busy meanwhile: for figures to rely on, run it on a quiet machine"
+        )
     for limit in limits:
         mark = "[green]held[/]" if limit.held(result) else "[red]broken[/]"
         console.print(f"{mark}: {limit.told(result)}")

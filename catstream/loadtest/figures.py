@@ -8,9 +8,9 @@ from typing import Any
 
 from catstream.loadtest.measures import Measures
 from catstream.loadtest.trial import Trial
-from catstream.loadtest.usage import Sample
+from catstream.loadtest.usage import summary
 
-__all__ = ["machine", "to_json", "usage"]
+__all__ = ["machine", "to_json"]
 
 
 def to_json(trial: Trial) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def to_json(trial: Trial) -> dict[str, Any]:
         "interrupted": trial.interrupted,
         "latency": {"track": result.track.figures(), "model": result.model.figures()},
         "streams": [_stream(measures, plan.rate) for measures in result.streams],
-        "processes": {name: usage(samples) for name, samples in result.usage.items()},
+        "processes": {name: summary(samples) for name, samples in result.usage.items()},
         "subscribers": {
             "quick": len(result.heard),
             "heard": sum(result.heard),
@@ -82,22 +82,10 @@ def _stream(measures: Measures, rate: float) -> dict[str, Any]:
     }
 
 
-def usage(samples: list[Sample]) -> dict[str, float]:
-    """Of one process: mean and most of its processor in cores, and of its memory."""
-    cores, memory = [sample.cores for sample in samples], [sample.memory for sample in samples]
-    return {
-        "cores": sum(cores) / len(cores),
-        "cores_most": max(cores),
-        "memory": sum(memory) / len(memory),
-        "memory_most": max(memory),
-    }
-
-
 def machine() -> dict[str, Any]:
     """What it ran on."""
     return {
         "processor": platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
-        "load_before": os.getloadavg()[0],
         "python": platform.python_version(),
     }

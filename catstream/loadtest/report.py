@@ -11,11 +11,11 @@ import numpy as np
 
 from catstream.html.page import table, write_page
 from catstream.html.plots import Axis, plot
-from catstream.loadtest.figures import usage
 from catstream.loadtest.latencies import PERCENTILES, Latencies
 from catstream.loadtest.measures import Measures
 from catstream.loadtest.run import Result
 from catstream.loadtest.trial import Trial
+from catstream.loadtest.usage import summary
 
 __all__ = ["write_report"]
 
@@ -53,9 +53,10 @@ def write_report(path: Path, trial: Trial) -> Path:
             _processes(result),
             _subscribers(result),
             _chaos(result),
-            "<h2>The camera</h2>",
-            f'<p class="about">It sent no frame more than {_ms(result.camera_late)} ms after it was due by its own '
-            "fault: latencies are not better known than that.</p>",
+            "<h2>How far to trust this</h2>",
+            f'<p class="about">The camera sent no frame more than {_ms(result.camera_late)} ms after it was due by its '
+            "own fault: latencies are not better known than that. What is not of the load test kept "
+            f"{result.others:.2f} cores busy meanwhile: on a quiet machine that is next to none.</p>",
             "<h2>Settings that are not the default</h2>",
             f"<pre>{escape(chr(10).join(plan.settings.changed()) or 'none')}</pre>",
         ],
@@ -199,7 +200,7 @@ def _kinds(result: Result, column: int, scale: float, start: float) -> dict[str,
 def _processes(result: Result) -> str:
     rows = []
     for name, samples in result.usage.items():
-        found = usage(samples)
+        found = summary(samples)
         cores, memory = (found["cores"], found["cores_most"]), (found["memory"], found["memory_most"])
         rows.append([escape(name), *(f"{value:.2f}" for value in cores), *(f"{value / 1e6:.0f}" for value in memory)])
     return table(["process", "cores, mean", "most", "MB, mean", "most"], rows)

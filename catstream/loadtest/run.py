@@ -21,7 +21,7 @@ from catstream.loadtest.measures import Measures, measure
 from catstream.loadtest.observer import Observer, Seen
 from catstream.loadtest.plan import Plan
 from catstream.loadtest.stream import Stream
-from catstream.loadtest.usage import Sample, Usage
+from catstream.loadtest.usage import REST, Sample, Usage, summary
 from catstream.video.broadcast import Schedule
 
 __all__ = ["News", "Recovery", "Result", "run"]
@@ -29,6 +29,7 @@ __all__ = ["News", "Recovery", "Result", "run"]
 _PATIENCE_SECONDS = 120.0  # for all to be ready
 _LEAD_SECONDS = 0.5  # from "ready" to the first frame
 _GRACE_SECONDS = 3.0  # for the track of the last frame
+_CALM_SECONDS = 5.0  # before the last frame without a kill: who was killed has time to come back
 _LOOK_SECONDS = 0.5  # from one sample of processor and memory to the next
 _TURN_SECONDS = 0.05
 
@@ -60,7 +61,7 @@ class Result:
     streams      figures of each
     restarts     of processes, in all
     recoveries   of each kill
-    usage        processor and memory of each process
+    usage        processor and memory of each process, and of all that is not of the load test
     heard        tracks that each quick subscriber heard, and missed
     frozen       seconds for which the frozen subscribers were that
     camera_late  seconds by which the camera itself sent a frame too late at most
@@ -90,6 +91,11 @@ class Result:
     def model(self) -> Latencies:
         """The same to the model that has seen them."""
         return Latencies(np.concatenate([stream.model.seconds for stream in self.streams]))
+
+    @property
+    def others(self) -> float:
+        """Cores that were busy with what is not of the load test, on average."""
+        return summary(self.usage[REST])["cores"] if REST in self.usage else 0.0
 
     @property
     def missed_share(self) -> float:
@@ -196,7 +202,7 @@ class _Watch:
             if now - self._looked >= _LOOK_SECONDS:
                 self._looked = now
                 self.usage.look(now, self._pids())
-            if self._chaos and now < last:
+            if self._chaos and now < last - _CALM_SECONDS:
                 self._chaos.turn(self._streams)
             passed = min(max(now - schedules[0].start, 0.0), self._plan.duration)
             latest = max(seen.tracks[-1][0] - (seen.tracks[-1][1].pts or 0.0) for seen in self._seen)

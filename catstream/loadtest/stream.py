@@ -50,7 +50,8 @@ class Stream(threading.Thread):
                     pass
                 self.totals, self.restarts = pipeline.totals, pipeline.restarts
         except CatstreamError as error:
-            self.error = error
+            # A detector that is told to stop while it resumes has nothing to end.
+            self.error = None if self._told else error
         finally:
             self._pipeline = None
             self.ready.set()

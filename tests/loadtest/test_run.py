@@ -14,7 +14,7 @@ from catstream.loadtest.chaos import Chaos
 from catstream.loadtest.limits import Limit
 from catstream.loadtest.plan import Plan
 from catstream.loadtest.trial import hold
-from catstream.loadtest.usage import Usage
+from catstream.loadtest.usage import REST, Usage
 
 
 class Sleepers:
@@ -81,6 +81,7 @@ def test_usage_tells_who_is_busy(sleepers):
     usage.look(1.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
     assert usage.samples["busy"][0].cores >= 0.29
     assert usage.samples["idle"][0].cores < usage.samples["busy"][0].cores
+    assert usage.samples[REST][0].cores >= 0
     assert 0 < usage.samples["idle"][0].memory < usage.samples["busy"][0].memory
 
 
