@@ -18,6 +18,7 @@ VERBS = {
     "evaluate": "Measure accuracy on annotated sequences, beside other trackers.",
     "loadtest": "Put pipelines under load, and measure what they bear.",
     "watch": "Show what a running pipeline says, as it says it.",
+    "view": "Look at a running pipeline in a browser, and steer it.",
     "sink": "Write the tracks of a running pipeline to files.",
     "record": "Keep what a running pipeline says, in one file.",
     "replay": "Play a recording to subscribers, or learn from it once more.",

@@ -1,0 +1,1 @@
+"""The web page of a running pipeline: look at it, steer it, measure it."""

@@ -1,0 +1,165 @@
+"""The application: the page, what it shows, and what it may ask of the pipeline.
+
+/                 the page
+/events           what is new, at most ten times a second, as server-sent events
+/pictures/N.jpg   the picture of frame N
+/control          POST {"verb": ..., "box": [x, y, w, h], "keep": ...}
+/metrics          for Prometheus
+/healthz          200 while this server runs
+/readyz           200 while all processes of the pipeline are heard
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from catstream.errors import CatstreamError, ProtocolError, RefusedError, SilenceError
+from catstream.messages import Answer
+from catstream.steering import Control
+from catstream.web import metrics
+from catstream.web.feed import Feed
+from catstream.web.guard import Bucket, body_of, too_many
+from catstream.wire.channels import CHANNELS
+
+__all__ = ["create"]
+
+_PAGE = Path(__file__).with_name("page")
+_TURN_SECONDS = 0.1
+_ALIVE_SECONDS = 5.0  # of silence after which a stream says that it is there: so it hears that nobody is
+_VIEWERS = 64
+_COMMANDS, _COMMANDS_PER_SECOND = 20, 5
+
+
+def create(feed: Feed) -> Starlette:
+    """The page of a feed, which runs for as long as this does; to be put behind a `Guard`."""
+    pages = _Pages(feed)
+
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        running = asyncio.create_task(feed.run())
+        yield
+        running.cancel()
+        with suppress(asyncio.CancelledError):
+            await running
+
+    return Starlette(
+        lifespan=lifespan,
+        routes=[
+            Route("/", pages.index),
+            Route("/events", pages.events),
+            Route("/pictures/{frame:int}.jpg", pages.picture),
+            Route("/control", pages.control, methods=["POST"]),
+            Route("/metrics", pages.metrics),
+            Route("/healthz", pages.healthz),
+            Route("/readyz", pages.readyz),
+            Mount("/page", StaticFiles(directory=_PAGE)),
+        ],
+    )
+
+
+class _Pages:
+    """A method a route."""
+
+    def __init__(self, feed: Feed) -> None:
+        self._feed = feed
+        self._commands = Bucket(_COMMANDS, _COMMANDS_PER_SECOND)
+
+    async def index(self, _: Request) -> Response:
+        return FileResponse(_PAGE / "index.html")
+
+    async def events(self, _: Request) -> Response:
+        if self._feed.viewers >= _VIEWERS:
+            return PlainTextResponse(f"{_VIEWERS} pages are open already\n", 503)
+        return StreamingResponse(self._news(), media_type="text/event-stream")
+
+    async def _news(self) -> AsyncIterator[str]:
+        seen: dict[str, int] = {}
+        spoken = monotonic()
+        with self._feed.watching():
+            yield "retry: 1000\n\n"
+            while not self._feed.closed:
+                if parts := self._feed.board.news(seen):
+                    spoken = monotonic()
+                    yield f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"
+                elif monotonic() - spoken > _ALIVE_SECONDS:
+                    spoken = monotonic()
+                    yield ":\n\n"
+                await asyncio.sleep(_TURN_SECONDS)
+
+    async def picture(self, request: Request) -> Response:
+        preview = self._feed.board.picture(request.path_params["frame"])
+        if preview is None:
+            return PlainTextResponse("this picture is gone\n", 404)
+        return Response(preview.jpeg, media_type="image/jpeg")
+
+    async def control(self, request: Request) -> Response:
+        # No form of another page can send this type without being asked about first.
+        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+            return _refused(415, "expected application/json")
+        if wait := self._commands.wait(monotonic()):
+            return too_many(wait)
+        self._commands.take()
+        try:
+            verb, box, keep = _command(await body_of(request))
+        except ValueError as error:
+            return _refused(400, str(error))
+        try:
+            answer = await run_in_threadpool(_steer, self._feed, verb, box, keep)
+        except RefusedError as error:
+            return _refused(409, str(error))
+        except ProtocolError as error:
+            return _refused(400, str(error))
+        except SilenceError as error:
+            return _refused(504, str(error))
+        except CatstreamError as error:
+            return _refused(503, str(error))
+        return JSONResponse({"done": True, "reason": answer.reason, "frame": answer.frame, "version": answer.version})
+
+    async def metrics(self, _: Request) -> Response:
+        return Response(metrics.text(self._feed), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    async def healthz(self, _: Request) -> Response:
+        return PlainTextResponse("ok\n")
+
+    async def readyz(self, _: Request) -> Response:
+        silent = [name for name in CHANNELS["health"].senders if name not in self._feed.board.health]
+        return PlainTextResponse(f"not heard: {', '.join(silent)}\n", 503) if silent else PlainTextResponse("ok\n")
+
+
+def _command(body: bytes | None) -> tuple[str, list[float] | None, bool]:
+    """Verb, box and whether to keep what was learned, as they were posted; ValueError where they cannot be read."""
+    if body is None:
+        raise ValueError("expected a command, got far more")
+    command: Any = json.loads(body)
+    if not isinstance(command, dict) or command.get("verb") not in ("set-box", "pause", "resume", "stop"):
+        raise ValueError('expected {"verb": "set-box", "pause", "resume" or "stop"}')
+    verb, box, keep = command["verb"], command.get("box"), command.get("keep", False)
+    numbers = isinstance(box, list) and len(box) == 4 and all(type(side) in (int, float) for side in box)
+    if (verb == "set-box") != numbers or not isinstance(keep, bool) or (box is not None and not numbers):
+        raise ValueError('expected "box": [x, y, w, h] with set-box and with nothing else, and "keep": true or false')
+    return verb, box, keep
+
+
+def _steer(feed: Feed, verb: str, box: list[float] | None, keep: bool) -> Answer:
+    """Have a command carried out; blocks until it is answered."""
+    with Control(feed.place, keys=feed.keys) as pipeline:
+        if box is not None:
+            return pipeline.set_box(box, keep=keep)
+        return {"pause": pipeline.pause, "resume": pipeline.resume, "stop": pipeline.stop}[verb]()
+
+
+def _refused(code: int, reason: str) -> Response:
+    return JSONResponse({"done": False, "reason": reason}, code)

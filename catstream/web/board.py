@@ -1,0 +1,197 @@
+"""The board: what the page shows of a pipeline, from the messages it sends. No socket, no clock."""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict, deque
+from typing import Any, Literal
+
+from catstream.messages import End, Features, Health, Model, Preview, Track
+from catstream.web.film import Film
+
+__all__ = ["TREES", "Board", "Standing"]
+
+#: How the pipeline is: not heard yet, heard, silent since, at its end.
+Standing = Literal["waiting", "running", "gone", "ended"]
+
+#: The compressor's coreset trees.
+TREES = ("object", "background", "loss", "extent")
+
+_POINT_SECONDS = 0.25
+_POINTS = 480  # two minutes
+_RATE_SECONDS = 2.0  # that frames a second are counted over
+_FRAMES = 4096  # whose arrival is remembered, until a model has learned from them
+_FAREWELL_SECONDS = 3.0  # that the processes may still be heard after the end
+_PICTURES = 8  # a page that asks for the last but one still gets it
+
+
+class Board:
+    """Takes messages, and tells each page what is new to it.
+
+    standing, reason : of the pipeline
+    tracks : how many came
+    """
+
+    def __init__(self) -> None:
+        self.standing: Standing = "waiting"
+        self.reason = ""
+        self.endpoint = ""
+        self.tracks = 0
+        self.track: Track | None = None
+        self.health: dict[str, Health] = {}
+        self.learned_after: float | None = None
+        self.film = Film()
+        self.pictures: OrderedDict[int, Preview] = OrderedDict()
+        self._model: Model | None = None
+        self._revisions: Counter[str] = Counter()
+        self._points: deque[tuple[float | None, ...]] = deque(maxlen=_POINTS)
+        self._pointed = self._ended = float("-inf")  # when the last point was made, and when the pipeline ended
+        self._moments: deque[float] = deque()
+        self._arrived: OrderedDict[int, float] = OrderedDict()
+
+    def take(self, message: Any, now: float) -> None:
+        """Take a message that came at a moment `now`, seconds of any clock that only goes forward."""
+        match message:
+            case Track():
+                self._follow(message, now)
+            case Model():
+                self._learn(message, now)
+            case Health():
+                self.health[message.process] = message
+                if self.standing in ("waiting", "gone") or now - self._ended > _FAREWELL_SECONDS:
+                    self.standing, self.reason = "running", ""
+                self._point(now)
+                self._changed("status", "trees")
+            case Preview():
+                self._look(message)
+            case Features():
+                if self.film.learn(message):
+                    self._changed("film")
+            case End():
+                self.standing, self.reason, self._ended = "ended", message.reason, now
+                self._changed("status")
+
+    def lost(self, reason: str) -> None:
+        """The pipeline is silent, or there is none."""
+        if self.standing == "running":
+            self.standing = "gone"
+        if self.standing != "ended":
+            self.reason = reason
+        self.health.clear()
+        self._changed("status", "trees")
+
+    def rate(self, now: float) -> float:
+        """Frames a second, over the last two."""
+        while self._moments and now - self._moments[0] > _RATE_SECONDS:
+            self._moments.popleft()
+        return len(self._moments) / _RATE_SECONDS
+
+    def counter(self, process: str, name: str) -> float | None:
+        """What a process said last of something that it counts."""
+        return self.health[process].counters.get(name) if process in self.health else None
+
+    def picture(self, frame: int) -> Preview | None:
+        """The picture of a frame that was told of lately, or that is in the film."""
+        if frame in self.pictures:
+            return self.pictures[frame]
+        return next((shot.preview for shot in self.film.shots if shot.frame == frame), None)
+
+    def news(self, seen: dict[str, int]) -> dict[str, Any]:
+        """The parts that are new to a page, ready for JSON.
+
+        Parameters
+        ----------
+        seen : what it was told of, empty at first; brought up to date
+        """
+        parts = {}
+        for name, revision in self._revisions.items():
+            if seen.get(name) != revision:
+                parts[name] = getattr(self, f"_{name}_part")(revision - seen.get(name, 0))
+                seen[name] = revision
+        return parts
+
+    def _follow(self, track: Track, now: float) -> None:
+        if self.standing != "running" or (self.track and track.model_version < self.track.model_version):
+            self._begin()
+        self.track = track
+        self.tracks += 1
+        self._moments.append(now)
+        self._arrived[track.frame] = now
+        if len(self._arrived) > _FRAMES:
+            self._arrived.popitem(last=False)
+        self._point(now)
+        self._changed("track")
+
+    def _begin(self) -> None:
+        """Another run, or another object: what was learned before is of no meaning to it."""
+        self.standing, self.reason, self.track = "running", "", None
+        self.film, self.learned_after = Film(), None
+        self._arrived.clear()
+        if self._model is not None:
+            self.film.adopt(self._model)
+        self._changed("status", "film")
+
+    def _learn(self, model: Model, now: float) -> None:
+        self._model = model
+        self.film.adopt(model)
+        if (arrived := self._arrived.get(model.frame)) is not None:
+            self.learned_after = now - arrived
+        while self._arrived and next(iter(self._arrived)) <= model.frame:
+            self._arrived.popitem(last=False)
+
+    def _look(self, preview: Preview) -> None:
+        self.pictures[preview.frame] = preview
+        self.pictures.move_to_end(preview.frame)
+        if len(self.pictures) > _PICTURES:
+            self.pictures.popitem(last=False)
+        if self.film.look(preview):
+            self._changed("film")
+        self._changed("picture")
+
+    def _point(self, now: float) -> None:
+        if self.track is None or now - self._pointed < _POINT_SECONDS:
+            return
+        self._pointed, present = now, self.track.state != "absent"
+        self._points.append(
+            (now, self.track.score, self.rate(now), self.learned_after, self.track.model_version, present)
+        )
+        self._changed("points")
+
+    def _changed(self, *parts: str) -> None:
+        self._revisions.update(parts)
+
+    def _status_part(self, _: int) -> dict[str, Any]:
+        return {
+            "standing": self.standing,
+            "reason": self.reason,
+            "endpoint": self.endpoint,
+            "processes": sorted(self.health),
+            "lost_seconds": self.counter("detector", "lost_seconds"),
+            "skipped": self.counter("detector", "skipped"),
+        }
+
+    def _track_part(self, _: int) -> dict[str, Any] | None:
+        if (track := self.track) is None:
+            return None
+        return {"frame": track.frame, "time": track.time, "state": track.state, "version": track.model_version}
+
+    def _picture_part(self, _: int) -> dict[str, Any]:
+        preview = next(reversed(self.pictures.values()))
+        return {"frame": preview.frame, "width": preview.width, "height": preview.height, "box": preview.box}
+
+    def _points_part(self, new: int) -> list[list[float | None]]:
+        return [[value if value is None else round(value, 3) for value in point] for point in list(self._points)[-new:]]
+
+    def _trees_part(self, _: int) -> dict[str, Any]:
+        return {
+            "leaves": {tree: self.counter("compressor", f"{tree}_leaves") for tree in TREES},
+            "bytes": self.counter("compressor", "bytes"),
+            "rows": self.counter("compressor", "rows"),
+        }
+
+    def _film_part(self, _: int) -> dict[str, Any]:
+        shots = [
+            {"frame": shot.frame, "time": shot.time, "taught": round(shot.taught, 3), "box": shot.preview.box}
+            | {"width": shot.preview.width, "height": shot.preview.height}
+            for shot in self.film.shots
+        ]
+        return {"frames": self.film.frames, "shots": shots}

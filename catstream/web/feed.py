@@ -1,0 +1,98 @@
+"""The feed: takes the messages of a pipeline to the board, however often that comes and goes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Iterator
+from time import monotonic
+
+from catstream.errors import CatstreamError
+from catstream.subscription import subscribe
+from catstream.web.board import Board
+from catstream.wire.endpoint import find
+
+__all__ = ["Feed"]
+
+_SILENCE_SECONDS = 4.0  # each process is heard once a second
+_PAUSE_SECONDS = 0.5
+
+#: What is taken always, and what only while somebody looks: it costs the pipeline something.
+_ALWAYS, _WATCHED = ("tracks", "models", "health"), ("previews", "features")
+
+
+class Feed:
+    """Attached for as long as `run` does; finds the pipeline again after each end, silence or restart.
+
+    Parameters
+    ----------
+    endpoint : where the pipeline runs; empty for the only one of this user, whichever that is by then
+    keys : the folder of keys of this client, where the pipeline asks for some
+
+    Attributes
+    ----------
+    board : what was told
+    place, keys : where it is attached, and with which keys; empty while it is not
+    viewers : how many pages are open
+    closed : whether the pages are to end
+    """
+
+    def __init__(self, endpoint: str = "", keys: str = "") -> None:
+        self._endpoint, self._keys = endpoint, keys
+        self.board = Board()
+        self.place = self.keys = ""
+        self.viewers = 0
+        self.closed = False
+        self._watched = asyncio.Event()
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator[None]:
+        """Somebody looks: pictures and features are taken meanwhile."""
+        self.viewers += 1
+        self._watched.set()
+        try:
+            yield
+        finally:
+            self.viewers -= 1
+            if not self.viewers:
+                self._watched.clear()
+
+    async def run(self) -> None:
+        """Until it is cancelled."""
+        while True:
+            try:
+                place = find(self._endpoint, self._keys)
+                self.place = self.board.endpoint = str(place)
+                self.keys = str(place.keys.folder) if place.keys else ""  # the only one has its keys noted
+                await self._attached()
+            except CatstreamError as error:
+                self.board.lost(str(error))
+            self.place = self.keys = ""
+            await asyncio.sleep(_PAUSE_SECONDS)
+
+    async def _attached(self) -> None:
+        """Until the pipeline ends, or is silent."""
+        tasks = [asyncio.create_task(self._take(channel)) for channel in (*_ALWAYS, *_WATCHED)]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _take(self, channel: str) -> None:
+        """Until the pipeline ends; what is for viewers only while there are any."""
+        timeout = _SILENCE_SECONDS if channel == "health" else None
+        while True:
+            if channel in _WATCHED:
+                await self._watched.wait()
+            with subscribe(self.place, channel, timeout=timeout, keys=self.keys) as messages:  # type: ignore[call-overload]
+                async for message in messages:
+                    self.board.take(message, monotonic())
+                    if channel in _WATCHED and not self.viewers:
+                        break
+                else:
+                    self.board.take(messages.end, monotonic())
+                    return

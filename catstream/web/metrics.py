@@ -1,0 +1,91 @@
+"""What a pipeline counts, as Prometheus reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from time import monotonic, time
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
+
+from catstream.web.board import TREES
+from catstream.web.feed import Feed
+from catstream.wire.channels import CHANNELS
+
+__all__ = ["text"]
+
+#: Name of a metric, the process and the counter that it is, and what it means.
+_COUNTED = (
+    ("frames", "detector", "sent", "Frames followed."),
+    ("frames_skipped", "detector", "skipped", "Frames of a live source that passed by."),
+    ("source_reopened", "detector", "reopened", "Times that a live source was lost and opened again."),
+    ("features_stored", "detector", "stored", "Messages of features that are stored in the coreset trees."),
+    ("rows", "compressor", "rows", "Rows inserted into the coreset trees."),
+)
+_GAUGES = (
+    ("source_lost_seconds", "detector", "lost_seconds", "For how long a live source has been lost."),
+    ("model_version", "detector", "model_version", "Version of the model that the detector uses."),
+    ("tree_bytes", "compressor", "bytes", "Memory of the coreset trees."),
+)
+
+
+def text(feed: Feed) -> bytes:
+    """The metrics as they are now, in Prometheus's text format."""
+    registry = CollectorRegistry()
+    registry.register(_Collector(feed))
+    return generate_latest(registry)
+
+
+class _Collector:
+    def __init__(self, feed: Feed) -> None:
+        self._feed = feed
+
+    def collect(self) -> Iterator[Metric]:
+        board = self._feed.board
+        yield _gauge("up", "Whether the pipeline is heard.", board.standing == "running")
+        yield _gauge("viewers", "Pages that are open.", self._feed.viewers)
+        for name, process, counter, meaning in _COUNTED:
+            if (value := board.counter(process, counter)) is not None:
+                yield CounterMetricFamily(f"catstream_{name}", meaning, value=value)
+        for name, process, counter, meaning in _GAUGES:
+            if (value := board.counter(process, counter)) is not None:
+                yield _gauge(name, meaning, value)
+        yield from self._learning()
+        yield from self._processes()
+        if board.track is not None:
+            yield _gauge("score", "Score of the newest track: about 0 on background, about 1 on the object.",
+                         board.track.score)  # fmt: skip
+            yield _gauge("present", "Whether the object is there.", board.track.state != "absent")
+            yield _gauge("frames_per_second", "Frames followed a second, over the last two.", board.rate(monotonic()))
+
+    def _learning(self) -> Iterator[Metric]:
+        board = self._feed.board
+        sent, taken = board.counter("detector", "sent"), board.counter("detector", "taken")
+        if sent is not None and taken is not None:
+            yield _gauge("features_waiting", "Messages of features that the compressor has not taken yet.",
+                         sent - taken)  # fmt: skip
+        if board.learned_after is not None:
+            yield _gauge("learning_latency_seconds", "From a frame's track to the model that learned from it.",
+                         board.learned_after)  # fmt: skip
+        leaves = GaugeMetricFamily(
+            "catstream_tree_leaves", "Leaves ever inserted into a coreset tree.", labels=["tree"]
+        )
+        for tree in TREES:
+            if (value := board.counter("compressor", f"{tree}_leaves")) is not None:
+                leaves.add_metric([tree], value)
+        yield leaves
+
+    def _processes(self) -> Iterator[Metric]:
+        heard = GaugeMetricFamily("catstream_heard_seconds", "Since a process was heard.", labels=["process"])
+        refused = CounterMetricFamily(
+            "catstream_refused_messages", "Messages that were not what their channel carries.", labels=["process"]
+        )
+        for process in CHANNELS["health"].senders:
+            if process in self._feed.board.health:
+                heard.add_metric([process], max(0.0, time() - self._feed.board.health[process].time))
+                refused.add_metric([process], self._feed.board.counter(process, "refused") or 0)
+        yield from (heard, refused)
+
+
+def _gauge(name: str, meaning: str, value: float) -> Metric:
+    return GaugeMetricFamily(f"catstream_{name}", meaning, value=float(value))

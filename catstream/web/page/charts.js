@@ -1,0 +1,90 @@
+// Four charts of the last two minutes: score, frames a second, latency, model.
+
+import { figure, make } from "./svg.js";
+
+const [FEWEST, SECONDS] = [15, 120]; // that are shown
+const [LEFT, TOP, BOTTOM] = [34, 8, 18];
+
+const CHARTS = [
+  { title: "score", tone: "accent", column: 1, least: 1, show: (value) => value.toFixed(2), unit: "" },
+  { title: "frames a second", tone: "blue", column: 2, least: 10, show: (value) => value.toFixed(0), unit: "" },
+  { title: "frame to model", tone: "violet", column: 3, least: 0.5, show: (value) => value.toFixed(2), unit: "s" },
+  { title: "model version", tone: "green", column: 4, least: 4, show: (value) => value.toFixed(0), unit: "" },
+];
+
+export class Charts {
+  constructor(element) {
+    this.points = [];
+    this.charts = CHARTS.map((chart) => {
+      const drawing = make("svg", { role: "img" });
+      const parts = figure("chart", chart.title, chart.tone, drawing);
+      element.append(parts.element);
+      return { ...chart, drawing, ...parts };
+    });
+  }
+
+  clear() {
+    this.points = [];
+  }
+
+  /** Take points of [second, score, frames a second, latency, model, present]. */
+  add(points) {
+    this.points.push(...points);
+    const now = this.points.at(-1)[0];
+    while (this.points[0][0] < now - SECONDS) this.points.shift();
+    for (const chart of this.charts) this.draw(chart, now);
+  }
+
+  draw({ drawing, right, column, least, show, unit, title }, now) {
+    const points = this.points.filter((point) => point[column] !== null);
+    const last = points.at(-1)?.[column];
+    right.textContent = last === undefined ? "–" : `${show(last)}${unit && ` ${unit}`}`;
+    const [wide, tall] = [drawing.clientWidth, drawing.clientHeight];
+    const seconds = Math.min(SECONDS, Math.max(FEWEST, now - this.points[0][0]));
+    const low = Math.min(0, ...points.map((point) => point[column]));
+    const high = round(Math.max(least, ...points.map((point) => point[column])));
+    const x = (second) => LEFT + (wide - LEFT) * (1 - (now - second) / seconds);
+    const y = (value) => TOP + (tall - TOP - BOTTOM) * (1 - (value - low) / (high - low));
+    const grid = [0, high].flatMap((value) => [
+      make("line", { class: "grid", x1: LEFT, x2: wide, y1: y(value), y2: y(value) }),
+      make("text", { x: LEFT - 6, y: y(value) + 4, "text-anchor": "end" }, String(value)),
+    ]);
+    grid.push(make("text", { x: LEFT, y: tall - 3 }, `${Math.round(seconds)} s ago`));
+    grid.push(make("text", { x: wide, y: tall - 3, "text-anchor": "end" }, "now"));
+    const away = spans(this.points).map(([from, to]) =>
+      make("rect", { class: "away", x: x(from), y: TOP, width: Math.max(1, x(to) - x(from)), height: tall - TOP - BOTTOM }));
+    const line = pieces(points).map((piece) =>
+      make("polyline", { points: piece.map((point) => `${x(point[0]).toFixed(1)},${y(point[column]).toFixed(1)}`).join(" ") }));
+    drawing.replaceChildren(...away, ...grid, ...line);
+    drawing.setAttribute("aria-label", `${title}: ${right.textContent}, from ${show(Math.min(...points.map((p) => p[column])))}`
+      + ` to ${show(Math.max(...points.map((p) => p[column])))} in the last two minutes; shaded where the object was absent`);
+  }
+}
+
+/** The next round number. */
+function round(value) {
+  const ten = 10 ** Math.floor(Math.log10(value));
+  return Number((ten * [1, 1.2, 1.5, 2, 3, 4, 5, 6, 8, 10].find((part) => value <= part * ten * 1.000001)).toPrecision(3));
+}
+
+/** From when to when the object was absent. */
+function spans(points) {
+  const found = [];
+  points.forEach((point, index) => {
+    if (point[5] || index === 0) return;
+    const before = points[index - 1];
+    if (found.length && found.at(-1)[1] === before[0]) found.at(-1)[1] = point[0];
+    else found.push([before[0], point[0]]);
+  });
+  return found;
+}
+
+/** The line, broken where nothing came for seconds. */
+function pieces(points) {
+  const found = [];
+  points.forEach((point, index) => {
+    if (index === 0 || point[0] - points[index - 1][0] > 2) found.push([]);
+    found.at(-1).push(point);
+  });
+  return found;
+}

@@ -1,0 +1,144 @@
+// What the server tells goes to the parts of the page; what a person wants goes to the pipeline.
+
+import { Charts } from "./charts.js";
+import { Film } from "./film.js";
+import { Stage } from "./stage.js";
+import { Trees } from "./trees.js";
+
+const $ = (selector) => document.querySelector(selector);
+const charts = new Charts($(".charts"));
+const trees = new Trees($(".trees"), $("#kept"));
+const film = new Film($(".film"), $("#measured"));
+const stage = new Stage($("#stage"), $("#picture"), { pause, follow, changed: showDrawing });
+let status = { standing: "waiting" };
+let track = null;
+let paused = false;
+
+/** Have a command carried out; returns the answer, null where it was refused, which is said. */
+async function steer(verb, more = {}) {
+  let answer;
+  try {
+    const response = await fetch("/control", {
+      method: "POST",
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify({ verb, ...more }),
+    });
+    const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
+    answer = json ? await response.json() : { done: false, reason: (await response.text()).trim() };
+  } catch {
+    answer = { done: false, reason: "the server of this page does not answer" };
+  }
+  say(answer.reason, !answer.done);
+  if (!answer.done) return null;
+  if (verb === "pause" || verb === "resume") showPaused(verb === "pause");
+  return answer;
+}
+
+function say(text, wrong = false) {
+  $("#said").textContent = text;
+  $("#said").classList.toggle("wrong", wrong);
+}
+
+/** Stand still, for a box to be drawn: the frame that it will be in, and how to go on afterwards. */
+async function pause() {
+  const before = paused;
+  const answer = await steer("pause");
+  if (!answer) return null;
+  say("Paused for your box.");
+  return { frame: answer.frame, leave: before ? null : () => steer("resume") };
+}
+
+async function follow(box, leave) {
+  const answer = await steer("set-box", { box, keep: $("#keep").checked });
+  if (answer && leave) {
+    await leave();
+    say(answer.reason);
+  }
+  return answer !== null;
+}
+
+function showDrawing(drawing, box) {
+  $("#watching").hidden = drawing;
+  $("#drawing").hidden = !drawing;
+  $("#follow").disabled = !box;
+}
+
+function showPaused(now) {
+  paused = now;
+  $("#pause").textContent = paused ? "Resume" : "Pause";
+  $("#pause").setAttribute("aria-pressed", String(paused));
+  showState();
+}
+
+function showState() {
+  const running = status.standing === "running";
+  const lost = running && status.lost_seconds > 0;
+  let state = running ? (track ? track.state : "waiting") : status.standing;
+  let words = { waiting: "waiting", gone: "pipeline gone", ended: "ended" }[state] || state;
+  if (lost) [state, words] = ["gone", `source lost for ${Math.round(status.lost_seconds)} s`];
+  else if (running && paused) words = `paused, ${words}`;
+  const pill = $("#state");
+  pill.dataset.state = state;
+  if (pill.lastElementChild.textContent !== words) pill.lastElementChild.textContent = words;
+  const skipped = status.skipped === null || status.skipped === undefined ? "" : `, ${status.skipped} frames skipped`;
+  $("#about").textContent = status.endpoint ? `${status.endpoint}${skipped}` : "";
+  let veil = "";
+  if (status.standing === "waiting") veil = status.reason || "Waiting for a pipeline";
+  if (status.standing === "gone") veil = "The pipeline is gone. This page waits for it.";
+  if (status.standing === "ended") veil = `The end: ${status.reason}. This page waits for the next one.`;
+  if (running && !stage.hasPicture) veil = "Waiting for a picture";
+  $("#veil").textContent = veil;
+  for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
+}
+
+const show = {
+  status(part) {
+    if (part.standing !== "running" && status.standing === "running") stage.cancel(false);
+    if (part.standing !== "running") paused = false;
+    status = part;
+    showPaused(part.paused ?? paused);
+  },
+  track(part) {
+    track = part;
+    if (!part) return;
+    $("#frame").textContent = `frame ${part.frame}, ${part.time.toFixed(1)} s, model ${part.version}`;
+    showState();
+  },
+  picture(part) {
+    stage.show(part).then(showState);
+  },
+  points: (part) => charts.add(part),
+  trees: (part) => trees.show(part),
+  film: (part) => film.show(part),
+};
+
+function listen() {
+  const events = new EventSource("/events");
+  events.onopen = () => charts.clear();
+  events.onmessage = (event) => {
+    for (const [name, part] of Object.entries(JSON.parse(event.data))) show[name](part);
+  };
+  events.onerror = () => {
+    show.status({ ...status, standing: "waiting", reason: "The server of this page does not answer. This page tries again." });
+    if (events.readyState !== EventSource.CLOSED) return;
+    events.close();
+    setTimeout(async () => {
+      const page = await fetch("/").catch(() => null);
+      if (page && page.status === 401) location.reload();
+      else listen();
+    }, 2000);
+  };
+}
+
+$("#draw").onclick = () => { $("#stage").focus(); stage.begin(); };
+$("#follow").onclick = () => stage.accept();
+$("#cancel").onclick = () => stage.cancel();
+$("#pause").onclick = () => steer(paused ? "resume" : "pause");
+$("#stop").onclick = () => $("#sure").showModal();
+$("#sure").onclose = (event) => {
+  if (event.target.returnValue === "stop") steer("stop");
+  event.target.returnValue = "";
+};
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { stage.draw(); film.draw(); });
+showState();
+listen();

@@ -1,0 +1,172 @@
+// The live picture with its box, and the box that a person draws: with mouse, finger or keyboard.
+
+const STEP = 0.02; // of the picture's shorter side, that an arrow moves a box
+const SMALLEST = 6; // pixels of the frame
+
+export class Stage {
+  /**
+   * actions: pause() stands still and says in which frame and how to go on; follow(box, leave) has a box followed;
+   * changed(drawing, box) hears what is drawn.
+   */
+  constructor(element, canvas, actions) {
+    Object.assign(this, { element, canvas, actions });
+    this.picture = this.bitmap = this.box = this.start = this.still = null;
+    this.drawing = this.loading = false;
+    element.addEventListener("pointerdown", (event) => this.press(event));
+    element.addEventListener("pointermove", (event) => this.drag(event));
+    element.addEventListener("pointerup", () => this.release());
+    element.addEventListener("pointercancel", () => this.release());
+    element.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  get hasPicture() {
+    return this.bitmap !== null;
+  }
+
+  /** Show a picture, unless one is on its way: then it is the next. */
+  async show(picture) {
+    this.next = picture;
+    if (this.loading) return;
+    this.loading = true;
+    while (this.next) {
+      const wanted = this.next;
+      this.next = null;
+      const response = await fetch(`/pictures/${wanted.frame}.jpg`).catch(() => null);
+      if (!response?.ok || (this.still && this.still.frame < wanted.frame)) continue;
+      const bitmap = await createImageBitmap(await response.blob()).catch(() => null);
+      if (!bitmap) continue;
+      this.bitmap?.close();
+      [this.picture, this.bitmap] = [wanted, bitmap];
+      this.draw();
+    }
+    this.loading = false;
+  }
+
+  /** Stand still for a box. */
+  async begin() {
+    if (this.drawing || !this.picture) return;
+    this.drawing = true;
+    this.tell();
+    const still = await this.actions.pause();
+    if (!still) this.cancel();
+    else if (this.drawing) this.still = still;
+    else still.leave?.();
+  }
+
+  /** Have the box followed. */
+  async accept() {
+    if (!this.drawing || !this.box || !this.still || this.asking) return;
+    this.asking = true;
+    const { x, y, w, h } = this.box;
+    const done = await this.actions.follow([x, y, w, h], this.still.leave);
+    this.asking = false;
+    if (done) this.end();
+  }
+
+  /** Leave, and go on as before. */
+  cancel(resume = true) {
+    if (!this.drawing) return;
+    if (resume) this.still?.leave?.();
+    this.end();
+  }
+
+  end() {
+    this.drawing = false;
+    this.box = this.start = this.still = null;
+    this.tell();
+  }
+
+  press(event) {
+    if (event.button !== 0 || !this.picture) return;
+    this.begin();
+    this.element.setPointerCapture(event.pointerId);
+    this.start = this.place(event);
+  }
+
+  drag(event) {
+    if (!this.start) return;
+    const { x, y } = this.place(event);
+    this.set(Math.min(x, this.start.x), Math.min(y, this.start.y), Math.abs(x - this.start.x), Math.abs(y - this.start.y));
+  }
+
+  release() {
+    if (!this.start) return;
+    this.start = null;
+    if (!this.box || this.box.w < SMALLEST || this.box.h < SMALLEST) {
+      this.box = null;
+      this.tell();
+    }
+  }
+
+  key(event) {
+    const { width, height } = this.picture ?? { width: 0, height: 0 };
+    const step = Math.max(1, Math.round(STEP * Math.min(width, height)));
+    const arrows = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
+    if (event.key === "Enter" && this.picture) {
+      if (this.box) this.accept();
+      else {
+        this.begin();
+        this.set(width * 0.4, height * 0.4, width * 0.2, height * 0.2);
+      }
+    } else if (event.key === "Escape") this.cancel();
+    else if (this.box && event.key in arrows) {
+      const [x, y] = arrows[event.key];
+      if (event.shiftKey) this.set(this.box.x, this.box.y, Math.max(SMALLEST, this.box.w + x), Math.max(SMALLEST, this.box.h + y));
+      else this.set(this.box.x + x, this.box.y + y, this.box.w, this.box.h);
+    } else return;
+    event.preventDefault();
+  }
+
+  set(x, y, w, h) {
+    const { width, height } = this.picture;
+    [w, h] = [Math.min(w, width), Math.min(h, height)];
+    this.box = { x: Math.max(0, Math.min(x, width - w)), y: Math.max(0, Math.min(y, height - h)), w, h };
+    this.tell();
+  }
+
+  /** Where in the frame a pointer is. */
+  place(event) {
+    const view = this.canvas.getBoundingClientRect();
+    const { width, height } = this.picture;
+    const scale = Math.min(view.width / width, view.height / height); // object-fit: contain
+    const left = view.left + (view.width - width * scale) / 2;
+    const top = view.top + (view.height - height * scale) / 2;
+    const inside = (value, most) => Math.max(0, Math.min(most, value));
+    return { x: inside((event.clientX - left) / scale, width), y: inside((event.clientY - top) / scale, height) };
+  }
+
+  tell() {
+    this.actions.changed(this.drawing, this.box);
+    this.draw();
+  }
+
+  draw() {
+    if (!this.bitmap) return;
+    const { canvas, bitmap, picture } = this;
+    const wide = Math.max(bitmap.width, Math.round(Math.min(canvas.clientWidth, 1280) * Math.min(devicePixelRatio, 2)));
+    const tall = Math.round((wide * picture.height) / picture.width);
+    if (canvas.width !== wide || canvas.height !== tall) [canvas.width, canvas.height] = [wide, tall];
+    const context = canvas.getContext("2d");
+    const scale = wide / picture.width;
+    context.drawImage(bitmap, 0, 0, wide, tall);
+    if (picture.box && !this.drawing) outline(context, picture.box.map((side) => side * scale), "#ff922b", wide);
+    if (!this.drawing) return;
+    context.fillStyle = "#0007";
+    context.fillRect(0, 0, wide, tall);
+    if (!this.box) return;
+    const { x, y, w, h } = this.box;
+    const own = bitmap.width / picture.width;
+    context.drawImage(bitmap, x * own, y * own, w * own, h * own, x * scale, y * scale, w * scale, h * scale);
+    outline(context, [x, y, w, h].map((side) => side * scale), "#ffffff", wide);
+  }
+}
+
+function outline(context, box, colour, wide) {
+  const thin = Math.max(2, wide / 260);
+  context.lineWidth = thin * 2.2;
+  context.strokeStyle = "#000b";
+  context.strokeRect(...box);
+  context.lineWidth = thin;
+  context.strokeStyle = colour;
+  context.strokeRect(...box);
+}

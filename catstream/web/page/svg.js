@@ -1,0 +1,21 @@
+// Elements of a drawing.
+
+export function make(name, attributes = {}, ...children) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.append(...children);
+  return element;
+}
+
+/** A figure with a caption of two ends, and a drawing below. */
+export function figure(kind, title, tone, drawing) {
+  const element = document.createElement("figure");
+  element.className = kind;
+  element.style.setProperty("--tone", `var(--${tone})`);
+  const caption = document.createElement("figcaption");
+  const [left, right] = [document.createElement("span"), document.createElement("b")];
+  left.textContent = title;
+  caption.append(left, right);
+  element.append(caption, drawing);
+  return { element, caption, left, right };
+}

@@ -1,0 +1,83 @@
+// The coreset trees. Of a tree its leaves are known: the levels of its nodes are the binary digits of their number,
+// since two nodes of a level are always merged. So each node, kept or merged, has its place above its leaves.
+
+import { figure, make } from "./svg.js";
+
+const TREES = { object: "accent", background: "blue", loss: "violet", extent: "green" };
+const MEANING = {
+  object: "the object", background: "the background", loss: "what is the object", extent: "what fits the object",
+};
+const [HEIGHT, EDGE] = [120, 8];
+const CLOSEST = 7; // pixels between two nodes of a level that is still drawn
+
+export class Trees {
+  constructor(element, kept) {
+    this.kept = kept;
+    this.trees = Object.entries(TREES).map(([name, tone]) => {
+      const drawing = make("svg", { role: "img" });
+      const parts = figure("tree", "", tone, drawing);
+      parts.left.append(Object.assign(document.createElement("b"), { textContent: MEANING[name] }));
+      element.append(parts.element);
+      return { name, drawing, ...parts, leaves: -1 };
+    });
+  }
+
+  show({ leaves, rows, bytes }) {
+    this.kept.textContent = rows ? `${rows.toLocaleString("en")} rows in ${(bytes / 1e6).toFixed(1)} MB.` : "";
+    for (const tree of this.trees) {
+      const count = leaves[tree.name] ?? 0;
+      if (count !== tree.leaves) this.draw(tree, count);
+    }
+  }
+
+  draw(tree, count) {
+    const before = new Set(nodes(Math.max(0, tree.leaves)).map(key));
+    const kept = nodes(count);
+    const top = kept.length ? kept[0].level : 0;
+    const apart = (tree.drawing.clientWidth - 2 * EDGE) / Math.max(count, 1);
+    const rise = Math.min(26, (HEIGHT - 34) / Math.max(top, 1));
+    const x = ({ level, from }) => EDGE + apart * (from + 2 ** level / 2);
+    const y = ({ level }) => HEIGHT - 16 - rise * level;
+    const [lines, fans, merged, filled] = [[], [], [], []];
+    const ends = ({ level, from }) => [EDGE + apart * from, EDGE + apart * (from + 2 ** level)];
+    const below = (node) => {
+      if (!node.level) return;
+      if (apart * 2 ** (node.level - 1) < CLOSEST) { // too close to be told apart
+        fans.push(`M${x(node)} ${y(node)}L${ends(node).map((end) => `${end} ${HEIGHT - 14}`).join("L")}Z`);
+        return;
+      }
+      const half = 2 ** (node.level - 1);
+      for (const child of [{ level: node.level - 1, from: node.from }, { level: node.level - 1, from: node.from + half }]) {
+        lines.push(`M${x(node)} ${y(node)}L${x(child)} ${y(child)}`);
+        merged.push(make("circle", { cx: x(child), cy: y(child), r: 2.2 }));
+        below(child);
+      }
+    };
+    for (const node of kept) {
+      below(node);
+      const [from, to] = ends(node);
+      const r = Math.max(2.5, Math.min(6, (to - from) / 2));
+      filled.push(make("rect", { class: "span", x: from + 0.5, y: HEIGHT - 10, width: Math.max(1, to - from - 1), height: 4 }));
+      filled.push(make("circle", { class: before.has(key(node)) ? "node" : "node new", cx: x(node), cy: y(node), r }));
+      if (to - from > 9) filled.push(make("text", { x: x(node), y: y(node) - 9 }, String(node.level)));
+    }
+    tree.drawing.replaceChildren(make("path", { class: "fan", d: fans.join("") }), make("path", { d: lines.join("") }), ...merged, ...filled);
+    tree.right.textContent = count ? `${plural(count, "leaf", "leaves")} in ${plural(kept.length, "node", "nodes")}` : "no leaf yet";
+    tree.drawing.setAttribute("aria-label", count ? `levels ${kept.map(({ level }) => level).join(", ")}` : "empty");
+    tree.leaves = count;
+  }
+}
+
+/** Nodes in memory, oldest first: level, and the first leaf that each stands for. */
+function nodes(count) {
+  const found = [];
+  for (let level = Math.floor(Math.log2(Math.max(count, 1))), from = 0; level >= 0; level--) {
+    if (Math.floor(count / 2 ** level) % 2 === 0) continue;
+    found.push({ level, from });
+    from += 2 ** level;
+  }
+  return found;
+}
+
+const plural = (count, one, more) => `${count.toLocaleString("en")} ${count === 1 ? one : more}`;
+const key = ({ level, from }) => `${level}:${from}`;

@@ -1,0 +1,108 @@
+"""The server of the page: from its start to its end, in this thread or in one of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import uvicorn
+
+from catstream.errors import ServiceError
+from catstream.web.app import create
+from catstream.web.feed import Feed
+from catstream.web.guard import Guard, is_loopback
+
+__all__ = ["Server"]
+
+_CONNECTIONS = 256
+_FAREWELL_SECONDS = 2
+
+
+class Server:
+    """Listens from its making on.
+
+    Parameters
+    ----------
+    endpoint, keys : of the pipeline, as `Feed` takes them
+    host, port : where to listen; port 0 for any that is free
+    token : what to show to get in; needed where others can reach the host
+
+    Attributes
+    ----------
+    url : of the page
+
+    Raises
+    ------
+    ServiceError
+        Where others could look without a token, the token could be guessed, or the port is taken.
+    """
+
+    def __init__(
+        self, endpoint: str = "", keys: str = "", *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None
+    ) -> None:
+        if token is None and not is_loopback(host):
+            raise ServiceError(
+                f"{host} can be reached from other machines, and who sees the page may steer: "
+                "give --token $(openssl rand -hex 16), or leave --host away"
+            )
+        self._feed = Feed(endpoint, keys)
+        guard = Guard(create(self._feed), token)
+        self._socket = _listening(host, port)
+        bound = self._socket.getsockname()[1]
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{bound}/" + (f"#{token}" if token else "")
+        config = uvicorn.Config(
+            guard,
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            limit_concurrency=_CONNECTIONS,
+            timeout_graceful_shutdown=_FAREWELL_SECONDS,
+        )
+        self._server = _Uvicorn(config, self._feed)
+
+    def run(self) -> None:
+        """Serve until Ctrl-C or SIGTERM."""
+        with contextlib.suppress(KeyboardInterrupt):  # told once the last page is served
+            self._server.run([self._socket])
+
+    @contextlib.contextmanager
+    def beside(self) -> Iterator[None]:
+        """Serve in a thread of its own, meanwhile."""
+        thread = threading.Thread(target=self._server.run, args=([self._socket],), name="view", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            self._server.should_exit = True
+            thread.join()
+
+
+class _Uvicorn(uvicorn.Server):
+    """Ends the streams of open pages before it waits for them."""
+
+    def __init__(self, config: uvicorn.Config, feed: Feed) -> None:
+        super().__init__(config)
+        self._feed = feed
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> Any:
+        self._feed.closed = True
+        await super().shutdown(sockets)
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listening = socket.socket(family)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+        listening.listen(_CONNECTIONS)
+    except OSError as error:
+        listening.close()
+        raise ServiceError(
+            f"cannot listen on {host}:{port} ({error.strerror}): give another --port or --host"
+        ) from None
+    return listening

@@ -1,0 +1,80 @@
+"""What the tests of the page share: messages of a pipeline, and a page that is served."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+
+import httpx
+import numpy as np
+import pytest
+
+from catstream.box import Box
+from catstream.messages import Features, Model, Preview, Track
+from catstream.web.server import Server
+from catstream.wire.endpoint import private_folder
+
+JPEG = b"\xff\xd8\xff\xe0 a picture"
+
+
+class Facts:
+    """Messages about frame after frame."""
+
+    @staticmethod
+    def track(frame, version=1, state="present", score=0.75):
+        box = None if state == "absent" else Box(4.0, 3.0, 20.0, 10.0)
+        return Track(frame + 1, frame, frame / 10, state, box, score, version)
+
+    @staticmethod
+    def model(version, frame):
+        return Model(version, frame, np.ones(2, np.float32), 0.0)
+
+    @staticmethod
+    def features(frame, wrong):
+        """Of one row, about which the model of above is so wrong."""
+        rows = np.full((1, 2), 0.5 + wrong / 2, np.float32)
+        one, none = np.ones(1, np.float32), np.empty((0, 2), np.float32)
+        return Features(frame + 1, frame, frame / 10, None, rows, one, one, none, none[:, 0])
+
+    @staticmethod
+    def preview(frame):
+        return Preview(frame, 64, 48, Box(4.0, 3.0, 20.0, 10.0), JPEG + str(frame).encode())
+
+
+@pytest.fixture
+def facts():
+    return Facts
+
+
+@pytest.fixture
+def folder():
+    """A private folder with a name that is short enough for sockets."""
+    with private_folder() as path:
+        yield path
+
+
+@pytest.fixture
+def serve(folder):
+    """Starts pages: what asks them, and where they are."""
+    with ExitStack() as stack:
+
+        def start(**options):
+            server = Server(str(folder), port=0, **options)
+            stack.enter_context(server.beside())
+            return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
+
+        yield start
+
+
+@pytest.fixture
+def until():
+    """Wait until a condition holds, and return what it returned; fail where it does not within a minute."""
+
+    def wait(condition, seconds=60.0):
+        deadline = time.monotonic() + seconds
+        while not (found := condition()):
+            assert time.monotonic() < deadline, "it did not happen in time"
+            time.sleep(0.02)
+        return found
+
+    return wait

@@ -1,0 +1,94 @@
+"""The board: what a page is told of the messages of a pipeline."""
+
+from __future__ import annotations
+
+import pytest
+
+from catstream.messages import End, Health
+from catstream.web.board import Board
+
+
+@pytest.fixture
+def board():
+    return Board()
+
+
+def test_a_page_is_told_once_of_what_is_new(board, facts):
+    seen = {}
+    board.take(facts.track(3), 1.0)
+    assert board.news(seen)["track"] == {"frame": 3, "time": 0.3, "state": "present", "version": 1}
+    assert board.news(seen) == {}
+    board.take(facts.track(4), 1.01)
+    assert set(board.news(seen)) == {"track"}
+
+
+def test_who_comes_late_gets_all_there_is(board, facts):
+    for frame in range(20):
+        board.take(facts.track(frame), 0.5 * frame)
+    early, late = {}, {}
+    assert len(board.news(early)["points"]) == 20
+    board.take(facts.track(20), 10.0)
+    assert len(board.news(early)["points"]) == 1
+    assert len(board.news(late)["points"]) == 21
+
+
+def test_two_minutes_of_points_are_kept_however_fast_tracks_come(board, facts):
+    for frame in range(20_000):
+        board.take(facts.track(frame), 0.01 * frame)
+    moments = [point[0] for point in board.news({})["points"]]
+    assert len(moments) == 480
+    assert moments[-1] - moments[0] == pytest.approx(120, abs=10)
+
+
+def test_frames_a_second_are_those_of_the_last_two(board, facts):
+    for frame in range(100):
+        board.take(facts.track(frame), frame / 50)
+    assert board.rate(2.0) == pytest.approx(50, abs=1)
+    assert board.rate(3.0) == pytest.approx(25, abs=1)
+    assert board.rate(9.0) == 0
+
+
+def test_latency_is_from_a_frame_to_the_model_that_learned_from_it(board, facts):
+    for frame in range(10):
+        board.take(facts.track(frame), float(frame))
+    board.take(facts.model(1, frame=6), 9.5)
+    assert board.learned_after == pytest.approx(3.5)
+
+
+def test_silence_and_the_end_are_told_apart(board, facts):
+    told = {}
+    board.take(Health("detector", 1.0, {"sent": 1.0}), 0.0)
+    assert board.news(told)["status"]["standing"] == "running"
+    board.lost("nothing came")
+    assert board.news(told)["status"]["standing"] == "gone"
+    board.take(facts.track(0), 10.0)
+    board.take(End(2, "the source came to its end"), 11.0)
+    board.lost("nothing came")
+    status = board.news(told)["status"]
+    assert (status["standing"], status["reason"]) == ("ended", "the source came to its end")
+
+
+def test_the_last_words_of_a_pipeline_are_not_taken_for_the_next_one(board):
+    board.take(End(2, "the source came to its end"), 10.0)
+    board.take(Health("compressor", 1.0, {}), 10.5)
+    assert board.standing == "ended"
+    board.take(Health("compressor", 2.0, {}), 20.0)
+    assert board.standing == "running"
+
+
+def test_another_run_begins_another_film(board, facts):
+    board.take(facts.track(0, version=5), 0.0)
+    board.take(facts.model(5, frame=0), 0.0)
+    board.take(facts.features(0, wrong=1.0), 0.0)
+    board.take(facts.preview(0), 0.0)
+    assert [shot["frame"] for shot in board.news({})["film"]["shots"]] == [0]
+    board.take(facts.track(0, version=0, state="bootstrapping"), 5.0)
+    assert board.news({})["film"]["shots"] == []
+
+
+def test_pictures_that_were_told_of_lately_are_there_and_older_ones_are_not(board, facts):
+    for frame in range(30):
+        board.take(facts.preview(frame), 0.1 * frame)
+    assert board.news({})["picture"] == {"frame": 29, "width": 64, "height": 48, "box": (4.0, 3.0, 20.0, 10.0)}
+    assert board.picture(25).jpeg.endswith(b"25")
+    assert board.picture(5) is None

@@ -1,0 +1,220 @@
+"""The server: who gets in, what others may make a browser do, and what it answers."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from urllib.parse import urlsplit
+
+import pytest
+
+from catstream.errors import ServiceError
+from catstream.messages import Health
+from catstream.web.guard import Bucket
+from catstream.web.server import Server
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Publisher
+
+TOKEN = "correct-horse-battery"
+PATHS = ["/", "/events", "/pictures/1.jpg", "/metrics"]
+
+
+@pytest.fixture
+def page(serve):
+    return serve()
+
+
+@pytest.fixture
+def locked(serve):
+    return serve(token=TOKEN)
+
+
+@pytest.fixture
+def pipeline(folder):
+    """The health of all three processes, and tracks and pictures, as a pipeline sends them."""
+    place = Endpoint.parse(str(folder))
+    with ExitStack() as stack:
+        health = {
+            name: stack.enter_context(Publisher("health", place, name))
+            for name in ("detector", "compressor", "trainer")
+        }
+        yield {
+            **health,
+            "tracks": stack.enter_context(Publisher("tracks", place)),
+            "previews": stack.enter_context(Publisher("previews", place)),
+        }
+
+
+def news(page, name, turn):
+    """The first part of that name that the page is told."""
+    with page.stream("GET", "/events") as events:
+        for line in events.iter_lines():
+            turn()
+            if line.startswith("data: ") and name in (parts := json.loads(line.removeprefix("data: "))):
+                return parts[name]
+    raise AssertionError("the stream ended")
+
+
+def test_the_page_needs_nothing_from_elsewhere_and_runs_no_script_of_others(page):
+    answer = page.get("/")
+    assert answer.status_code == 200
+    policy = dict(part.split(" ", 1) for part in answer.headers["content-security-policy"].split("; "))
+    assert (policy["default-src"], policy["script-src"], policy["style-src"]) == ("'none'", "'self'", "'self'")
+    assert policy["frame-ancestors"] == "'none'"
+    assert "http://" not in answer.text
+    assert "https://" not in answer.text
+    assert "style=" not in answer.text
+
+
+@pytest.mark.parametrize("name", ["style.css", "page.js", "stage.js", "charts.js", "trees.js", "film.js", "svg.js"])
+def test_each_file_of_the_page_is_served_as_what_it_is(page, name):
+    answer = page.get(f"/page/{name}")
+    assert answer.headers["content-type"].startswith("text/css" if name.endswith("css") else "text/javascript")
+    assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+def test_files_beside_the_page_are_not_served(page):
+    assert page.get("/page/..%2fguard.py").status_code == 404
+    assert page.get("/page/%2e%2e/guard.py").status_code == 404
+
+
+def test_it_is_healthy_by_itself_and_ready_with_all_processes(page, pipeline, until):
+    assert page.get("/healthz").status_code == 200
+    assert page.get("/readyz").status_code == 503
+
+    def ready():
+        for name in ("detector", "compressor", "trainer"):
+            pipeline[name].send(Health(name, 1.0, {"sent": 3.0, "refused": 1.0}))
+        return page.get("/readyz").status_code == 200
+
+    until(ready)
+    shown = page.get("/metrics").text
+    assert "\ncatstream_up 1.0\n" in shown
+    assert "\ncatstream_frames_total 3.0\n" in shown
+    assert '\ncatstream_refused_messages_total{process="trainer"} 1.0\n' in shown
+
+
+def test_tracks_come_to_the_page_as_they_are_sent(page, pipeline, facts):
+    def turn():
+        pipeline["detector"].send(Health("detector", 1.0, {}))
+        pipeline["tracks"].send(facts.track(5))
+
+    turn()
+    assert news(page, "track", turn) == {"frame": 5, "time": 0.5, "state": "present", "version": 1}
+
+
+def test_pictures_are_asked_of_the_pipeline_only_while_somebody_looks(page, pipeline, facts, until):
+    def turn():
+        pipeline["detector"].send(Health("detector", 1.0, {}))
+        pipeline["previews"].send(facts.preview(7))
+        return True
+
+    until(lambda: turn() and page.get("/metrics").text.count("\ncatstream_up 1.0\n"))
+    assert not pipeline["previews"].heard
+    assert news(page, "picture", turn)["frame"] == 7
+    assert page.get("/pictures/7.jpg").content == facts.preview(7).jpeg
+    until(lambda: turn() and not pipeline["previews"].heard)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1", ""])
+def test_other_names_that_lead_here_are_not_answered_to(page, host):
+    assert page.get("/", headers={"Host": host}).status_code in (400, 421)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1"])
+def test_other_pages_may_not_steer(page, origin):
+    answer = page.post("/control", json={"verb": "pause"}, headers={"Origin": origin})
+    assert answer.status_code == 403
+
+
+def test_a_form_of_another_page_may_not_steer_though_it_names_no_origin(page):
+    assert page.post("/control", data={"verb": "pause"}).status_code == 415
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        {"verb": "format"},
+        {"verb": "set-box"},
+        {"verb": "set-box", "box": [1, 2, 3]},
+        {"verb": "set-box", "box": [1, 2, 3, "4"]},
+        {"verb": "set-box", "box": [1, 2, 0, 4]},
+        {"verb": "set-box", "box": [1, 2, 3, float("nan")]},
+        {"verb": "pause", "box": [1, 2, 3, 4]},
+        {"verb": "pause", "keep": "yes"},
+        ["pause"],
+        "x" * 5000,
+    ],
+    ids=repr,
+)
+def test_a_command_that_cannot_be_is_refused_before_it_is_sent(page, command):
+    body = json.dumps(command)
+    answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 400
+    assert "expected" in answer.json()["reason"]
+
+
+def test_who_steers_too_often_is_told_to_wait(page):
+    answers = [page.post("/control", json={"verb": "format"}) for _ in range(40)]
+    assert 429 in {answer.status_code for answer in answers}
+    assert int(next(answer for answer in answers if answer.status_code == 429).headers["retry-after"]) >= 0
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_without_the_token_nothing_of_the_pipeline_is_shown(locked, path):
+    assert locked.get(path).status_code == 401
+    assert locked.post("/control", json={"verb": "pause"}).status_code == 401
+
+
+def test_whoever_asks_how_it_is_needs_no_token(locked):
+    assert locked.get("/healthz").status_code == 200
+    assert locked.get("/readyz").status_code == 503
+
+
+def test_the_token_opens_as_a_header(locked):
+    assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
+    assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}x"}).status_code == 401
+
+
+def test_the_token_opens_by_the_door_and_the_browser_does_not_keep_it(locked):
+    answer = locked.post("/enter", data={"token": TOKEN})
+    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    kept = answer.headers["set-cookie"]
+    assert TOKEN not in kept
+    assert "HttpOnly" in kept
+    assert "SameSite=lax" in kept
+    assert locked.get("/").status_code == 200
+
+
+def test_tokens_cannot_be_tried_out(locked):
+    codes = [locked.post("/enter", data={"token": f"guess {guess}"}).status_code for guess in range(12)]
+    assert codes[:8] == [401] * 8
+    assert 429 in codes
+    answer = locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"})
+    assert answer.status_code == 429, "a right guess among too many is not to be told from a wrong one"
+
+
+def test_a_bucket_lets_as_many_through_as_it_says():
+    bucket, passed = Bucket(3, 0.5), []
+    for moment in range(20):
+        if not bucket.wait(moment):
+            bucket.take()
+            passed.append(moment)
+    assert passed == [0, 1, 2, 3, 4, 6, 8, 10, 12, 14, 16, 18]
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::"])
+def test_where_others_can_look_a_token_is_needed(host):
+    with pytest.raises(ServiceError, match="--token"):
+        Server(host=host, port=0)
+
+
+def test_a_token_that_could_be_guessed_is_refused():
+    with pytest.raises(ServiceError, match="can be guessed"):
+        Server(port=0, token="secret")
+
+
+def test_a_port_that_is_taken_is_named(page):
+    port = urlsplit(str(page.base_url)).port
+    with pytest.raises(ServiceError, match=rf"127.0.0.1:{port} .* another --port"):
+        Server(port=port)
