@@ -88,7 +88,7 @@ class Camera:
     def _answer(self) -> Any:
         try:
             return self._pipe.recv()
-        except EOFError:
+        except (EOFError, ConnectionError):
             raise ServiceError("the camera of the load test has died: its last words are above") from None
 
 

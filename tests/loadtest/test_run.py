@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
+import sys
 import time
 from multiprocessing import resource_tracker
 
@@ -70,6 +72,20 @@ def test_chaos_spares_whom_a_supervisor_would_give_up(sleepers):
             stream.children[kill.process] = stream.start()
     names = [kill.process for kill in chaos.kills]
     assert {name: names.count(name) for name in names} == {"detector": 4, "compressor": 4, "trainer": 4}
+
+
+def test_ctrl_c_reaches_not_even_the_first_child():
+    script = """if True:
+        import time
+        from catstream.loadtest.children import SPAWN, start
+        child = SPAWN.Process(target=time.sleep, args=(600,))
+        start(child)
+        print(open(f"/proc/{child.pid}/status").read())
+        child.kill()
+    """
+    status = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    blocked = int(re.search(r"SigBlk:\s*(\w+)", status.stdout)[1], 16)
+    assert blocked & 1 << (signal.SIGINT - 1)
 
 
 def test_usage_tells_who_is_busy(sleepers):
