@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format docs settings bench lock clean
+.PHONY: help setup demo test test-slow lint format docs settings bench lock clean fuzz
 
 help:  ## say what there is
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -53,6 +53,9 @@ settings: $(READY)  ## write the table of docs/settings.md anew
 
 bench: $(READY)  ## speed, memory and growth: a quarter of an hour
 	for name in startup throughput kernels wire endurance speed; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+
+fuzz: $(READY)  ## a million hostile inputs for each decoder: half an hour
+	$(BIN)/python benchmarks/fuzz.py
 
 lock:  ## pin the newest versions of everything in requirements.lock, with their hashes
 	$(PYTHON) -m venv --clear build/lock

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from catstream.compression.compressor import Compressor
 from catstream.errors import ServiceError
-from catstream.messages import End, Position
+from catstream.messages import End, Features, Position
 from catstream.recording.file import RecordingWriter
 from catstream.services.loop import Process
 from catstream.services.recorder import Recorder
@@ -44,12 +44,16 @@ def main(process: Process, state: Path | None, record: Path | None = None) -> No
         stored, saved = _position(compressor), time.monotonic()
         return stored
 
+    def check(message: Features | End) -> None:
+        if isinstance(message, Features):
+            compressor.check(message)
+
     with ExitStack() as stack:
         recorder = None
         if record is not None:
             writer = stack.enter_context(RecordingWriter(record, process.run, resume=True))
             recorder = stack.enter_context(Recorder(writer, process.endpoint))
-        features = stack.enter_context(Receiver("features", process.endpoint, stored, settings.window, store))
+        features = stack.enter_context(Receiver("features", process.endpoint, stored, settings.window, store, check))
         samples = stack.enter_context(Publisher("samples", process.endpoint))
 
         def counters() -> dict[str, float]:

@@ -51,6 +51,16 @@ class Compressor:
         self.last_sample: Sample | None = None
         self._sampled_leaves = 0
 
+    def check(self, features: Features) -> None:
+        """Raise ProtocolError where rows have another length than those before: they are of another stream."""
+        width = max(self.trees["loss"].width, self.trees["extent"].width) - 2
+        if width > 0 and len(features.rows) + len(features.extents) and features.rows.shape[1] != width:
+            raise ProtocolError(
+                f"features rows have length {features.rows.shape[1]}, those before {width}: "
+                "start all processes with the same catstream",
+                "width",
+            )
+
     def take(self, features: Features) -> Sample | None:
         """Store one frame's features; a sample where the trees have grown enough since the last.
 

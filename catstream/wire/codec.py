@@ -118,21 +118,25 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
             max_ext_len=0,
         )
     except (ValueError, msgpack.exceptions.UnpackException) as error:
-        raise ProtocolError(f"expected {expected}, got {len(data)} bytes that are not its msgpack: {error}") from None
+        raise ProtocolError(
+            f"expected {expected}, got {len(data)} bytes that are not its msgpack: {error}", "msgpack"
+        ) from None
     if not isinstance(envelope, list) or len(envelope) != 3:
-        raise ProtocolError(f"expected {expected} as [version, kind, fields], got something else in msgpack")
+        raise ProtocolError(
+            f"expected {expected} as [version, kind, fields], got something else in msgpack", "envelope"
+        )
     version, name, fields = envelope
     if version != VERSION:
         raise ProtocolError(
-            f"expected version {VERSION} of the protocol, got {_brief(version)}: run the same catstream"
+            f"expected version {VERSION} of the protocol, got {_brief(version)}: run the same catstream", "version"
         )
     kind = KINDS.get(name) if isinstance(name, str) else None
     if kind not in kinds:
-        raise ProtocolError(f"expected {expected}, got {_brief(name)}")
+        raise ProtocolError(f"expected {expected}, got {_brief(name)}", "kind")
     try:
         message: Any = msgspec.convert(fields, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
-        raise ProtocolError(f"{name}: {error}") from None
+        raise ProtocolError(f"{name}: {error}", "type") from None
     _check(message)
     return message
 
@@ -192,13 +196,13 @@ def _check(message: Any) -> None:
     if isinstance(message, Features):
         shares = np.concatenate([message.labels, message.fits])
         if not ((shares >= 0).all() and (shares <= 1).all() and (message.weights > 0).all()):
-            raise ProtocolError("features: expected labels and fits from 0 to 1 and weights above 0")
+            raise ProtocolError("features: expected labels and fits from 0 to 1 and weights above 0", "range")
     if isinstance(message, Sample):
         d = len(message.object.mean)
         trees = (message.background, message.loss, message.extent)
         widths = [len(tree.mean) if tree is not None else d + 2 for tree in trees]
         if widths != [d, d + 2, d + 2]:
-            raise ProtocolError(f"sample: expected trees of d, d, d + 2 and d + 2 columns, got {[d, *widths]}")
+            raise ProtocolError(f"sample: expected trees of d, d, d + 2 and d + 2 columns, got {[d, *widths]}", "width")
     if isinstance(message, Preview):
         if not (message.jpeg.startswith(_JPEG) and len(message.jpeg) <= _LONGEST_PICTURE):
             raise ProtocolError(
@@ -220,17 +224,20 @@ def _check_array(array: np.ndarray, kind: type, name: str, where: str, lengths: 
         )
     if array.ndim != len(shape) or array.shape != expected or array.dtype != dtype:
         letters = ", ".join(map(str, shape))
-        raise ProtocolError(f"{where}: expected {dtype} ({letters}), got {array.dtype} {array.shape} with {lengths}")
+        raise ProtocolError(
+            f"{where}: expected {dtype} ({letters}), got {array.dtype} {array.shape} with {lengths}",
+            "dtype" if array.dtype != dtype else "shape",
+        )
     if (kind, name) not in _MAY_BE_NAN and not np.isfinite(array).all():
-        raise ProtocolError(f"{where}: holds numbers that are not finite")
+        raise ProtocolError(f"{where}: holds numbers that are not finite", "finite")
 
 
 def _check_numbers(value: Any, where: str) -> None:
     if isinstance(value, Box) and not (value.w > 0 and value.h > 0):
-        raise ProtocolError(f"{where}: expected a width and a height above 0, got {value}")
+        raise ProtocolError(f"{where}: expected a width and a height above 0, got {value}", "range")
     numbers = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
     for number in numbers:
         if isinstance(number, float) and not math.isfinite(number):
-            raise ProtocolError(f"{where}: expected a finite number, got {number}")
+            raise ProtocolError(f"{where}: expected a finite number, got {number}", "finite")
         if isinstance(number, int) and not 0 <= number <= _LARGEST_INTEGER:
-            raise ProtocolError(f"{where}: expected a whole number from 0 to 2**53, got {number}")
+            raise ProtocolError(f"{where}: expected a whole number from 0 to 2**53, got {number}", "range")

@@ -230,7 +230,7 @@ def _read(path: Path) -> dict[str, object]:
             f"cannot read {path} ({error.strerror}): a folder of keys is made with `catstream keys new` for a "
             "pipeline, with `catstream keys allow` for a client"
         ) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ServiceError(f"{path} is damaged ({error}): make new keys") from None
 
 

@@ -45,6 +45,8 @@ _LINGER = 2000  # milliseconds that a closed socket still has for its last messa
 _NEWEST = 8  # messages of a burst that are on their way at once where only the newest counts
 _SAMPLES = 65536  # that a sender remembers, at most one a message: as many as `lag_frames` may be
 _COMMANDS = 64  # that wait, or were answered last, and that are taken in at once
+_CHANGES = 1000  # readers that come or go, taken in at once
+_LONGEST_WISH = 4096  # bytes of what a reader says: who it is, and what it subscribes to
 _HANDSHAKE = 5000  # milliseconds that a peer has to say who it is
 
 #: What ZeroMQ tells of a connection, where it is asked to.
@@ -110,13 +112,29 @@ class _Socket:
         for sender in self.channel.senders:
             self._socket.connect(self._endpoint.address(self.channel, sender))
 
-    def _decode(self, data: bytes | memoryview, *kinds: type) -> Any:
+    def _decode(self, data: bytes | memoryview, *kinds: type, check: Callable[[Any], None] | None = None) -> Any:
         """The message, or None for what a stranger sent: counted, said once, dropped."""
         try:
-            return decode(data, *kinds)
+            message = decode(data, *kinds)
+            if check is not None:
+                check(message)
         except ProtocolError as error:
             self._drop(error.reason, error)
             return None
+        return message
+
+    def _from_peer(self) -> tuple[bytes, memoryview | None]:
+        """Who sends, and what, of a ROUTER's next message; None where it has not the one part that all have."""
+        peer = self._socket.recv()
+        data = self._socket.recv(copy=False).buffer
+        parts = 1
+        while self._socket.rcvmore:  # one by one: a stranger may send any number
+            self._socket.recv(copy=False)
+            parts += 1
+        if parts > 1:
+            self._drop("parts", f"it has {parts} parts")
+            return peer, None
+        return peer, data
 
     def _drop(self, reason: str, text: object) -> None:
         """Count a message that is not what the channel carries, and say so once."""
@@ -261,6 +279,9 @@ class Sender(_Socket):
                 f"the receiver of {self.channel.name} has stored message {answer.seq}, only {self.sent} were sent: "
                 "it holds another stream, start it anew or this process with --resume"
             )
+        if isinstance(answer, Stored) and (answer.seq < self.stored or answer.taken < self.taken):
+            self._drop("acknowledgement", f"it was said before that {self.taken} were taken and {self.stored} stored")
+            return
         self._heard = monotonic()
         if answer.version > self.version:
             self.version = answer.version
@@ -297,6 +318,7 @@ class Receiver(_Socket):
     position : where the stream goes on: the next message taken is the one after `position.seq`
     store : stores all that was taken, and returns where that is; called where a sender asks, so that one
         that starts anew has nothing to repeat. Without it the answer is what was stored last
+    check : raises ProtocolError for a message that is not of this stream
     """
 
     def __init__(
@@ -306,11 +328,12 @@ class Receiver(_Socket):
         position: Position,
         window: int,
         store: Callable[[], Position] | None = None,
+        check: Callable[[Any], None] | None = None,
     ) -> None:
         super().__init__(zmq.ROUTER, channel, endpoint, depth=window + 1)
         self.taken = position.seq
-        self._position, self._store = position, store
-        self._peer: bytes | None = None
+        self._position, self._store, self._check, self._window = position, store, check, window
+        self._peer: bytes | None = None  # whose message was taken last: what is stored concerns nobody else
         self._asked = 0.0  # when a message was last found missing
         self._ended = False  # whether the sender has sent its end
         self._bind()
@@ -319,26 +342,28 @@ class Receiver(_Socket):
         """The next message in order, or None where none came in time."""
         if not self._wait(seconds):
             return None
-        # Two parts, who and what; a stranger may send any number.
-        peer, *parts = self._socket.recv_multipart(copy=False)
-        self._peer = peer.bytes
-        if len(parts) == 1 and not len(parts[0].buffer):
+        peer, data = self._from_peer()
+        if data is None:
+            return None
+        if not len(data):
             if self._store is not None and self._position.seq < self.taken:
                 self._position = self._store()
-            self._answer(self._position)
+            self._answer(peer, self._position)
             return None
-        message = self._decode(parts[0].buffer if len(parts) == 1 else b"", *self.channel.messages)
+        message = self._decode(data, *self.channel.messages, check=self._check)
         if message is None:
             return None
         if message.seq <= self.taken:  # it was asked and sent all again: it does not know what is taken
-            self.acknowledge(self._position)
+            self._answer(peer, Stored(self._position.seq, self.taken, self._position.version))
             return None
         if message.seq > self.taken + 1:
+            if message.seq > self.taken + self._window + 1:  # more than a sender may have on its way
+                self._drop("sequence", f"message {message.seq} came after {self.taken}")
             if monotonic() - self._asked > _PATIENCE:
                 self._asked = monotonic()
-                self._answer(self._position)
+                self._answer(peer, self._position)
             return None
-        self._asked = 0.0
+        self._asked, self._peer = 0.0, peer
         self.taken = message.seq
         if isinstance(message, End):
             self._ended, self._left = True, False
@@ -347,7 +372,8 @@ class Receiver(_Socket):
     def acknowledge(self, position: Position) -> None:
         """Say that all is taken up to the last message, and stored up to `position.seq`."""
         self._position = position
-        self._answer(Stored(position.seq, self.taken, position.version))
+        if self._peer is not None:
+            self._answer(self._peer, Stored(position.seq, self.taken, position.version))
 
     def close(self) -> None:
         """Close, after the sender where it has sent its end: a connection that breaks may cost it the last answer."""
@@ -355,10 +381,9 @@ class Receiver(_Socket):
             self._look(_LINGER, until=zmq.EVENT_DISCONNECTED)
         super().close()
 
-    def _answer(self, message: Stored | Position) -> None:
-        if self._peer is not None:
-            with contextlib.suppress(zmq.Again):  # a sender that does not listen asks again
-                self._socket.send_multipart([self._peer, encode(message)], zmq.NOBLOCK)
+    def _answer(self, peer: bytes, message: Stored | Position) -> None:
+        with contextlib.suppress(zmq.Again):  # a sender that does not listen asks again
+            self._socket.send_multipart([peer, encode(message)], zmq.NOBLOCK)
 
 
 class Publisher(_Socket):
@@ -374,6 +399,8 @@ class Publisher(_Socket):
         row = CHANNELS[channel]
         newest = row.keeps == "newest"
         super().__init__(zmq.XPUB, channel, endpoint, depth=_NEWEST if newest else row.depth)
+        self._socket.maxmsgsize = _LONGEST_WISH
+        self._openings = {b"", *map(opening, row.messages)}  # what readers may subscribe to
         self._wanted: set[bytes] = set()  # what messages must begin with for somebody to get them
         self._last: bytes | None = None if greeting is None else encode(greeting)
         self._repeat = float("inf")  # when the last message is due once more
@@ -401,12 +428,14 @@ class Publisher(_Socket):
         """Send the greeting, or the last message, to those who came since or missed it; call it now and then."""
         self._look()
         late = monotonic() >= self._repeat
-        while True:
+        for _ in range(_CHANGES):  # more wait for the next turn: a flood stops nothing
             try:
                 change = self._socket.recv(zmq.NOBLOCK)
             except zmq.Again:
                 break
-            if change.startswith(b"\x01"):
+            if change[1:] not in self._openings:
+                self._drop("subscription", "readers subscribe to everything, or to one kind")
+            elif change.startswith(b"\x01"):
                 late = True
                 self._wanted.add(change[1:])
             else:  # the last one who wanted this has left
@@ -493,16 +522,16 @@ class Responder(_Socket):
         for _ in range(_COMMANDS):  # more wait for the next turn: a flood stops nothing
             if not self._wait(0):
                 break
-            peer, *parts = self._socket.recv_multipart(copy=False)  # a stranger may send any number
-            command = self._decode(parts[0].buffer if len(parts) == 1 else b"", Command)
+            peer, data = self._from_peer()
+            command = self._decode(data, Command) if data is not None else None
             if command is None:
                 continue
             if (answer := self._answers.get(command.id)) is not None:
-                self._send(peer.bytes, answer)
+                self._send(peer, answer)
             elif command.id in self._asking or len(self._asking) < _COMMANDS:
                 if command.id not in self._asking:
                     commands.append(command)
-                self._asking[command.id] = peer.bytes
+                self._asking[command.id] = peer
         return commands
 
     def answer(self, answer: Answer) -> None:

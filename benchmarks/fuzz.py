@@ -1,0 +1,264 @@
+"""Hostile bytes: a million inputs for each decoder, led by coverage, each with a limit of time and of memory.
+
+Each decoder has a process of its own under atheris (libFuzzer), which begins with good messages or files and changes
+them where that leads somewhere new. An input is taken, or refused by the error that is meant for it. Another error,
+an input that takes longer than 5 seconds, or 64 MB more than after the first thousandth of the inputs ends the
+process, and with it this program: it names the file that holds the input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import atheris
+import numpy as np
+from table import Table, command, publish
+
+with atheris.instrument_imports(include=["catstream"]):
+    from catstream.box import Box
+    from catstream.compression import storage
+    from catstream.compression.compressor import Compressor
+    from catstream.errors import CatstreamError, ProtocolError, RecordingError, ServiceError, SettingsError
+    from catstream.messages import (
+        Answer,
+        Bearings,
+        Command,
+        End,
+        Features,
+        Health,
+        Model,
+        Motion,
+        Position,
+        Preview,
+        Run,
+        Sample,
+        Stored,
+        Summary,
+        Track,
+    )
+    from catstream.recording.file import Recording, RecordingWriter
+    from catstream.settings import Settings
+    from catstream.wire.codec import KINDS, decode, encode
+    from catstream.wire.keys import Keys, create
+
+SECONDS = 5  # an input may take
+MEGABYTES = 64  # resident memory may grow by
+LONGEST = 4096  # bytes of an input, or as long as the longest seed
+SETTINGS = Settings(coreset_size=2)
+
+COLUMNS = ("decoder", "inputs", "taken", "refused", "inputs a second", "MB more", "crashes", "hangs")
+
+
+class Decoder:
+    """What takes bytes from outside.
+
+    take   decodes an input
+    error  what it refuses one with
+    seeds  good inputs
+    """
+
+    def __init__(self, take: Callable[[bytes], Any], error: type[CatstreamError], *seeds: bytes) -> None:
+        self.take, self.error, self.seeds = take, error, seeds
+
+
+def messages() -> dict[str, tuple[Any, ...]]:
+    """Good messages of each kind."""
+
+    def array(*shape: int, dtype: str = "<f4") -> np.ndarray:
+        return np.linspace(0.1, 0.9, int(np.prod(shape)), dtype=dtype).reshape(shape)
+
+    def summary(columns: int) -> Summary:
+        return Summary(array(4, columns), array(columns), 40, (3, 1, 0))
+
+    box = Box(4.5, 3.0, 20.0, 10.0)
+    motion = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
+    bearings = Bearings("present", box, box, 0.9, False, motion, array(5, 4, dtype="<f8"))
+    none = np.empty((0, 5), "<f4")
+    return {
+        "answer": (Answer("7f", True, "followed from frame 9 on", 9, box, 4),),
+        "command": (Command("7f", "set-box", box, True), Command("80", "stop")),
+        "end": (End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),),
+        "features": (
+            Features(3, 2, 0.08, box, array(3, 5), array(3), array(3), array(1, 5), array(1), bearings),
+            Features(4, 3, 0.12, None, none, array(0), array(0), none, array(0)),
+        ),
+        "health": (Health("trainer", 1.7e9, {"version": 4.0}),),
+        "model": (Model(4, 20, array(5), -0.25, motion, array(5)), Model(1, 0, array(5), 0.0, None)),
+        "position": (Position(5, 4, box, 2, bearings), Position()),
+        "preview": (Preview(2, 1280, 720, box, b"\xff\xd8\xff\xe0"),),
+        "run": (Run("0.1.0", {"coreset_size": "64", "classifier": "joint"}),),
+        "sample": (Sample(4, 20, summary(5), summary(5), summary(7), summary(7), array(2, 2, dtype="<f8")),),
+        "stored": (Stored(5, 7, 2),),
+        "track": (
+            Track(3, 2, 0.08, "present", box, 0.75, 4, 1234.5),
+            Track(1, 0, 0.0, "absent", None, 0.0, 0),
+        ),
+    }
+
+
+def decoders(folder: Path) -> dict[str, Decoder]:
+    """All that take bytes from outside: each kind of message, and each kind of file.
+
+    Parameters
+    ----------
+    folder : for the files
+    """
+    seeds = messages()
+    found = {
+        name: Decoder(lambda data, kind=kind: encode(decode(data, kind)), ProtocolError, *map(encode, seeds[name]))
+        for name, kind in KINDS.items()
+    }
+    compressor = Compressor(SETTINGS)
+    for seq in range(1, 12):
+        rows = np.random.default_rng(seq).normal(size=(4, 6)).astype("f4")
+        labels, weights = np.array([1, 0, 1, 0], "f4"), np.ones(4, "f4")
+        compressor.take(Features(seq, seq, 0.0, Box(1.0, 2.0, 9.0, 9.0), rows, labels, weights, rows[:2], labels[:2]))
+    compressor.save(folder / "checkpoint")
+    with RecordingWriter(folder / "recording", Run("0.1.0", {})) as writer:
+        for kind in (Track, Features, Model, End):
+            writer.write(seeds[kind.__name__.lower()][0])
+    create(folder / "keys")
+    found |= {
+        "any message": Decoder(
+            lambda data: encode(decode(data, *KINDS.values())),
+            ProtocolError,
+            *(encode(message) for several in seeds.values() for message in several),
+        ),
+        "storage": filed(folder / "a", storage.read, ProtocolError, (folder / "checkpoint").read_bytes()),
+        "checkpoint": filed(folder / "b", forged, ProtocolError, (folder / "checkpoint").read_bytes()),
+        "recording": filed(
+            folder / "c",
+            lambda path: list(Recording(path).messages()),
+            RecordingError,
+            (folder / "recording").read_bytes(),
+        ),
+        "settings": filed(
+            folder / "d.toml",
+            lambda path: Settings.load(file=path, environment={}),
+            SettingsError,
+            b"coreset_size = 128\nclassifier = 'joint'\nlockstep = true\n",
+        ),
+        "keys": filed(
+            folder / "keys" / "client.key",
+            lambda _: Keys.load(folder / "keys"),
+            ServiceError,
+            (folder / "keys" / "client.key").read_bytes(),
+        ),
+    }
+    return found
+
+
+def forged(path: Path) -> None:
+    """Load a checkpoint whose checksum fits, as who writes one on purpose sees to."""
+    with patch.object(storage, "_checksum", lambda *_: Anything()):
+        Compressor.load(path, SETTINGS)
+
+
+class Anything:
+    """Equal to all."""
+
+    def __ne__(self, _: object) -> bool:
+        return False
+
+
+def filed(path: Path, read: Callable[[Path], Any], error: type[CatstreamError], seed: bytes) -> Decoder:
+    """A decoder of what is in a file."""
+    path.touch(mode=0o600)
+
+    def take(data: bytes) -> None:
+        path.write_bytes(data)
+        read(path)
+
+    return Decoder(take, error, seed)
+
+
+class Trial:
+    """One decoder, and the count of what became of its inputs; in a process of its own.
+
+    totals : file that holds the count, written now and then
+    """
+
+    def __init__(self, decoder: Decoder, inputs: int, totals: Path) -> None:
+        self._decoder, self._inputs, self._totals = decoder, inputs, totals
+        self._taken = self._refused = 0
+        self._before = self._most = 0.0
+
+    def __call__(self, data: bytes) -> None:
+        try:
+            self._decoder.take(data)
+            self._taken += 1
+        except self._decoder.error:
+            self._refused += 1
+        count = self._taken + self._refused
+        if count % max(1, self._inputs // 1000) == 0:
+            resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+            self._before = self._before or resident
+            self._most = max(self._most, resident - self._before)
+            self._totals.write_text(json.dumps([count, self._taken, self._refused, self._most]))
+            if self._most > MEGABYTES:
+                raise MemoryError(f"{self._most:.0f} MB more than after the first inputs")
+
+
+def trial(name: str, inputs: int, folder: Path) -> None:
+    """Be the process of one decoder; does not return."""
+    decoder = decoders(folder)[name]
+    corpus = folder / "corpus"
+    corpus.mkdir()
+    for number, seed in enumerate(decoder.seeds):
+        (corpus / str(number)).write_bytes(seed)
+    limits = [
+        f"-runs={inputs}",
+        f"-timeout={SECONDS}",
+        f"-max_len={max(LONGEST, *map(len, decoder.seeds))}",
+        "-rss_limit_mb=0",
+        "-seed=1",
+    ]
+    quiet = ["-print_final_stats=0", "-verbosity=0", f"-artifact_prefix={Path.cwd()}/{name.replace(' ', '-')}-"]
+    atheris.Setup([sys.argv[0], *limits, *quiet, str(corpus)], Trial(decoder, inputs, folder / "totals"))
+    atheris.Fuzz()
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    inputs = 1000 if options.quick else options.inputs
+    rows = []
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None) as home:
+        (Path(home) / "names").mkdir()
+        names = [name for name in decoders(Path(home) / "names") if not options.only or name in options.only]
+        for number, name in enumerate(names[:: 5 if options.quick else 1]):
+            folder = Path(home) / str(number)
+            folder.mkdir()
+            command = [sys.executable, __file__, "--trial", name, "--inputs", str(inputs), "--folder", str(folder)]
+            before = os.times().children_user
+            done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+            seconds = os.times().children_user - before
+            if done.returncode:
+                raise SystemExit(f"{name}: {done.stderr[-4000:]}")
+            count, taken, refused, megabytes = json.loads((folder / "totals").read_text())
+            rows.append((name, count, taken, refused, round(count / max(seconds, 0.01)), round(megabytes, 1), 0, 0))
+            print(f"{name}: {count} inputs, {seconds:.0f} s", file=sys.stderr)
+    note = (
+        f"an input is at most {LONGEST} bytes, or as long as a good one; "
+        f"a crash, one of {SECONDS} s, or {MEGABYTES} MB more ends the run"
+    )
+    yield Table("what became of hostile inputs", COLUMNS, rows, note)
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--inputs", type=int, default=1_000_000, help="for each decoder (default: %(default)s)")
+    parser.add_argument("--only", nargs="*", metavar="NAME", help="these decoders")
+    parser.add_argument("--trial", metavar="NAME", help=argparse.SUPPRESS)
+    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.trial:
+        trial(options.trial, options.inputs, options.folder)
+    publish(figures(options), options.json)

@@ -1,0 +1,195 @@
+"""What a stranger sends on any channel is counted by what is wrong with it, and dropped: nothing is trusted."""
+
+from __future__ import annotations
+
+import struct
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+
+from catstream.compression.compressor import Compressor
+from catstream.errors import ProtocolError
+from catstream.messages import Command, End, Features, Health, Model, Position, Preview, Run, Sample, Stored, Track
+from catstream.settings import Settings
+from catstream.wire.channels import CHANNELS
+from catstream.wire.codec import encode
+from catstream.wire.refusals import refusals
+from catstream.wire.sockets import Publisher, Receiver, Responder, Sender, Subscriber
+
+WINDOW = 4
+PUBLISHED = [name for name, channel in CHANNELS.items() if not channel.acknowledged]
+
+
+def features(seq, width=5, rows=3):
+    return Features(
+        seq, seq, 0.0, None, np.ones((rows, width), "f4"), np.ones(rows, "f4"), np.ones(rows, "f4"),
+        np.ones((0, width), "f4"), np.ones(0, "f4"),
+    )  # fmt: skip
+
+
+def changed(message, **fields):
+    """A message as bytes, with some of its fields replaced on the wire."""
+    version, kind, plain = msgpack.unpackb(encode(message))
+    return msgpack.packb([version, kind, plain | fields])
+
+
+def rows(dtype, shape, number=1.0):
+    data = struct.pack("<f" if dtype == "<f4" else "<d", number) * int(np.prod(shape))
+    return {"dtype": dtype, "shape": shape, "data": data}
+
+
+#: What is wrong with a message of features, by the reason that health counts it under.
+WRONG = {
+    "msgpack": [b"GET / HTTP/1.1"],
+    "envelope": [msgpack.packb({"seq": 1})],
+    "version": [msgpack.packb([2, "features", {}])],
+    "kind": [encode(Health("trainer", 0.0))],
+    "type": [changed(features(1), seq="1")],
+    "dtype": [changed(features(1), rows=rows("<f8", [3, 5]))],
+    "shape": [changed(features(1), rows=rows("<f4", [2, 5]))],
+    "width": [encode(features(2, width=6))],
+    "finite": [changed(features(1), rows=rows("<f4", [3, 5], float("nan")))],
+    "range": [changed(features(1), labels=rows("<f4", [3], 2.0))],
+    "sequence": [encode(features(2**40))],
+    "parts": [b"", encode(features(2))],
+}
+
+
+def refused(reason):
+    return refusals().get(f"refused_{reason}", 0)
+
+
+@pytest.fixture
+def stranger(endpoint):
+    """A raw socket of a given kind at a channel's address."""
+    sockets = []
+
+    def connect(kind, name):
+        sockets.append(zmq.Context.instance().socket(kind))
+        sockets[-1].linger = 0
+        sockets[-1].connect(endpoint.address(CHANNELS[name]))
+        return sockets[-1]
+
+    yield connect
+    for socket in sockets:
+        socket.close()
+
+
+@pytest.mark.parametrize("reason", WRONG)
+def test_a_wrong_message_is_counted_by_what_is_wrong_and_costs_the_true_sender_nothing(
+    reason, endpoint, stranger, until
+):
+    compressor, before, taken = Compressor(Settings(coreset_size=2)), refused(reason), []
+    with (
+        Receiver("features", endpoint, Position(), WINDOW, check=compressor.check) as receiver,
+        Sender("features", endpoint, WINDOW) as sender,
+    ):
+
+        def turn():
+            sender.send(features(sender.sent + 1)) if sender.sent < len(taken) + 1 else sender.listen(0.01)
+            if (message := receiver.receive(0.01)) is not None:
+                taken.append(message.seq)
+                compressor.take(message)
+                receiver.acknowledge(Position(message.seq))
+
+        until(lambda: sender.stored >= 1, turn)
+        stranger(zmq.DEALER, "features").send_multipart(WRONG[reason])
+        until(lambda: refused(reason) == before + 1, turn)
+        until(lambda: sender.stored > 5, turn)
+    assert taken == list(range(1, len(taken) + 1)), "each once, in order"
+    assert compressor.seq == taken[-1]
+    assert refusals()["refused"] >= 1
+
+
+def test_a_stranger_hears_only_what_it_asked_and_the_sender_all_that_is_its_own(endpoint, stranger, until):
+    taken = []
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+        other = stranger(zmq.DEALER, "results")
+
+        def turn():
+            if (message := receiver.receive(0.01)) is not None:
+                taken.append(message.seq)
+            sender.listen(0)
+
+        sender.send(End(1, "the source came to its end"))
+        until(lambda: taken == [1], turn)
+        other.send(b"")
+        until(lambda: other.poll(0), turn)
+        other.recv()
+        other.send(encode(End(1, "replayed")))
+        until(lambda: other.poll(0), turn)
+        other.recv()
+        receiver.acknowledge(Position(1))  # stored only now
+        until(lambda: sender.stored == 1, lambda: sender.listen(0.01))
+        assert not other.poll(50)
+
+
+def test_parts_without_number_are_one_refused_message(endpoint, stranger, until):
+    before = refused("parts")
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver:
+        stranger(zmq.DEALER, "results").send_multipart([b"x"] * 20_000)
+        until(lambda: refused("parts") == before + 1, lambda: receiver.receive(0.05))
+
+
+def test_an_acknowledgement_that_comes_again_takes_nothing_back(endpoint, until):
+    before = refused("acknowledgement")
+    with zmq.Context.instance().socket(zmq.ROUTER) as receiver, Sender("results", endpoint, WINDOW) as sender:
+        receiver.bind(endpoint.address(CHANNELS["results"]))
+        for seq in (1, 2):
+            sender.send(Track(seq, seq, 0.0, "absent", None, 0.0, 0))
+        until(lambda: receiver.poll(10), lambda: sender.listen(0))
+        peer = receiver.recv_multipart()[0]
+        for answer in (Stored(1, 1), Stored(2, 2), Stored(1, 1)):
+            receiver.send_multipart([peer, encode(answer)])
+        until(lambda: refused("acknowledgement") == before + 1, lambda: sender.listen(0.01))
+        assert (sender.stored, sender.taken) == (2, 2)
+        receiver.send_multipart([peer, encode(Position(9))])
+        with pytest.raises(ProtocolError, match="another stream"):
+            until(lambda: False, lambda: sender.listen(0.01))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_what_is_said_to_a_publisher_is_counted_and_its_readers_go_on(name, endpoint, stranger, until):
+    said = {
+        Track: Track(1, 0, 0.0, "absent", None, 0.0, 0),
+        Sample: End(1, "nothing was learned"),
+        Model: Model(1, 1, np.ones(3, np.float32), 0.0),
+        Health: Health("detector", 0.0),
+        Preview: Preview(1, 64, 48, None, b"\xff\xd8\xff"),
+        Run: End(1, "nothing was learned"),
+    }[CHANNELS[name].messages[0]]
+    before, heard = refused("subscription"), []
+    with (
+        Publisher(name, endpoint, CHANNELS[name].senders[0]) as publisher,
+        Subscriber(name, endpoint) as reader,
+    ):
+        other = stranger(zmq.XSUB, name)
+        for junk in (b"GET / HTTP/1.1", b"\x01topic", encode(End(9, "forged"))):
+            other.send(junk)
+        other.send(b"\x01" + bytes(10_000))  # above the limit: ZeroMQ ends the connection
+        until(
+            lambda: refused("subscription") >= before + 3 and heard,
+            lambda: (publisher.send(said), heard.extend(reader.waiting())),
+        )
+    assert {type(message) for message in heard} == {type(said)}
+
+
+def test_a_flood_of_commands_is_counted_and_the_next_one_is_heard(endpoint, stranger, until):
+    before, heard = refused("msgpack"), []
+    with Responder("control", endpoint) as responder:
+        other = stranger(zmq.DEALER, "control")
+        for _ in range(50):
+            other.send(b"\xc1")
+        stranger(zmq.DEALER, "control").send(encode(Command("1", "stop")))
+        until(lambda: refused("msgpack") == before + 50 and heard, lambda: heard.extend(responder.waiting()))
+    assert [command.verb for command in heard] == ["stop"]
+
+
+def test_a_message_above_the_limit_ends_its_connection_and_is_counted_so(endpoint, stranger, until):
+    before = refusals().get("disconnected", 0)
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver:
+        stranger(zmq.DEALER, "results").send(bytes(CHANNELS["results"].limit + 1))
+        until(lambda: refusals().get("disconnected", 0) > before, lambda: receiver.receive(0.05))
+    assert receiver.taken == 0
