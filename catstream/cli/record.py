@@ -31,7 +31,7 @@ def record(output: Path, endpoint: str, keys: str) -> None:
     """Keep what a running pipeline says, in one file, until it ends or Ctrl-C.
 
     Features, models, tracks and health are written as they come, with the
-    settings that the pipeline runs with; about half a megabyte a frame. A crash
+    settings that the pipeline runs with; about 0.4 MB a frame. A crash
     at any moment leaves a file that can be read up to there.
 
     The pipeline does not wait: what came before this, or faster than it was

@@ -169,10 +169,9 @@ class Recording:
                 self.size = file.tell()
             self.torn = file.seek(0, os.SEEK_END) - self.size
         self.counts[Features], self.counts[Model] = len(self._taken), len(self._models)
-        last = max([*tracks, *(seq for seq, _ in self._taken[-1:])], default=0)
-        if self.end is not None:
-            last = self.end.seq - 1
-        self.missing = {Features: last - len(self._taken), Track: last - len(tracks)}
+        seqs = {Features: {seq for seq, _ in self._taken}, Track: tracks}
+        last = {kind: self.end.seq - 1 if self.end else max(own, default=0) for kind, own in seqs.items()}
+        self.missing = {kind: last[kind] - len(own) for kind, own in seqs.items()}
         first = next(self.messages(), (0.0, None))[1]
         if not isinstance(first, Run):
             raise RecordingError(f"{path} does not say what it is a recording of: it was torn before it began")

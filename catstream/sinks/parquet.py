@@ -46,7 +46,7 @@ def export(database: Path, path: Path) -> int:
     kinds = {"INTEGER": arrow.int64(), "REAL": arrow.float64(), "TEXT": arrow.string()}
     part, rows = path.with_name(path.name + ".part"), 0
     try:
-        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as tracks:
+        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=rw", uri=True)) as tracks:
             names = tracks.execute("SELECT name, type FROM pragma_table_info('tracks')").fetchall()
             schema = arrow.schema([(name, kinds[kind]) for name, kind in names])
             cursor = tracks.execute("SELECT * FROM tracks ORDER BY frame")

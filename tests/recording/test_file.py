@@ -58,6 +58,7 @@ def test_a_crash_at_any_byte_leaves_all_records_before_it(written, tmp_path):
         kept = sum(end <= size for end in ends[1:])
         assert [type(message) for message in read(cut)[1:]] == [type(message) for message in messages[:kept]]
         assert Recording(cut).torn == size - ends[kept]
+        assert not any(Recording(cut).missing.values())
 
 
 @pytest.mark.parametrize("size", [0, 5, 8, 60, 500])
