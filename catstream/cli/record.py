@@ -56,7 +56,8 @@ def _record(output: Path, place: Endpoint, console: Console) -> None:
         status = stack.enter_context(console.status("waiting for the settings of the pipeline"))
         lessons = stack.enter_context(Subscriber("lessons", place))
         while not isinstance(run := lessons.receive(0.1), Run):
-            pass
+            if isinstance(run, End):
+                raise RecordingError(f"nothing was recorded, as the pipeline has just ended: {run.reason}")
         writer = stack.enter_context(RecordingWriter(output, run))
         recorder = stack.enter_context(Recorder(writer, place))
         seq, last, deadline = 0, None, float("inf")
