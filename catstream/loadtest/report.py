@@ -34,7 +34,7 @@ def write_report(path: Path, trial: Trial) -> Path:
     result = trial.result
     plan = result.plan
     about = (
-        f"{plan}, {result.seconds:.1f} s{', interrupted' if result.interrupted else ''}. Latency counts from the "
+        f"{plan}, {result.seconds:.1f} s{', interrupted' if trial.interrupted else ''}. Latency counts from the "
         "moment at which a frame was due; a skipped one waits for the track of a newer one."
     )
     return write_page(
@@ -74,20 +74,24 @@ def _limits(trial: Trial) -> str:
 def _steps(trial: Trial) -> str:
     if not trial.searched:
         return ""
-    rows = [
-        [
-            f"{step.rate:g}",
-            f"{step.followed:.1f}",
-            *(_ms(step.result.track[name]) for name in PERCENTILES),
-            f'<span class="bad">{escape("; ".join(step.broken))}</span>'
-            if step.broken
-            else '<span class="good">holds</span>',
-        ]
-        for step in trial.steps
-    ]
-    heads = ["frames/s due", "followed", *(f"{name} ms" for name in PERCENTILES), ""]
-    found = f"The highest rate that holds: {trial.found:g} frames/s" if trial.found else "No rate holds"
-    return f'<h2>{found}</h2><p class="about">What was tried, in this order.</p>{table(heads, rows, texts=0)}'
+    rows = []
+    for step in trial.steps:
+        style, verdict = ("bad", "; ".join(step.broken)) if step.broken else ("good", "holds")
+        latencies = [_ms(step.result.track[name]) for name in PERCENTILES]
+        rows.append(
+            [
+                f"{step.rate:g} frames/s",
+                f'<span class="{style}">{escape(verdict)}</span>',
+                f"{step.followed:.1f}",
+                *latencies,
+            ]
+        )
+    heads = ["due", "", "followed", *(f"{name} ms" for name in PERCENTILES)]
+    if trial.found:
+        found = f"The highest rate that holds: {trial.found:g} frames/s"
+    else:
+        found = "Interrupted before a rate was found" if trial.interrupted else "No rate holds"
+    return f'<h2>{found}</h2><p class="about">What was tried, in this order.</p>{table(heads, rows, texts=2)}'
 
 
 def _streams(result: Result) -> str:
