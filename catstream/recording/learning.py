@@ -102,8 +102,10 @@ def learn(
     Raises
     ------
     RecordingError
-        Where features are missing.
+        Where features are missing, or there are none.
     """
+    if not recording.counts[Features]:
+        raise RecordingError(f"{recording.path} holds no features to learn from: {recording}")
     if (missing := recording.missing[Features]) and not incomplete:
         raise RecordingError(
             f"{recording.path} misses the features of {missing} frames, so no model can come out as it was: record a "

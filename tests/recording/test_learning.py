@@ -55,6 +55,12 @@ def test_where_features_are_missing_nothing_is_learned_unless_that_is_wanted(sai
     assert lesson.counters["seq"] == sum(isinstance(message, Features) for message in said) - 1
 
 
+def test_a_recording_of_models_alone_teaches_nothing(said, written):
+    recording = Recording(written(models_of(said)))
+    with pytest.raises(RecordingError, match="holds no features to learn from"):
+        learn(recording, recording.settings, incomplete=True)
+
+
 def test_marks_are_the_weighted_squared_error_and_the_share_of_frames_won(rng):
     model = Model(1, 0, rng.normal(size=4).astype(np.float32), 0.25)
     labels, weights = np.array([1, 1, 0, 0], np.float32), np.array([4, 1, 1, 1], np.float32)
