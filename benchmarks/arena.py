@@ -42,7 +42,7 @@ LINKS = {
 }
 
 _PATIENCE_SECONDS = 120.0  # without a track, after which the run counts as stuck
-_DISK = "32m"  # of the small disk: a few checkpoints
+_DISK = "128m"  # of the small disk: a few checkpoints, which are written anew beside the old one
 #: What a process finds as `sitecustomize`: its wall clock is off by the seconds in a file. Clocks that only run
 #: forward (time.monotonic, ZeroMQ's own) go on, as they do when an administrator or NTP sets the clock.
 _CLOCK = """

@@ -32,6 +32,7 @@ from catstream.evaluation.metrics import score
 from catstream.messages import Track
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
+from catstream.tracker import Tracker
 from catstream.video.source import open_source
 
 CALM = (1, 6)  # frames from one recovery to the next fault
@@ -105,7 +106,7 @@ FAULTS: dict[str, tuple[Fault, float]] = {
 
 @dataclass(slots=True)
 class Ordeal:
-    """What a run with faults came to.
+    """What a run through faults came to.
 
     recovery  of each kind of fault: seconds from its end until all goes on
     tracks    of each frame
@@ -120,35 +121,24 @@ class Ordeal:
     deaths: int
     learned: Compressor
 
-    @property
-    def boxes(self) -> np.ndarray:
-        """A row a frame, NaN where absent."""
-        return np.array([track.box or (np.nan,) * 4 for track in self.tracks])
-
-    @property
-    def rows(self) -> int:
-        """Rows in the trees."""
-        return sum(tree.rows_seen for tree in self.learned.trees.values())
-
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     cycles = 2 if options.quick else options.cycles
-    faults = schedule(cycles, options.seed)
     source, truth = long(named(options, "TLD_01_david"), 60 if options.quick else 10 * cycles + 100)
-    box, times, ends = Box(*map(float, truth[0])), [], []
+    box, faults, times, ends = Box(*map(float, truth[0])), schedule(cycles, options.seed), [], []
+    calm = undisturbed(source, box)
     for label, settings in (("lockstep", Settings(lockstep=True)), ("default", Settings())):
-        calm, worn = (endure(source, box, settings, some, options.seed) for some in ([], faults))
-        times += [(label, *row) for row in quantiles(worn.recovery)]
-        same = ("yes" if identical(calm, worn) else "NO") if settings.lockstep else None
-        success = [score(run.boxes, truth).success for run in (worn, calm)]
-        met = sum(map(len, worn.recovery.values()))
-        ends.append(
-            (label, met, worn.deaths, *map(int, worn.totals.values()), len(worn.tracks), worn.rows, *success, same)
-        )
+        run = endure(source, box, settings, faults, options.seed)
+        times += [(label, *row) for row in quantiles(run.recovery)]
+        same = None if label == "default" else "yes" if identical(run, calm) else "NO"
+        sent, stored = (int(run.totals[name]) for name in ("sent", "stored"))
+        success = [score(boxes(tracks), truth).success for tracks in (run.tracks, calm[0])]
+        met, rows = sum(map(len, run.recovery.values())), sum(tree.rows_seen for tree in run.learned.trees.values())
+        ends.append((label, met, run.deaths, sent, stored, len(run.tracks), rows, *success, same))
     columns = ("run", "fault", "times", "p50 s", "p99 s", "slowest s")
     yield Table("Recovery", columns, times, "from the end of a fault to the track two frames further, or a new model")
     columns = ("run", "faults", "restarts", "sent", "stored", "tracks", "rows", "success", "without", "trees the same")
-    note = f"seed {options.seed}; sent, stored: messages of features; rows: in the trees; without: without faults"
+    note = f"seed {options.seed}; sent, stored: messages of features; rows: in the trees; without: in one process"
     yield Table(f"{len(truth)} frames", columns, ends, note)
 
 
@@ -214,9 +204,27 @@ def further(arena: Arena, frames: int) -> None:
     arena.until(lambda: len(arena.tracks) >= goal)
 
 
-def identical(one: Ordeal, other: Ordeal) -> bool:
+def undisturbed(source: str, box: Box) -> tuple[list[Track], Compressor]:
+    """Tracks of a run in one process, and what it learned."""
+    tracker, tracks = Tracker(), []
+    with open_source(source) as frames:
+        for frame in frames:
+            if tracks:
+                tracker.update(frame.image, frame.time)
+            else:
+                tracker.init(frame.image, box, frame.time)
+            tracks.append(tracker.track)
+    return tracks, tracker.compressor
+
+
+def identical(run: Ordeal, calm: tuple[list[Track], Compressor]) -> bool:
     """Whether two runs gave the same tracks, and the same trees bit for bit."""
-    return one.tracks == other.tracks and fingerprint(one.learned) == fingerprint(other.learned)
+    return run.tracks == calm[0] and fingerprint(run.learned) == fingerprint(calm[1])
+
+
+def boxes(tracks: list[Track]) -> np.ndarray:
+    """A row a frame, NaN where absent."""
+    return np.array([track.box or (np.nan,) * 4 for track in tracks])
 
 
 def fingerprint(compressor: Compressor) -> list[tuple[object, object]]:

@@ -8,10 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.settings import Settings
-from catstream.tracker import Tracker
 from catstream.video.demo import write
-from catstream.video.source import open_source
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
@@ -25,17 +22,11 @@ def video(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def calm(video):
-    """The tracker after the same video, in one process and undisturbed, and its tracks."""
+    """Tracks of the same video in one process, undisturbed, and what it learned."""
+    import chaos
+
     path, boxes = video
-    tracker, tracks = Tracker(Settings(lockstep=True)), []
-    with open_source(path) as source:
-        for frame in source:
-            if tracks:
-                tracker.update(frame.image, frame.time)
-            else:
-                tracker.init(frame.image, boxes[0], frame.time)
-            tracks.append(tracker.track)
-    return tracker, tracks
+    return chaos.undisturbed(path, boxes[0])
 
 
 @pytest.fixture
