@@ -41,6 +41,7 @@ SECONDS = (0.1, 1.0)  # that a freeze, a cut, a slow link or a full disk lasts
 DELAY = (0.005, 0.05)  # of each 64 KiB on a slow link
 HOUR = 3600.0
 FULL = "disk full"
+RUNS = {"lockstep": Settings(lockstep=True), "default": Settings()}
 
 Fault = Callable[[Arena, np.random.Generator], None]
 
@@ -127,8 +128,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     source, truth = long(named(options, "TLD_01_david"), 60 if options.quick else 10 * cycles + 100)
     box, faults, times, ends = Box(*map(float, truth[0])), schedule(cycles, options.seed), [], []
     calm = undisturbed(source, box)
-    for label, settings in (("lockstep", Settings(lockstep=True)), ("default", Settings())):
-        run = endure(source, box, settings, faults, options.seed)
+    for label in [options.run] if options.run else RUNS:
+        run = endure(source, box, RUNS[label], faults, options.seed)
         times += [(label, *row) for row in quantiles(run.recovery)]
         same = None if label == "default" else "yes" if identical(run, calm) else "NO"
         sent, stored = (int(run.totals[name]) for name in ("sent", "stored"))
@@ -243,6 +244,7 @@ def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, floa
 if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--cycles", type=int, default=200, help="faults (default: %(default)s)")
+    parser.add_argument("--run", choices=list(RUNS), help="only this one of the two")
     parser.add_argument("--seed", type=int, default=0, help="of the schedule (default: %(default)s)")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # the small disk is taken away then, too

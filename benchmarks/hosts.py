@@ -30,14 +30,9 @@ class Hosts:
             self._namespace(stack, "switch")
             self._ip("-n", self._named("switch"), "link", "add", "bridge", "type", "bridge")
             self._ip("-n", self._named("switch"), "link", "set", "bridge", "up")
-            for name, address in self.addresses.items():
+            for name in self.addresses:
                 self._namespace(stack, name)
-                host, port = self._named(name), ["-n", self._named("switch"), "link"]
-                self._ip(*port, "add", name, "type", "veth", "peer", "name", "eth0", "netns", host)
-                self._ip(*port, "set", name, "master", "bridge", "up")
-                self._ip("-n", host, "address", "add", f"{address}/24", "dev", "eth0")
-                for device in ("eth0", "lo"):
-                    self._ip("-n", host, "link", "set", device, "up")
+                self._plug_in(name)
             self._stack = stack.pop_all()
         return self
 
@@ -61,6 +56,25 @@ class Hosts:
             yield
         finally:
             self._ip(*port, "up")
+
+    def power_off(self, name: str, *processes: subprocess.Popen[str]) -> None:
+        """A host goes down with its processes and all that its kernel knew, and comes up again; nobody is told."""
+        with self.cut_off(name):
+            for process in processes:
+                process.kill()
+                process.wait()
+            self._ip("netns", "delete", self._named(name))
+            self._ip("netns", "add", self._named(name))
+            self._ip("-n", self._named("switch"), "link", "delete", name)
+            self._plug_in(name)
+
+    def _plug_in(self, name: str) -> None:
+        host, port = self._named(name), ["-n", self._named("switch"), "link"]
+        self._ip(*port, "add", name, "type", "veth", "peer", "name", "eth0", "netns", host)
+        self._ip(*port, "set", name, "master", "bridge", "up")
+        self._ip("-n", host, "address", "add", f"{self.addresses[name]}/24", "dev", "eth0")
+        for device in ("eth0", "lo"):
+            self._ip("-n", host, "link", "set", device, "up")
 
     def _namespace(self, stack: ExitStack, name: str) -> None:
         self._ip("netns", "add", self._named(name))

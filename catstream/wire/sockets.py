@@ -76,7 +76,10 @@ class _Socket:
         self._socket.maxmsgsize = self.channel.limit
         self._socket.handshake_ivl = _HANDSHAKE
         # No heartbeats: ZeroMQ aborts the process where one is due to a peer that went away while the queue of
-        # its messages was full (libzmq issue 4767). On one machine the kernel tells when a peer is gone.
+        # its messages was full (libzmq issue 4767). On one machine the kernel tells when a peer is gone; of a host
+        # that lost its power nobody tells: TCP asks there, and says so after 11 s, or once the host is up again.
+        self._socket.tcp_keepalive, self._socket.tcp_keepalive_idle = 1, 5
+        self._socket.tcp_keepalive_intvl, self._socket.tcp_keepalive_cnt = 2, 3
         self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 20, 500
         self._events: Any = None  # hears of connections
         self._left = False  # whether one ended

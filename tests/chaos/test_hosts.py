@@ -32,8 +32,8 @@ def hosts():
 
 
 @pytest.fixture
-def pipeline(video, hosts, tmp_path):
-    """The processes by name, and one that watches; each on its host, with the keys that are its due."""
+def start(video, hosts, tmp_path):
+    """Starts a process on its host, or one that watches, with the keys that are its due."""
     path, boxes = video
     create(tmp_path / "keys")
     allow(tmp_path / "keys", "viewer", "watch", output=tmp_path / "viewer")
@@ -45,25 +45,42 @@ def pipeline(video, hosts, tmp_path):
         "trainer": [],
         "detector": ["--resume", path, "--box", ",".join(map(str, boxes[0]))],
     }
-    watch = ["watch", "tracks", "--json", "--endpoint", endpoint, "--keys", tmp_path / "viewer"]
-    viewer = hosts.start("viewer", Path(sys.executable).with_name("catstream"), *watch, stdout=subprocess.PIPE)
-    services = [sys.executable, "-m", "catstream.services"]
-    return {name: hosts.start(name, *services, name, *common, *own[name]) for name in NAMES} | {"viewer": viewer}
+
+    def begin(name):
+        if name == "viewer":
+            watch = ["watch", "tracks", "--json", "--endpoint", endpoint, "--keys", tmp_path / "viewer"]
+            return hosts.start(name, Path(sys.executable).with_name("catstream"), *watch, stdout=subprocess.PIPE)
+        return hosts.start(name, sys.executable, "-m", "catstream.services", name, *common, *own[name])
+
+    return begin
 
 
 @pytest.mark.parametrize(
     "victim", ["compressor", *(pytest.param(name, marks=pytest.mark.slow) for name in ("detector", "trainer"))]
 )
-def test_a_host_that_is_cut_off_for_a_while_costs_nothing(video, calm, hosts, pipeline, until, tmp_path, victim):
+def test_a_host_that_is_cut_off_for_a_while_costs_nothing(video, calm, hosts, start, until, tmp_path, victim):
+    viewer, *processes = (start(name) for name in ("viewer", *NAMES))
     until(lambda: reached(tmp_path / "state", 5))
     with hosts.cut_off(victim):
         time.sleep(CUT_SECONDS)
         assert reached(tmp_path / "state", 0).seq < len(video[1]), "the video was over before the host was cut off"
-    heard = pipeline.pop("viewer").communicate()[0].splitlines()
-    assert {name: process.wait(60) for name, process in pipeline.items()} == dict.fromkeys(NAMES, 0)
+    heard = viewer.communicate()[0].splitlines()
+    assert [process.wait(60) for process in processes] == [0, 0, 0]
     tracks, learned = calm
     assert chaos.fingerprint(reached(tmp_path / "state", 0)) == chaos.fingerprint(learned)
     assert [json.loads(line)["frame"] for line in heard if "frame" in line][-1] == tracks[-1].frame
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", NAMES)
+def test_a_host_that_loses_its_power_and_comes_back_costs_nothing(video, calm, hosts, start, until, tmp_path, victim):
+    processes = {name: start(name) for name in NAMES}
+    until(lambda: reached(tmp_path / "state", 5))
+    hosts.power_off(victim, processes[victim])
+    assert reached(tmp_path / "state", 0).seq < len(video[1]), "the video was over before the host went down"
+    processes[victim] = start(victim)
+    assert {name: process.wait(120) for name, process in processes.items()} == dict.fromkeys(NAMES, 0)
+    assert chaos.fingerprint(reached(tmp_path / "state", 0)) == chaos.fingerprint(calm[1])
 
 
 def reached(state, seq):
