@@ -180,7 +180,8 @@ def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: i
             except OSError as error:
                 print(f"without full disks: {error}", file=sys.stderr)
                 faults = [name for name in faults if name != FULL]
-        frames = open_source(source).frames or 0
+        with open_source(source) as video:
+            frames = video.frames or 0
         arena = stack.enter_context(Arena(source, box, settings, folder / "state", folder))
         for number, name in enumerate(faults, start=1):
             further(arena, int(random.integers(*CALM)))
@@ -195,8 +196,14 @@ def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: i
             recovery[name].append(monotonic() - begin)
             print(f"{number} of {len(faults)}: {name}, {recovery[name][-1]:.2f} s", file=sys.stderr, flush=True)
         arena.finish()
-        learned = Compressor.load(folder / "state" / "compressor.safetensors", settings)
-        return Ordeal(dict(recovery), arena.tracks, dict(arena.end.totals), arena.deaths, learned)
+        return Ordeal(
+            dict(recovery), arena.tracks, dict(arena.end.totals), arena.deaths, learned(folder / "state", settings)
+        )
+
+
+def learned(state: Path, settings: Settings) -> Compressor:
+    """From the newest checkpoint in a folder; ValueError where there is none yet."""
+    return Compressor.load(max(state.rglob("*.safetensors"), key=lambda file: file.stat().st_mtime_ns), settings)
 
 
 def further(arena: Arena, frames: int) -> None:
