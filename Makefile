@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format docs settings bench lock clean fuzz
+.PHONY: help setup demo test test-slow lint format docs settings bench lock clean fuzz audit
 
 help:  ## say what there is
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -36,10 +36,11 @@ test: $(READY)  ## all tests but the slow ones, doctests too
 test-slow: $(READY)  ## the slow ones: long real sequences, soaks
 	$(BIN)/pytest -m slow
 
-lint: $(READY)  ## style and types
+lint: $(READY)  ## style, types, and what is unsafe
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/bandit --quiet --configfile pyproject.toml --recursive catstream services
 
 format: $(READY)  ## put style right where that needs no thought
 	$(BIN)/ruff check --fix-only --quiet .
@@ -53,6 +54,9 @@ settings: $(READY)  ## write the table of docs/settings.md anew
 
 bench: $(READY)  ## speed, memory and growth: a quarter of an hour
 	for name in startup throughput kernels wire endurance speed; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+
+audit: $(READY)  ## known holes in what requirements.lock installs; asks PyPI
+	$(BIN)/python .ci/audit
 
 fuzz: $(READY)  ## a million hostile inputs for each decoder: half an hour
 	$(BIN)/python benchmarks/fuzz.py
