@@ -12,6 +12,7 @@ __all__ = [
     "RecordingError",
     "RefusedError",
     "ServiceError",
+    "SetBackError",
     "SettingsError",
     "SilenceError",
     "VideoError",
@@ -51,6 +52,10 @@ class RecordingError(CatstreamError):
 
 class ServiceError(CatstreamError):
     """A process of the pipeline that failed, or that cannot start."""
+
+
+class SetBackError(ServiceError):
+    """A receiver that needs messages once more that its sender does not have any more: its disk lost them."""
 
 
 class SilenceError(ServiceError, TimeoutError):

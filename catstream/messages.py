@@ -108,14 +108,16 @@ class Features:
 class Stored:
     """Acknowledges messages of an acknowledged channel, receiver -> sender.
 
-    seq      every message up to and with this one survives the receiver's death: forget it
+    seq      every message up to and with this one survives the receiver's death, but for `unsaved`: forget it
     taken    every message up to and with this one has been taken
     version  the newest Sample made so far, 0 before the first
+    unsaved  how many of those up to `seq`, the last ones, are in memory only: the disk takes nothing
     """
 
     seq: int
     taken: int
     version: int = 0
+    unsaved: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +129,7 @@ class Position:
     box       where the object was last found, None in a new stream
     version   the newest Sample made so far, 0 before the first
     bearings  those of that message, None where it had none
+    unsaved   how many of those up to `seq`, the last ones, are in memory only: the disk takes nothing
     """
 
     seq: int = 0
@@ -134,6 +137,7 @@ class Position:
     box: Box | None = None
     version: int = 0
     bearings: Bearings | None = None
+    unsaved: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,11 +248,13 @@ class Health:
     process   its name
     time      seconds since the epoch
     counters  what it counts: name -> number
+    trouble   what is wrong with it, for a person to read; empty where nothing is
     """
 
     process: str
     time: float
     counters: dict[str, float] = field(default_factory=dict)
+    trouble: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,10 @@ with catstream.Pipeline("walk.mp4", (120, 80, 64, 48)) as pipeline:
 from __future__ import annotations
 
 import logging
+import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -20,6 +21,7 @@ from catstream.errors import RecordingError, ServiceError, SettingsError, VideoE
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
+from catstream.state import Origin, began, held, position
 from catstream.video.source import WHOLE, is_live, open_source
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.sockets import Receiver, Subscriber
@@ -46,10 +48,17 @@ class Pipeline:
     settings : all defaults where None
     part : which frames of a file or folder there are to follow, `slice(100, 200, 2)` for 100, 102 ... 198
     record : file to write all that travels to, see `catstream.recording`; no features are missing there
+    state : folder to keep what was learned in, so that a power cut does not end the run: once a second, and at the end
+    resume : folder of an earlier run to go on with, where it was. Source, box, part and settings are
+        kept there too: give those only that are to be others
+    notes : names and texts to keep there, for whoever goes on
 
     Attributes
     ----------
     name, frames, rate, size, live : of the source, as `catstream.video.frames.Source` has them
+    source, part, notes : as they were given, or kept
+    after : where a run that is resumed goes on, to be set before it is entered: after the last track that the caller
+        has. Where None, after the last frame that was learned from: tracks of the last second may come again
 
     Raises
     ------
@@ -59,47 +68,81 @@ class Pipeline:
         From the constructor, where the file to record to is there already.
     SettingsError
         From the constructor, for settings that the source cannot be followed with: a live one in lockstep.
+    ServiceError, ProtocolError
+        From the constructor, where nothing was kept in the folder to resume, or it is damaged.
     ServiceError
-        On entering, where the endpoint is in use. While iterating, where a process cannot be kept alive.
+        On entering, where the endpoint or the folder of the state is in use. While iterating, where a process
+        cannot be kept alive.
     VideoError
         While iterating, where the source breaks, after its last good frame.
     """
 
     def __init__(
         self,
-        source: str,
-        box: Sequence[float],
+        source: str | None = None,
+        box: Sequence[float] | None = None,
         settings: Settings | None = None,
         *,
         part: slice = WHOLE,
-        record: str | Path | None = None,
+        record: str | os.PathLike[str] | None = None,
+        state: str | os.PathLike[str] | None = None,
+        resume: str | os.PathLike[str] | None = None,
+        notes: Mapping[str, str] | None = None,
     ) -> None:
-        self.settings = settings or Settings()
-        self._source, self._box, self._part = str(source), Box(*map(float, box)), part
+        if state is not None and resume is not None:
+            raise SettingsError("a run is begun in a folder (state) or goes on in one (resume): give one of them")
+        self._kept = Origin.load(Path(resume)) if resume is not None else None
+        self._state = Path(state or resume or "") if state or resume else None
+        self.settings, self.part, self.notes = settings or Settings(), part, dict(notes or {})
+        self.after: Position | None = None
+        if self._kept is not None:
+            source, box = source or self._kept.source, box or self._kept.box
+            self.settings, self.notes = settings or self._kept.settings, {**self._kept.notes, **self.notes}
+            self.part = self._kept.part if part == WHOLE else part
+        if source is None or box is None:
+            raise SettingsError("a new run needs a source, and a box in its first frame: give both")
+        self.source, self._box = str(source), Box(*map(float, box))
         self._record = None if record is None else Path(record)
         self._end: End | None = None
         self._health: dict[str, Health] = {}
-        if self.settings.lockstep and is_live(self._source):
+        if self.settings.lockstep and is_live(self.source):
             raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
-        if self._record is not None and self._record.exists():
+        if self._record is not None and self._record.exists() and self._kept is None:
             raise RecordingError(f"{record} is there already: give another name, or remove it")
         # The detector opens the source once more: a camera shows its picture to one at a time.
-        with open_source(self._source, part=part) as first:
+        with open_source(self.source, part=self.part) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
         self._box.inside(*self.size)
         self.settings = self.settings.for_length(self.frames)
+        path = self.source if self.live else str(Path(self.source).absolute())
+        started = self._kept.started if self._kept else time.time()
+        self._origin = Origin(path, self._box, self.part, self.settings, self.size, started, self.notes)
+        if self._kept is not None and self._state is not None:
+            self._kept.check(self._state, self._origin)
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
             endpoint = stack.enter_context(meeting_place(self.settings.endpoint, folder, self.settings.keys))
             self.endpoint = str(endpoint)
-            self._results = stack.enter_context(Receiver("results", endpoint, Position(), self.settings.window))
+            state = stack.enter_context(self._begun(self._state)) if self._state is not None else None
+            start = self._start(state) if state is not None and self._kept is not None else Position()
+            self._box = start.box or self._box
+            self._results = stack.enter_context(Receiver("results", endpoint, start, self.settings.window))
             self._reports = stack.enter_context(Subscriber("health", endpoint))
             settings = replace(self.settings, endpoint=self.endpoint)
             self._supervisor = Supervisor(
-                self._source, self._box, settings, folder, owned=True, part=self._part, record=self._record
+                self.source,
+                self._origin.box,
+                settings,
+                folder,
+                owned=True,
+                part=self.part,
+                record=self._record,
+                state=state,
+                resume=self._kept is not None,
+                since=time.monotonic() - max(0.0, time.time() - self._origin.started),
             )
             stack.callback(self._supervisor.stop)
             self._stack = stack.pop_all()
@@ -137,6 +180,11 @@ class Pipeline:
         return {name: health.counters for name, health in self._health.items()}
 
     @property
+    def trouble(self) -> dict[str, str]:
+        """What is wrong with a process, for a person, by its name; of those with which something is."""
+        return {name: health.trouble for name, health in self._health.items() if health.trouble}
+
+    @property
     def pids(self) -> dict[str, int]:
         """Process id by name."""
         return self._supervisor.pids
@@ -151,6 +199,27 @@ class Pipeline:
         """For how long a live source has been lost, 0 while it is not."""
         return self.health.get("detector", {}).get("lost_seconds", 0.0)
 
+    @contextmanager
+    def _begun(self, folder: Path) -> Iterator[Path]:
+        """Hold the folder of the state, and say there how the pipeline was started."""
+        with held(folder) as state:
+            if self._kept is None and began(state):
+                raise ServiceError(
+                    f"a pipeline was kept in {str(folder)!r} already: go on with it (--resume {folder}), "
+                    "or give another folder"
+                )
+            if self._origin != self._kept:
+                self._origin.save(state)
+            yield state
+
+    def _start(self, state: Path) -> Position:
+        """After which track to go on."""
+        if self.after is not None and not self.live:
+            return self.after
+        # The frames of a live source cannot be had again: what was learned from is not lost, though no track tells.
+        learned = position(state, self.settings)
+        return max(learned, self.after or learned, key=lambda start: start.seq)
+
     def _watch(self) -> None:
         self._listen()
         self._supervisor.check()
@@ -162,6 +231,9 @@ class Pipeline:
 
     def _listen(self) -> None:
         for health in self._reports.waiting():
+            before = self._health.get(health.process)
+            if health.trouble and (before is None or before.trouble != health.trouble):
+                _log.warning("%s: %s", health.process, health.trouble)
             self._health[health.process] = health
 
     def _wait(self) -> None:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from catstream.compression.compressor import Compressor
-from catstream.errors import ServiceError
+from catstream.compression.generations import Generations
 from catstream.messages import End, Features, Position
 from catstream.recording.file import RecordingWriter
 from catstream.services.loop import Process
 from catstream.services.recorder import Recorder
+from catstream.state import TREES, held
 from catstream.wire.sockets import Publisher, Receiver
 
 __all__ = ["main"]
 
 _END_SECONDS = 5.0  # that the end of the tracks, after that of the features, may take
-
-_log = logging.getLogger(__name__)
+_LOCK_SECONDS = 10.0  # that a compressor before this one may take to end
 
 
 def main(process: Process, state: Path | None, record: Path | None = None) -> None:
@@ -28,36 +27,42 @@ def main(process: Process, state: Path | None, record: Path | None = None) -> No
 
     Parameters
     ----------
-    state : folder of the checkpoint that a restarted compressor goes on from; without one,
+    state : folder of the checkpoints that a restarted compressor goes on from; without one,
         what was taken counts as stored
     record : file to write all that travels to, features as they are taken; one that is there is gone on with
     """
     settings = process.settings
-    file = _checkpoint(state)
-    compressor = Compressor.load(file, settings) if file and file.exists() else Compressor(settings)
-    stored, saved = _position(compressor), time.monotonic()
-
-    def store() -> Position:
-        nonlocal stored, saved
-        if file is not None:
-            compressor.save(file)
-        stored, saved = _position(compressor), time.monotonic()
-        return stored
-
-    def check(message: Features | End) -> None:
-        if isinstance(message, Features):
-            compressor.check(message)
-
     with ExitStack() as stack:
+        generations = None
+        if state is not None:
+            generations = Generations(stack.enter_context(held(state / TREES, _LOCK_SECONDS)))
+        compressor = generations.load(settings) if generations else Compressor(settings)
+        stored, tried, settled = compressor.seq, time.monotonic(), compressor.position
+
+        def store(needed: bool = True) -> Position:
+            """Write a checkpoint. Where the disk takes none and it is needed, memory has to do: learning goes on."""
+            nonlocal stored, tried, settled
+            if generations is None or generations.save(compressor):
+                stored, needed = compressor.seq, True
+            tried = time.monotonic()
+            if needed:
+                settled = replace(compressor.position, unsaved=compressor.seq - stored)
+            return settled
+
         recorder = None
         if record is not None:
             writer = stack.enter_context(RecordingWriter(record, process.run, resume=True))
             recorder = stack.enter_context(Recorder(writer, process.endpoint))
-        features = stack.enter_context(Receiver("features", process.endpoint, stored, settings.window, store, check))
+
+        def check(message: Features | End) -> None:
+            if isinstance(message, Features):
+                compressor.check(message)
+
+        features = stack.enter_context(Receiver("features", process.endpoint, settled, settings.window, store, check))
         samples = stack.enter_context(Publisher("samples", process.endpoint))
 
         def counters() -> dict[str, float]:
-            own: dict[str, float] = {"stored": stored.seq}
+            own: dict[str, float] = {"stored": stored}
             if recorder is not None:
                 own |= {"recorded": writer.written, "unrecorded": float(recorder.failed != "")}
             return compressor.counters() | own
@@ -75,16 +80,20 @@ def main(process: Process, state: Path | None, record: Path | None = None) -> No
                 sample = compressor.take(message)
                 if sample is not None:
                     samples.send(sample)
-            before, waiting = stored.seq, compressor.seq - stored.seq
-            overdue = time.monotonic() - saved >= settings.checkpoint_seconds
-            if file is None or (waiting and (end or overdue or 2 * waiting >= settings.window)):
-                store()
-            if message is not None or stored.seq > before:
+            before, waiting = settled, compressor.seq - settled.seq
+            needed = generations is None or end or 2 * waiting >= settings.window
+            overdue = time.monotonic() - tried >= settings.checkpoint_seconds
+            if compressor.seq > stored and (needed or overdue):
+                store(needed)
+            if message is not None or settled is not before:
                 # The end of the stream holds no features: with all before it, it is stored too. A sample needs
                 # no checkpoint to be made: in lockstep the detector waits for its model.
-                now = replace(stored, version=compressor.version)
-                features.acknowledge(_position(compressor, message.seq) if end else now)
+                now = replace(settled, version=compressor.version)
+                if end:
+                    now = replace(now, seq=message.seq, unsaved=now.unsaved and now.unsaved + 1)
+                features.acknowledge(now)
             samples.welcome()
+            process.trouble = generations.trouble if generations else ""
             process.beat(counters, now=end)
             if end:
                 samples.send(message)
@@ -94,18 +103,3 @@ def main(process: Process, state: Path | None, record: Path | None = None) -> No
             features.receive(0.02)  # a detector that did not hear that its end is stored asks again
             recorder.listen()
             process.beat(counters)
-
-
-def _checkpoint(state: Path | None) -> Path | None:
-    if state is None:
-        return None
-    try:
-        state.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise ServiceError(f"cannot keep checkpoints in {state} ({error.strerror}): give another folder") from None
-    return state / "compressor.safetensors"
-
-
-def _position(compressor: Compressor, seq: int | None = None) -> Position:
-    seq = compressor.seq if seq is None else seq
-    return Position(seq, max(compressor.frame, 0), compressor.box, compressor.version, compressor.bearings)

@@ -175,7 +175,7 @@ class _Line:
         for sender in self._senders:
             seconds = _OWNER_SECONDS if sender is self._results else _FAREWELL_SECONDS
             self._deliver(sender, End(seq + 1, reason, failed, totals), seconds)
-            while sender.stored < sender.sent and not self._process.ended_for(seconds):
+            while sender.settled < sender.sent and not self._process.ended_for(seconds):
                 sender.listen(0.02)
                 self._process.beat(self._counters)
             if sender is self._features:

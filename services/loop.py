@@ -9,7 +9,7 @@ import signal
 import time
 from collections.abc import Callable
 
-from catstream.errors import CatstreamError
+from catstream.errors import CatstreamError, SetBackError
 from catstream.messages import Health, Run
 from catstream.recording.file import run_of
 from catstream.settings import Settings
@@ -30,12 +30,14 @@ class Process:
     """What a process has, whichever it is.
 
     settings, endpoint : as all processes of this pipeline have them
+    trouble : what is wrong, for a person; told with its health
     """
 
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
         self.settings = settings
         self.endpoint = Endpoint.parse(settings.endpoint, settings.keys)
+        self.trouble = ""
         self._asked = float("inf")  # when it was asked to end
         self._health = Publisher("health", self.endpoint, sender=name)
         self._beat = 0.0
@@ -60,7 +62,7 @@ class Process:
         """Tell how it is, once a second; cheap to call in every turn of a loop."""
         if now or time.monotonic() - self._beat >= 1:
             self._beat = time.monotonic()
-            self._health.send(Health(self.name, time.time(), counters() | refusals()))
+            self._health.send(Health(self.name, time.time(), counters() | refusals(), self.trouble))
         else:
             self._health.welcome()
 
@@ -81,7 +83,8 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
 
     Returns
     -------
-    its exit code: 0 at the end of the stream or after SIGTERM, `REFUSED` for an error that names its cause
+    its exit code: 0 at the end of the stream or after SIGTERM, `REFUSED` for an error that names its cause, and
+    that would come again
     """
     logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
     if parent is not None:
@@ -92,6 +95,9 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
             main(process)
         finally:
             process.close()
+    except SetBackError as error:
+        _log.warning("%s", error)
+        return 1
     except CatstreamError as error:
         _log.error("%s", error)
         return REFUSED

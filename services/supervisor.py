@@ -78,10 +78,13 @@ class Supervisor:
     Parameters
     ----------
     settings : with the endpoint where the processes meet
-    folder : where checkpoints and logs are kept while the pipeline runs
+    folder : where logs are kept while the pipeline runs
     owned : whether somebody takes every track from the channel `results`
     part : which frames of the source there are to follow
     record : file to write all that travels to, or to go on with
+    state : where what was learned is kept; in `folder` where None
+    resume : whether the pipeline goes on with that
+    since : moment of `time.monotonic` that the times of a live source count from, now where None
     """
 
     def __init__(
@@ -94,11 +97,16 @@ class Supervisor:
         owned: bool,
         part: slice = WHOLE,
         record: Path | None = None,
+        state: Path | None = None,
+        resume: bool = False,
+        since: float | None = None,
     ) -> None:
-        self._source, self._box, self._settings, self._folder, self._owned = source, box, settings, folder, owned
+        self._source, self._box, self._settings, self._owned = source, box, settings, owned
+        self._state, self._resume = state or folder, resume
         self._part = {"--start": part.start, "--end": part.stop, "--stride": part.step}
         self._record = record
-        self._since = time.monotonic()  # a restarted detector goes on with the times of a live source
+        # A restarted detector goes on with the times of a live source.
+        self._since = time.monotonic() if since is None else since
         self._children = {name: _Child(name, (folder / f"{name}.log").open("w+b")) for name in NAMES}
         for child in self._children.values():
             self._start(child)
@@ -188,10 +196,10 @@ class Supervisor:
             command += [self._source, "--box", ",".join(map(repr, self._box)), "--since", repr(self._since)]
             for option, number in self._part.items():
                 command += [] if number is None else [option, str(number)]
-            command += ["--owned"] * self._owned + ["--resume"] * bool(child.restarts)
+            command += ["--owned"] * self._owned + ["--resume"] * (self._resume or bool(child.restarts))
             command += ["--recorded"] * (self._record is not None)
         if child.name == "compressor":
-            command += ["--state", str(self._folder)]
+            command += ["--state", str(self._state)]
             command += [] if self._record is None else ["--record", str(self._record)]
         child.seen = time.monotonic()
         own = {name: value for name, value in os.environ.items() if not name.startswith("CATSTREAM_")}

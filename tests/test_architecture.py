@@ -18,7 +18,7 @@ FLOORS = [
     {"box"},
     {"messages", "settings", "ridge", "html"},
     {"detection", "compression", "training", "wire", "video", "adapters"},
-    {"tracker", "subscription", "steering", "recording", "sinks"},
+    {"tracker", "subscription", "steering", "recording", "sinks", "state"},
     {"services", "web"},
     {"pipeline"},
     {"evaluation"},

@@ -20,32 +20,37 @@ from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
 from catstream.services.options import with_part, with_settings
 from catstream.settings import Settings
-from catstream.video.results import ResultsWriter
+from catstream.video.results import ResultsWriter, last_position, tracks
 from catstream.video.source import is_live
 
 __all__ = ["track"]
 
+_FOLDER = click.Path(path_type=Path)
 _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 
 
 @click.command()
-@click.argument("source")
-@click.option("--box", required=True, metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
-@click.option("--output", type=click.Path(path_type=Path), help="Folder for the results.")
+@click.argument("source", required=False)
+@click.option("--box", metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
+@click.option("--output", type=_FOLDER, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--record", type=click.Path(path_type=Path), help="File to record the run to: `catstream replay`.")
 @click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
+@click.option("--state", type=_FOLDER, help="Folder to keep what was learned in, through power cuts.")
+@click.option("--resume", type=_FOLDER, help="Go on with what is kept in such a folder.")
 @with_part
 @with_settings
 def track(
     settings: Settings,
     part: slice,
-    source: str,
-    box: str,
+    source: str | None,
+    box: str | None,
     output: Path | None,
     video: bool,
     record: Path | None,
     lockstep: bool,
+    state: Path | None,
+    resume: Path | None,
 ) -> None:
     """Follow an object through a video, from its box in the first frame.
 
@@ -57,6 +62,10 @@ def track(
 
     A detector, a compressor and a trainer run as processes of their own;
     Ctrl-C ends them, and the results so far are kept.
+
+    With --state, what was learned is kept too, on disk, once a second: after a
+    power cut, a crash or Ctrl-C, --resume goes on where the run was, with the
+    same source, box, settings and results, unless they are given again.
 
     \b
     Writes
@@ -74,14 +83,32 @@ def track(
       catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
       catstream track walk.mp4 --box 120,80,64,48 --record walk.rec
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
+      catstream track walk.mp4 --box 120,80,64,48 --output out --state kept
+      catstream track --resume kept
     """
-    if video and output is None:
-        raise click.UsageError("--video needs --output, the folder to write it to")
-    if video and is_live(source):
+    if state is not None and resume is not None:
+        raise click.UsageError("--state begins a run, --resume goes on with one: give one of them")
+    if resume is None and (source is None or box is None):
+        raise click.UsageError("a run needs SOURCE, and --box for the object in its first frame")
+    if video and source is not None and is_live(source):
         raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
     if lockstep:
         settings = Settings.of({**settings.values(), "lockstep": True})
-    pipeline = Pipeline(source, Box.parse(box), settings, part=part, record=record)
+    pipeline = Pipeline(
+        source,
+        Box.parse(box) if box is not None else None,
+        None if resume is not None and settings == Settings() else settings,
+        part=part,
+        state=state,
+        record=record,
+        resume=resume,
+        notes=({"output": str(output.absolute())} if output is not None else {}) | ({"video": "yes"} if video else {}),
+    )
+    video, output = "video" in pipeline.notes, Path(pipeline.notes["output"]) if "output" in pipeline.notes else None
+    if video and output is None:
+        raise click.UsageError("--video needs --output, the folder to write it to")
+    if resume is not None and output is not None:
+        pipeline.after = last_position(output, pipeline.name)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console(stderr=True, soft_wrap=True)
     run = _Run(pipeline)
@@ -93,7 +120,7 @@ def track(
             sinks = None
             for found in pipeline:
                 # Not before there is something to write: a run that cannot start leaves older results alone.
-                sinks = sinks or _Sinks(stack, pipeline, source, part, output, video)
+                sinks = sinks or _Sinks(stack, pipeline, output, video, resume is not None)
                 sinks.write(found)
                 run.show(progress, found)
     except KeyboardInterrupt:
@@ -104,26 +131,29 @@ def track(
             if record is not None:
                 console.print(f"recording: {record}, {Recording(record)}", highlight=False)
     if interrupted:
-        console.print("stopped: the results so far are kept")
+        go_on = f", go on with: catstream track --resume {state or resume}" if state or resume else ""
+        console.print(f"stopped: the results so far are kept{go_on}", highlight=False)
         sys.exit(_INTERRUPTED)
 
 
 class _Sinks:
     """Where tracks go: results files, and a video of the same frames read once more."""
 
-    def __init__(
-        self, stack: ExitStack, pipeline: Pipeline, source: str, part: slice, output: Path | None, video: bool
-    ) -> None:
-        self._results = stack.enter_context(ResultsWriter(output, pipeline.name)) if output is not None else None
+    def __init__(self, stack: ExitStack, pipeline: Pipeline, output: Path | None, video: bool, resume: bool) -> None:
+        self._results: ResultsWriter | None = None
+        if output is not None:
+            self._results = stack.enter_context(ResultsWriter(output, pipeline.name, resume=resume))
         self._video: Any = None
         self._moment = time.perf_counter()
         if video and output is not None:
             from catstream.video.annotate import AnnotatedVideo
             from catstream.video.source import open_source
 
-            self._frames = stack.enter_context(open_source(source, part=part))
+            self._frames = stack.enter_context(open_source(pipeline.source, part=pipeline.part))
             path = output / f"{pipeline.name}.mp4"
             self._video = stack.enter_context(AnnotatedVideo(path, pipeline.rate, pipeline.size))
+            for found in tracks(output) if resume else ():  # a video cannot be written on: it is drawn again
+                self._video.write(next(self._frames).image, found)
 
     def write(self, found: Track) -> None:
         moment = time.perf_counter()

@@ -16,7 +16,7 @@ from catstream.box import Box
 from catstream.compression import checkpoint, storage
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, SettingsError
-from catstream.messages import Bearings, Features, Sample
+from catstream.messages import Bearings, Features, Position, Sample
 from catstream.settings import Settings
 
 __all__ = ["Compressor"]
@@ -99,6 +99,11 @@ class Compressor:
         return self.last_sample.version if self.last_sample else 0
 
     @property
+    def position(self) -> Position:
+        """Where the stream of messages goes on, once all that was taken is stored."""
+        return Position(self.seq, max(self.frame, 0), self.box, self.version, self.bearings)
+
+    @property
     def leaves(self) -> int:
         """Leaves ever inserted into the trees."""
         return sum(self._leaves().values())
@@ -141,7 +146,9 @@ class Compressor:
         Raises
         ------
         ProtocolError
-            Where the file is torn, or made with another coreset size.
+            Where the file is torn, damaged or another one.
+        SettingsError
+            Where it was made with another coreset size.
         """
         arrays, facts = storage.read(path)
         self = cls(settings)
@@ -159,10 +166,9 @@ class Compressor:
                 self.trees[name] = CoresetTree.from_state(own, tree_facts)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): take an older copy") from None
-        sizes = {tree.size for tree in self.trees.values()}
-        if sizes != {settings.coreset_size} or set(self.trees) != set(_TREES):
-            raise ProtocolError(
-                f"{path} holds trees of size {sizes}, the settings say {settings.coreset_size}: "
+        if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset_size}:
+            raise SettingsError(
+                f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset_size}: "
                 "go on with the same settings"
             )
         return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import zlib
@@ -14,21 +15,33 @@ from catstream.errors import ProtocolError
 __all__ = ["read", "write"]
 
 _KEY = "catstream"  # one metadata key only: with more, their order and so the bytes would vary
+_VERSION = 1  # of what the metadata means
 
 
 def write(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: dict[str, object]) -> None:
-    """Write a file beside its final name, then put it in place of the old one."""
-    from safetensors.numpy import save_file
+    """Write a file beside its final name, then put it in place of the old one; it survives a power cut from then on.
+
+    Raises
+    ------
+    OSError
+        Where it cannot be written. What was there before stays as it was.
+    """
+    from safetensors.numpy import save
 
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     try:
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        text = json.dumps({"facts": facts, "checksum": _checksum(contiguous, facts)}, sort_keys=True)
-        save_file(contiguous, part, metadata={_KEY: text})
+        told = {"version": _VERSION, "facts": facts, "checksum": _checksum(contiguous, facts)}
+        with part.open("wb") as file:
+            file.write(save(contiguous, metadata={_KEY: json.dumps(told, sort_keys=True)}))
+            file.flush()
+            os.fsync(file.fileno())  # the new name must not be on disk before all that it names
         part.replace(path)
+        _sync(path.parent)
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # of a disk that is read-only now; the next one writes over it
+            part.unlink(missing_ok=True)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, object]]:
@@ -46,11 +59,22 @@ def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
             told = json.loads((file.metadata() or {})[_KEY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         facts = told["facts"]
+        if told["version"] != _VERSION:
+            raise ValueError(f"it is of version {told['version']}, this catstream reads {_VERSION}")
         if told["checksum"] != _checksum(arrays, facts):
             raise ValueError("its checksum does not fit")
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ProtocolError(f"{path} is not a whole file of catstream ({error}): take an older copy") from None
     return arrays, facts
+
+
+def _sync(folder: Path) -> None:
+    """Have the names in a folder on disk."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _checksum(arrays: dict[str, np.ndarray], facts: dict[str, object]) -> int:

@@ -13,19 +13,22 @@ NAME_time.txt is measured and is never the same twice.
 from __future__ import annotations
 
 import contextlib
+import os
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import Track
+from catstream.messages import Position, Track
 
-__all__ = ["COLUMNS", "ResultsWriter", "row"]
+__all__ = ["COLUMNS", "ResultsWriter", "last_position", "row", "tracks"]
 
 #: Of tracks.csv.
 COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version"
 
 _ABSENT = "nan,nan,nan,nan"
+_TRACKS = "tracks.csv"
 
 
 def row(track: Track) -> str:
@@ -49,6 +52,8 @@ class ResultsWriter:
     directory : where to write; made if it is not there
     name : of the run, usually that of the source
     start : number of the first frame
+    resume : go on after the rows that are there: those of the last frame that is whole in every file;
+        what a power cut left beyond it is cut off
 
     Raises
     ------
@@ -56,15 +61,19 @@ class ResultsWriter:
         Where the directory cannot be written to, before any work is done.
     """
 
-    def __init__(self, directory: str | Path, name: str, start: int = 0) -> None:
+    def __init__(self, directory: str | Path, name: str, start: int = 0, *, resume: bool = False) -> None:
         self.directory = Path(directory)
         self.rows = start
         with contextlib.ExitStack() as files:
             try:
                 self.directory.mkdir(parents=True, exist_ok=True)
+                if resume:
+                    self.rows = _cut(self.directory, name)
                 self._boxes, self._scores, self._times, self._tracks = (
-                    files.enter_context((self.directory / file).open("w", encoding="ascii", buffering=1))
-                    for file in (f"{name}.txt", f"{name}_confidence.value", f"{name}_time.txt", "tracks.csv")
+                    files.enter_context(
+                        (self.directory / file).open("a" if resume else "w", encoding="ascii", buffering=1)
+                    )
+                    for file in (*_rows(name), _TRACKS)
                 )
             except OSError as error:
                 raise VideoError(
@@ -72,7 +81,8 @@ class ResultsWriter:
                     "give a folder that exists or can be made, and that you may write to"
                 ) from None
             self._files = files.pop_all()
-        self._tracks.write(COLUMNS + "\n")
+        if not self._tracks.tell():
+            self._tracks.write(COLUMNS + "\n")
 
     def write(self, track: Track, seconds: float) -> None:
         """Add one frame, and the seconds of work it took. A frame that has its row already is skipped."""
@@ -97,3 +107,77 @@ class ResultsWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def tracks(directory: str | Path) -> Iterator[Track]:
+    """The tracks that `tracks.csv` holds, up to the first that is not whole; none where there is no file."""
+    for _, track in _lines(Path(directory) / _TRACKS):
+        yield track
+
+
+def last_position(directory: str | Path, name: str) -> Position:
+    """After which frame a run goes on that wrote these results: the last one that is whole in every file."""
+    rows, box = _whole(Path(directory), name), None
+    for track in tracks(directory):
+        if track.frame < rows:
+            box = track.box or box
+    return Position(rows, max(rows - 1, 0), box)
+
+
+def _rows(name: str) -> tuple[str, ...]:
+    """Files with a row a frame, also of one that no track was written for."""
+    return f"{name}.txt", f"{name}_confidence.value", f"{name}_time.txt"
+
+
+def _lines(path: Path) -> Iterator[tuple[int, Track]]:
+    """Where each line of `tracks.csv` ends, in bytes, and its track."""
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+        end = len(file.readline())
+        for line in file:
+            try:
+                frame, seconds, state, x, y, w, h, score, version = line.decode("ascii").split(",")
+                box = Box(*map(float, (x, y, w, h))) if x else None
+                track = Track(
+                    int(frame) + 1, int(frame), float(seconds), _state(state), box, float(score), int(version)
+                )
+            except ValueError:  # half a line, or what a disk holds where nothing was written yet
+                return
+            if not line.endswith(b"\n"):
+                return
+            end += len(line)
+            yield end, track
+
+
+def _state(text: str) -> Any:
+    if text not in ("bootstrapping", "present", "absent"):
+        raise ValueError(text)
+    return text
+
+
+def _row_ends(path: Path) -> list[int]:
+    """Where each whole row of a file ends, in bytes."""
+    ends = [0]
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+        for line in file:
+            if not line.endswith(b"\n") or b"\0" in line:
+                break
+            ends.append(ends[-1] + len(line))
+    return ends
+
+
+def _whole(directory: Path, name: str) -> int:
+    """How many frames are whole in every file."""
+    least = min(len(_row_ends(directory / file)) - 1 for file in _rows(name))
+    return max((track.frame + 1 for track in tracks(directory) if track.frame < least), default=0)
+
+
+def _cut(directory: Path, name: str) -> int:
+    """Cut off what is beyond the last frame that is whole in every file; returns how many frames that leaves."""
+    rows = _whole(directory, name)
+    for file in _rows(name):
+        if (directory / file).exists():
+            os.truncate(directory / file, _row_ends(directory / file)[rows])
+    if (directory / _TRACKS).exists():
+        ends = [end for end, track in _lines(directory / _TRACKS) if track.frame < rows]
+        os.truncate(directory / _TRACKS, ends[-1] if ends else 0)
+    return rows

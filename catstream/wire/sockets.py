@@ -29,7 +29,7 @@ from typing import Any, Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from catstream.errors import ProtocolError, ServiceError
+from catstream.errors import ProtocolError, ServiceError, SetBackError
 from catstream.messages import Answer, Command, End, Position, Stored
 from catstream.wire.channels import CHANNELS, Channel
 from catstream.wire.codec import decode, encode, opening
@@ -211,14 +211,15 @@ class Sender(_Socket):
     """The sending side of an acknowledged channel.
 
     sent     newest seq that was given to `send`
-    stored   newest seq that survives the receiver's death
+    settled  newest seq that the receiver will not ask for again while it lives
+    stored   newest seq that survives the receiver's death: less than `settled` while its disk takes nothing
     taken    newest seq that the receiver has taken
     version  newest sample that the receiver has made
     """
 
     def __init__(self, channel: str, endpoint: Endpoint, window: int) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, depth=window + 1)
-        self.sent = self.stored = self.taken = self.version = 0
+        self.sent = self.settled = self.stored = self.taken = self.version = 0
         self._made: deque[tuple[int, int]] = deque(maxlen=_SAMPLES)  # seq that led to a sample, and which
         self._led_to = 0  # the sample that `made` told of last
         self._window = window
@@ -239,7 +240,7 @@ class Sender(_Socket):
 
     def resume(self, seq: int, known: int) -> None:
         """Go on after message `seq` of a sender before this one, of which the receiver has stored `known`."""
-        self.sent = self.stored = self.taken = seq
+        self.sent = self.settled = self.stored = self.taken = seq
         self._known = known + self._window  # what the sender before this one had on its way may be stored by now
 
     def made(self, seq: int) -> int:
@@ -282,9 +283,14 @@ class Sender(_Socket):
                 f"the receiver of {self.channel.name} has stored message {answer.seq}, only {self.sent} were sent: "
                 "it holds another stream, start it anew or this process with --resume"
             )
-        if isinstance(answer, Stored) and (answer.seq < self.stored or answer.taken < self.taken):
-            self._drop("acknowledgement", f"it was said before that {self.taken} were taken and {self.stored} stored")
+        if isinstance(answer, Stored) and (answer.seq < self.settled or answer.taken < self.taken):
+            self._drop("acknowledgement", f"it was said before that {self.taken} were taken and {self.settled} stored")
             return
+        if isinstance(answer, Position) and answer.seq < self.settled:
+            raise SetBackError(
+                f"the receiver of {self.channel.name} had {self.settled} messages and now has {answer.seq}: "
+                "what came between is made again from the source"
+            )
         self._heard = monotonic()
         if answer.version > self.version:
             self.version = answer.version
@@ -292,10 +298,11 @@ class Sender(_Socket):
         while self._waiting and self._waiting[0][0] <= answer.seq:
             self._waiting.popleft()
             self._on_the_way = max(self._on_the_way - 1, 0)
-        self.stored = max(self.stored, min(answer.seq, self.sent))
+        self.settled = max(self.settled, min(answer.seq, self.sent))
+        self.stored = max(self.stored, min(answer.seq - answer.unsaved, self.sent))
         if isinstance(answer, Position):
             self._on_the_way = 0
-            self.taken = self.stored
+            self.taken = self.settled
         else:
             self.taken = min(answer.taken, self.sent)
 
@@ -373,10 +380,10 @@ class Receiver(_Socket):
         return message
 
     def acknowledge(self, position: Position) -> None:
-        """Say that all is taken up to the last message, and stored up to `position.seq`."""
+        """Say that all is taken up to the last message, and stored up to `position.seq`, but for `position.unsaved`."""
         self._position = position
         if self._peer is not None:
-            self._answer(self._peer, Stored(position.seq, self.taken, position.version))
+            self._answer(self._peer, Stored(position.seq, self.taken, position.version, position.unsaved))
 
     def close(self) -> None:
         """Close, after the sender where it has sent its end: a connection that breaks may cost it the last answer."""

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
-from catstream.errors import ProtocolError
+from catstream.errors import ProtocolError, SettingsError
 from catstream.messages import Bearings, Features, Motion, Sample
 from catstream.settings import Settings
 
@@ -205,5 +205,5 @@ def test_a_state_of_another_coreset_size_is_refused(settings, messages, tmp_path
     compressor = Compressor(settings)
     take(compressor, messages, 37)
     compressor.save(tmp_path / "state")
-    with pytest.raises(ProtocolError, match="same settings"):
+    with pytest.raises(SettingsError, match="same settings"):
         Compressor.load(tmp_path / "state", dataclasses.replace(settings, coreset_size=16))

@@ -1,0 +1,135 @@
+"""`catstream track --state` and `--resume`: what was learned outlives every process, and its results go on."""
+
+from __future__ import annotations
+
+import csv
+import time
+
+import psutil
+import pytest
+
+from catstream.compression.generations import Generations
+from catstream.settings import Settings
+from catstream.state import TREES
+from catstream.video.source import open_source
+
+OFTEN = ["--set", "checkpoint_seconds=0.05", "--lockstep"]
+RESULTS = ["demo.txt", "demo_confidence.value", "tracks.csv"]
+
+
+def frames(folder):
+    path = folder / "tracks.csv"
+    return [int(row["frame"]) for row in csv.DictReader(path.read_text().splitlines())] if path.exists() else []
+
+
+def checkpoints(folder):
+    return list((folder / TREES).glob("*.safetensors"))
+
+
+def kill_everything(process):
+    """The command and all its children, which die with it."""
+    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children()]
+    for one in family:
+        one.kill()
+    process.wait()
+    psutil.wait_procs(family, 30)
+
+
+@pytest.fixture
+def killed(video, catstream, tmp_path):
+    """A run that was killed with all its processes, as by a power cut, once it had a checkpoint and some rows."""
+
+    def start(*options, rows=12):
+        source, box = video
+        command = ["track", source, "--box", box, "--output", tmp_path / "out", "--state", tmp_path / "kept"]
+        process = catstream(*command, *OFTEN, *options)
+        deadline = time.monotonic() + 120
+        while not (checkpoints(tmp_path / "kept") and len(frames(tmp_path / "out")) >= rows):
+            assert process.poll() is None, process.communicate()[1]
+            assert time.monotonic() < deadline, "no checkpoint came"
+            time.sleep(0.01)
+        kill_everything(process)
+        return tmp_path / "kept"
+
+    return start
+
+
+@pytest.fixture(scope="module")
+def undisturbed(video, tmp_path_factory):
+    """Results of the same run in one go."""
+    import subprocess
+    import sys
+
+    source, box = video
+    out = tmp_path_factory.mktemp("undisturbed")
+    command = [sys.executable, "-c", "from catstream.cli import main; main()", "track", source, "--box", box]
+    subprocess.run([*command, "--output", str(out), *OFTEN], check=True, capture_output=True)
+    return out
+
+
+def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed, undisturbed, said, tmp_path):
+    kept = killed()
+    before = len(frames(tmp_path / "out"))
+    assert before < 60
+    code, _, errors = said("track", "--resume", kept)
+    assert code == 0, errors
+    for file in RESULTS:
+        assert (tmp_path / "out" / file).read_bytes() == (undisturbed / file).read_bytes()
+    assert "60 messages sent, 60 stored" in errors
+    assert Generations(kept / TREES).load(Settings()).seq == 60
+    code, _, errors = said("track", "--resume", kept)
+    assert code == 0, errors
+    assert frames(tmp_path / "out") == list(range(60)), "a run that is complete gets no row more"
+
+
+def test_rows_that_a_power_cut_tore_are_cut_off_and_written_again(killed, undisturbed, said, tmp_path):
+    kept = killed("--video")
+    for file, cut in [("demo.txt", 60), ("tracks.csv", 100)]:
+        path = tmp_path / "out" / file
+        path.write_bytes(path.read_bytes()[:-cut] + bytes(9))
+    code, _, errors = said("track", "--resume", kept)
+    assert code == 0, errors
+    for file in RESULTS:
+        assert len((tmp_path / "out" / file).read_text().splitlines()) == 60 + (file == "tracks.csv")
+    assert (tmp_path / "out" / "tracks.csv").read_text().splitlines()[:8] == (
+        (undisturbed / "tracks.csv").read_text().splitlines()[:8]
+    )
+    with open_source(tmp_path / "out" / "demo.mp4") as film:
+        assert sum(1 for _ in film) == 60, "the video is drawn again, whole"
+
+
+def test_a_damaged_checkpoint_is_said_and_the_one_before_goes_on(killed, undisturbed, said, tmp_path):
+    kept = killed(rows=25)
+    newest = max(checkpoints(kept))
+    damaged = bytearray(newest.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    newest.write_bytes(damaged)
+    code, _, errors = said("track", "--resume", kept)
+    assert code == 0, errors
+    assert "damaged checkpoints: 1" in errors
+    assert (tmp_path / "out" / "tracks.csv").read_bytes() == (undisturbed / "tracks.csv").read_bytes()
+
+
+def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, catstream, tmp_path):
+    kept, (source, box) = killed(), video
+    refusals = {
+        "go on with it": ["track", source, "--box", box, "--state", kept],
+        "learned with coreset_size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset_size=32"],
+        "frames 3::": ["track", "--resume", kept, "--start", "3"],
+        "no pipeline was kept": ["track", "--resume", tmp_path / "none"],
+        "give one of them": ["track", "--resume", kept, "--state", kept],
+        "needs SOURCE": ["track", source, "--state", tmp_path / "new"],
+    }
+    for word, command in refusals.items():
+        code, _, errors = said(*command)
+        assert code in (1, 2), errors
+        assert word in errors.replace("\n", " ")
+    running = catstream("track", "--resume", kept, "--set", "window=1", *OFTEN)
+    rows = len(frames(tmp_path / "out"))
+    while len(frames(tmp_path / "out")) == rows and running.poll() is None:
+        time.sleep(0.01)
+    code, _, errors = said("track", "--resume", kept)
+    assert code == 1, errors
+    assert "a pipeline that runs keeps its state" in errors
+    assert running.wait(120) == 0
+    assert frames(tmp_path / "out") == list(range(60))

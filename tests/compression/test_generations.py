@@ -1,0 +1,126 @@
+"""Checkpoints on disk: the last two, each whole or not at all, and what is done about one that is damaged."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import os
+
+import numpy as np
+import pytest
+
+from catstream.compression.compressor import Compressor
+from catstream.compression.generations import Generations
+from catstream.errors import SettingsError
+from catstream.messages import Features
+from catstream.settings import Settings
+
+SETTINGS = Settings(coreset_size=8)
+
+
+@pytest.fixture
+def grow(rng):
+    """Gives a compressor so many more messages; returns it."""
+
+    def take(compressor, count=1):
+        for seq in range(compressor.seq + 1, compressor.seq + count + 1):
+            rows, labels = rng.normal(size=(4, 9)).astype(np.float32), np.float32([1, 0, 0, 0.5])
+            compressor.take(Features(seq, seq - 1, 0.0, None, rows, labels, np.ones_like(labels), rows, labels))
+        return compressor
+
+    return take
+
+
+@pytest.fixture
+def kept(grow, tmp_path):
+    """A folder with generations of 40, 50 and 60 messages, of which the first is gone."""
+    compressor, generations = grow(Compressor(SETTINGS), 30), Generations(tmp_path)
+    for _ in range(3):
+        assert generations.save(grow(compressor, 10))
+    return tmp_path
+
+
+def files(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def newest(folder):
+    return max(folder.glob("*.safetensors"))
+
+
+def test_the_newest_two_are_kept_and_the_newest_is_used(kept):
+    assert files(kept) == ["000000000002.safetensors", "000000000003.safetensors"]
+    assert Generations(kept).load(SETTINGS).seq == 60
+
+
+def test_a_folder_without_any_begins_anew(tmp_path):
+    assert Generations(tmp_path).load(SETTINGS).seq == 0
+
+
+@pytest.mark.parametrize("share", [0, 0.001, 0.5, 0.999])
+def test_a_torn_file_is_noticed_and_the_one_before_is_used(kept, share, caplog):
+    whole = newest(kept).read_bytes()
+    newest(kept).write_bytes(whole[: int(share * len(whole))])
+    generations = Generations(kept)
+    assert generations.load(SETTINGS).seq == 50
+    assert "1 damaged checkpoints, the one of frame 49 was used" in generations.trouble
+    assert "cannot be used" in caplog.text
+
+
+def test_no_flipped_bit_goes_unnoticed(kept, rng):
+    """What is loaded is the one or the other, and never anything between."""
+    path, whole = newest(kept), newest(kept).read_bytes()
+    right = {
+        60: Compressor.load(path, SETTINGS).counters(),
+        50: Compressor.load(min(kept.iterdir()), SETTINGS).counters(),
+    }
+    noticed = 0
+    for place in np.concatenate([np.arange(64), rng.integers(0, len(whole), 60)]):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        loaded = Generations(kept).load(SETTINGS)
+        assert loaded.counters() == right[loaded.seq]
+        noticed += loaded.seq == 50
+    assert noticed > 100
+
+
+def test_after_a_damaged_one_the_next_is_kept_beside_the_good_one(kept, grow):
+    newest(kept).write_bytes(b"torn")
+    generations = Generations(kept)
+    assert generations.save(grow(generations.load(SETTINGS), 5))
+    assert files(kept) == ["000000000002.safetensors", "000000000004.safetensors", "damaged"]
+    newest(kept).write_bytes(b"torn")
+    assert Generations(kept).load(SETTINGS).seq == 50
+
+
+def test_where_none_is_whole_all_is_learned_anew_and_said(kept):
+    for path in kept.iterdir():
+        path.write_bytes(b"")
+    generations = Generations(kept)
+    assert generations.load(SETTINGS).seq == 0
+    assert "2 damaged checkpoints, all is learned anew" in generations.trouble
+
+
+def test_a_full_disk_is_said_and_costs_nothing_that_was_kept(kept, grow, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    before, generations = files(kept), Generations(kept)
+    compressor = grow(generations.load(SETTINGS), 5)
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", full)
+        assert not generations.save(compressor)
+    assert generations.failing
+    assert "No space left on device" in generations.trouble
+    assert files(kept) == before
+    assert Generations(kept).load(SETTINGS).seq == 60
+    assert generations.save(compressor)
+    assert not generations.failing
+    assert not generations.trouble
+    assert Generations(kept).load(SETTINGS).seq == 65
+
+
+def test_another_coreset_size_is_refused_and_not_taken_for_damage(kept):
+    with pytest.raises(SettingsError, match="same settings"):
+        Generations(kept).load(dataclasses.replace(SETTINGS, coreset_size=16))
