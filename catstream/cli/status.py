@@ -38,6 +38,7 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
       trees      the coreset trees of the compressor
       source     whether a camera or a stream is there, and the frames skipped
       refused    messages that were not what their channel carries
+      trouble    what is wrong with a process, where something is
       heard      each process, and how long ago it said so
 
     \b
@@ -100,6 +101,7 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
         "skipped": whole(detector, "skipped"),
         "reopened": whole(detector, "reopened"),
         "lost_seconds": detector.get("lost_seconds"),
+        "trouble": {name: heard[-1].trouble for name, heard in reports.items() if heard[-1].trouble},
         "refused": {name: int(counters[name].get("refused", 0)) for name in reports},
         "processes": {
             name: {"seconds_ago": round(max(0.0, time.time() - heard[-1].time), 2), "counters": heard[-1].counters}
@@ -134,5 +136,6 @@ def _text(found: dict[str, Any]) -> str:
             *([source] if found["skipped"] is not None else []),  # a file skips none
             f"refused    {sum(found['refused'].values())} messages",
             f"heard      {', '.join(heard)}",
+            *(f"trouble    {name}: {trouble}" for name, trouble in found["trouble"].items()),
         )
     )
