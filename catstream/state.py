@@ -35,7 +35,7 @@ _HELP = "give another folder"
 _PAUSE_SECONDS = 0.05
 
 #: Settings that change nothing of what is learned: a run may go on with others.
-_FREE = {"endpoint", "lockstep", "lag_frames", "window", "checkpoint_seconds"}
+_FREE = {"endpoint", "keys", "lockstep", "lag_frames", "window", "checkpoint_seconds"}
 
 
 @dataclass(frozen=True, slots=True)

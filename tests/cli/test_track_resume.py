@@ -82,6 +82,7 @@ def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed
     assert frames(tmp_path / "out") == list(range(60)), "a run that is complete gets no row more"
 
 
+@pytest.mark.slow
 def test_rows_that_a_power_cut_tore_are_cut_off_and_written_again(killed, undisturbed, said, tmp_path):
     kept = killed("--video")
     for file, cut in [("demo.txt", 60), ("tracks.csv", 100)]:
@@ -98,6 +99,7 @@ def test_rows_that_a_power_cut_tore_are_cut_off_and_written_again(killed, undist
         assert sum(1 for _ in film) == 60, "the video is drawn again, whole"
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_said_and_the_one_before_goes_on(killed, undisturbed, said, tmp_path):
     kept = killed(rows=25)
     newest = max(checkpoints(kept))

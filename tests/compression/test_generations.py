@@ -63,7 +63,7 @@ def test_a_torn_file_is_noticed_and_the_one_before_is_used(kept, share, caplog):
     newest(kept).write_bytes(whole[: int(share * len(whole))])
     generations = Generations(kept)
     assert generations.load(SETTINGS).seq == 50
-    assert "1 damaged checkpoints, the one of frame 49 was used" in generations.trouble
+    assert "damaged checkpoints: 1, the one of frame 49 was used" in generations.trouble
     assert "cannot be used" in caplog.text
 
 
@@ -99,7 +99,7 @@ def test_where_none_is_whole_all_is_learned_anew_and_said(kept):
         path.write_bytes(b"")
     generations = Generations(kept)
     assert generations.load(SETTINGS).seq == 0
-    assert "2 damaged checkpoints, all is learned anew" in generations.trouble
+    assert "damaged checkpoints: 2, all is learned anew" in generations.trouble
 
 
 def test_a_full_disk_is_said_and_costs_nothing_that_was_kept(kept, grow, monkeypatch):
