@@ -4,7 +4,9 @@
 //     catstream track walk.mp4 --box 120,80,64,48 --set endpoint=run
 //     node examples/subscriber.mjs run
 //
-// Prints every track and each new model, until the pipeline ends. docs/protocol.md says what travels.
+// Where the pipeline asks for keys, their folder is a second argument. Prints every track and each new model, until the pipeline ends. docs/protocol.md says what travels.
+
+import { readFileSync } from "node:fs";
 
 import { decode } from "@msgpack/msgpack";
 import { Subscriber } from "zeromq";
@@ -15,6 +17,21 @@ const PORTS = { models: 2, tracks: 3 }; // counted from that of the endpoint
 function address(endpoint, channel) {
   const [, host, port] = endpoint.match(/^(tcp:\/\/.*):(\d+)$/) ?? [];
   return host ? `${host}:${Number(port) + PORTS[channel]}` : `ipc://${endpoint}/${channel}`;
+}
+
+// The key of this name in one of the files of keys.
+function key(folder, file, name) {
+  return readFileSync(`${folder}/${file}`, "utf8").match(new RegExp(`^${name} = "(.{40})"$`, "m"))[1];
+}
+
+// The options of a socket that holds these keys.
+function secured(folder) {
+  if (!folder) return {};
+  return {
+    curveServerKey: key(folder, "server.pub", "public"),
+    curvePublicKey: key(folder, "client.key", "public"),
+    curveSecretKey: key(folder, "client.key", "secret"),
+  };
 }
 
 // A socket that hears the channel from now on.
@@ -64,13 +81,13 @@ async function followTracks(tracks) {
   }
 }
 
-const [endpoint] = process.argv.slice(2);
+const [endpoint, keys] = process.argv.slice(2);
 if (!endpoint) {
-  console.error("usage: node subscriber.mjs ENDPOINT (a folder, or tcp://127.0.0.1:PORT)");
+  console.error("usage: node subscriber.mjs ENDPOINT [KEYS] (a folder, or tcp://127.0.0.1:PORT; a folder of keys)");
   process.exit(1);
 }
-const tracks = attach(endpoint, "tracks");
-const models = attach(endpoint, "models", { conflate: true });
+const tracks = attach(endpoint, "tracks", secured(keys));
+const models = attach(endpoint, "models", { conflate: true, ...secured(keys) });
 const following = followModels(models);
 await followTracks(tracks);
 models.close(); // ends the other loop

@@ -3,6 +3,8 @@
     catstream track walk.mp4 --box 120,80,64,48 --set endpoint=run
     python examples/subscriber.py run
 
+Where the pipeline asks for keys, their folder is a second argument.
+
 Prints every track and each new model, until the pipeline ends. `docs/protocol.md` says what travels.
 """
 
@@ -10,7 +12,9 @@ from __future__ import annotations
 
 import math
 import sys
+import tomllib
 from array import array
+from pathlib import Path
 
 import msgpack
 import zmq
@@ -26,12 +30,16 @@ def address(endpoint: str, channel: str) -> str:
     return f"ipc://{endpoint}/{channel}"
 
 
-def attach(endpoint: str, channel: str, *, newest: bool) -> zmq.Socket:
+def attach(endpoint: str, channel: str, keys: str, *, newest: bool) -> zmq.Socket:
     """A socket that hears the channel from now on; with `newest` it holds no message but the last."""
     socket = zmq.Context.instance().socket(zmq.SUB)
     if newest:
         socket.setsockopt(zmq.CONFLATE, 1)
     socket.subscribe(b"")
+    if keys:
+        own = tomllib.loads((Path(keys) / "client.key").read_text())
+        socket.curve_serverkey = tomllib.loads((Path(keys) / "server.pub").read_text())["public"].encode()
+        socket.curve_publickey, socket.curve_secretkey = own["public"].encode(), own["secret"].encode()
     socket.connect(address(endpoint, channel))  # the pipeline may come later
     return socket
 
@@ -52,8 +60,8 @@ def norm(weights: dict) -> float:
     return math.hypot(*numbers)
 
 
-def main(endpoint: str) -> None:
-    tracks, models = attach(endpoint, "tracks", newest=False), attach(endpoint, "models", newest=True)
+def main(endpoint: str, keys: str = "") -> None:
+    tracks, models = attach(endpoint, "tracks", keys, newest=False), attach(endpoint, "models", keys, newest=True)
     poller = zmq.Poller()
     poller.register(tracks)
     poller.register(models)
@@ -78,6 +86,6 @@ def main(endpoint: str) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: python subscriber.py ENDPOINT (a folder, or tcp://127.0.0.1:PORT)")
-    main(sys.argv[1])
+    if len(sys.argv) not in (2, 3):
+        sys.exit("usage: python subscriber.py ENDPOINT [KEYS] (a folder, or tcp://127.0.0.1:PORT; a folder of keys)")
+    main(*sys.argv[1:])

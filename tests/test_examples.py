@@ -18,6 +18,7 @@ from catstream.errors import SilenceError
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.demo import write
+from catstream.wire.keys import create
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MODULES = [EXAMPLES / "node_modules" / name for name in ("zeromq", "@msgpack/msgpack")]
@@ -59,14 +60,20 @@ def test_the_rerun_subscriber_writes_what_the_viewer_would_show(tmp_path):
 
 
 @pytest.mark.parametrize("example", ["subscriber.py", "subscriber.mjs"])
-def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(example, tmp_path):
+@pytest.mark.parametrize("secured", [False, True], ids=["without keys", "with keys"])
+def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(example, secured, tmp_path):
     words, (source, boxes) = command(example), write(tmp_path, 60, (320, 240))
+    keys = str(tmp_path / "keys") if secured else ""
+    if secured:
+        create(tmp_path / "keys")
     found, norms = {}, {}
     with (
         # A window of one: the pipeline goes on only as its tracks are taken.
-        Pipeline(str(source), boxes[0], Settings(window=1)) as pipeline,
-        catstream.subscribe(pipeline.endpoint, "models", timeout=0) as models,
-        subprocess.Popen([*words, pipeline.endpoint], stdout=subprocess.PIPE, text=True) as reader,
+        Pipeline(str(source), boxes[0], Settings(window=1, keys=keys)) as pipeline,
+        catstream.subscribe(pipeline.endpoint, "models", timeout=0, keys=keys) as models,
+        subprocess.Popen(
+            [*words, pipeline.endpoint, *([keys] if secured else [])], stdout=subprocess.PIPE, text=True
+        ) as reader,
     ):
         for track in pipeline:
             found[track.frame] = track
