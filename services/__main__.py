@@ -20,15 +20,16 @@ import click
 
 from catstream.box import Box
 from catstream.errors import CatstreamError
-from catstream.services.loop import run
+from catstream.services.loop import Parent, run
 from catstream.services.options import with_part, with_settings
 from catstream.settings import Settings
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.option("--parent", type=int, hidden=True, help="Process id of the one to end with.")
+@click.option("--pulse", type=int, hidden=True, help="File descriptor of the pulse that it watches.")
 @click.pass_context
-def main(context: click.Context, parent: int | None) -> None:
+def main(context: click.Context, parent: int | None, pulse: int | None) -> None:
     """The processes of a catstream pipeline.
 
     They meet at an endpoint: a folder that holds their sockets, or tcp://127.0.0.1:PORT. All need
@@ -40,7 +41,7 @@ def main(context: click.Context, parent: int | None) -> None:
       python -m catstream.services trainer    --set endpoint=run &
       python -m catstream.services detector   --set endpoint=run walk.mp4 --box 120,80,64,48
     """
-    context.obj = parent
+    context.obj = None if parent is None else Parent(parent, pulse)
 
 
 _source = click.argument("source")
@@ -57,7 +58,7 @@ _box = click.option("--box", required=True, metavar="X,Y,W,H", help="The object 
 @with_part
 @with_settings
 @click.pass_obj
-def detector(parent: int | None, settings: Settings, source: str, box: str, **options: Any) -> None:
+def detector(parent: Parent | None, settings: Settings, source: str, box: str, **options: Any) -> None:
     """Frames in; tracks and features out, with the newest model there is."""
     import cv2
 
@@ -73,7 +74,7 @@ def detector(parent: int | None, settings: Settings, source: str, box: str, **op
 @click.option("--record", type=click.Path(path_type=Path), help="File to write all that travels to, or to go on with.")
 @with_settings
 @click.pass_obj
-def compressor(parent: int | None, settings: Settings, **options: Any) -> None:
+def compressor(parent: Parent | None, settings: Settings, **options: Any) -> None:
     """Features in, samples out; owns the coreset trees."""
     from catstream.services import compressor
 
@@ -83,7 +84,7 @@ def compressor(parent: int | None, settings: Settings, **options: Any) -> None:
 @main.command()
 @with_settings
 @click.pass_obj
-def trainer(parent: int | None, settings: Settings) -> None:
+def trainer(parent: Parent | None, settings: Settings) -> None:
     """Samples in, models out."""
     from catstream.services import trainer
 

@@ -19,6 +19,7 @@ from catstream.wire.sockets import Publisher, Receiver
 __all__ = ["main"]
 
 _END_SECONDS = 5.0  # that the end of the tracks, after that of the features, may take
+_STORE_SECONDS = 60.0  # that a slow disk may take
 _LOCK_SECONDS = 10.0  # that a compressor before this one may take to end
 
 
@@ -42,6 +43,7 @@ def main(process: Process, state: Path | None, record: Path | None = None) -> No
         def store(needed: bool = True) -> Position:
             """Write a checkpoint. Where the disk takes none and it is needed, memory has to do: learning goes on."""
             nonlocal stored, tried, settled
+            process.allow(_STORE_SECONDS)
             if generations is None or generations.save(compressor):
                 stored, needed = compressor.seq, True
             tried = time.monotonic()

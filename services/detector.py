@@ -20,6 +20,8 @@ __all__ = ["main"]
 
 # What the last messages may take to be stored where the run was stopped.
 _FAREWELL_SECONDS = 10.0
+_OPEN_SECONDS = 60.0  # that opening the source may take, and learning the first frame
+_SKIP_SECONDS = 0.1  # that decoding a frame may take which is passed over
 _OWNER_SECONDS = 0.5  # the owner may listen no more
 
 _log = logging.getLogger(__name__)
@@ -56,6 +58,7 @@ def main(
             line.resume(detector, box)
         # From the last frame that was stored, which is passed over: there may be none after it.
         first = max(detector.seq - 1, 0)
+        process.allow(_OPEN_SECONDS + first * _SKIP_SECONDS)
         frames = stack.enter_context(open_source(source, first, part=part, since=since, idle=line.idle))
         line.source = frames
         reason, failed = "the source came to its end", False
@@ -68,6 +71,7 @@ def main(
                 if detector.seq:
                     track, features = detector.step(frame.image, frame.time)
                 else:
+                    process.allow(_OPEN_SECONDS)
                     track, features = detector.init(frame.image, box, frame.time)
                 line.send(replace(track, pts=frame.pts), features)
                 line.previews.show(track.frame, frame.image, track.box)

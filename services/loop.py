@@ -8,22 +8,37 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 from catstream.errors import CatstreamError, SetBackError
 from catstream.messages import Health, Run
 from catstream.recording.file import run_of
+from catstream.services.pulse import PATIENCE, Pulse
 from catstream.settings import Settings
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.refusals import refusals
 from catstream.wire.sockets import Publisher
 
-__all__ = ["REFUSED", "Process", "die_with", "run"]
+__all__ = ["REFUSED", "Parent", "Process", "die_with", "run"]
 
 #: Exit code of a process that would fail the same way again: it is not restarted.
 REFUSED = 2
 
+_CLOSE_SECONDS = 30.0
+_QUICK_SIZE = 128  # coreset size up to which a turn of compressor and trainer is short on any machine
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 _log = logging.getLogger(__name__)
+
+
+class Parent(NamedTuple):
+    """Who started a process, and is not to be outlived.
+
+    pid    its process id
+    pulse  file descriptor of the memory in which it watches the pulse; None where it does not
+    """
+
+    pid: int
+    pulse: int | None
 
 
 class Process:
@@ -33,11 +48,14 @@ class Process:
     trouble : what is wrong, for a person; told with its health
     """
 
-    def __init__(self, name: str, settings: Settings) -> None:
+    def __init__(self, name: str, settings: Settings, pulse: int | None = None) -> None:
         self.name = name
         self.settings = settings
         self.endpoint = Endpoint.parse(settings.endpoint, settings.keys)
         self.trouble = ""
+        # All but the detector turn in a time that grows with the coreset size.
+        factor = 1.0 if name == "detector" else max(1.0, (settings.coreset_size / _QUICK_SIZE) ** 2)
+        self._pulse = Pulse(pulse, PATIENCE * factor)
         self._asked = float("inf")  # when it was asked to end
         self._health = Publisher("health", self.endpoint, sender=name)
         self._beat = 0.0
@@ -59,12 +77,19 @@ class Process:
         return time.monotonic() - self._asked >= seconds
 
     def beat(self, counters: Callable[[], dict[str, float]], now: bool = False) -> None:
-        """Tell how it is, once a second; cheap to call in every turn of a loop."""
+        """Tell how it is, once a second; cheap, and to be called in every turn of a loop."""
+        self._pulse.beat()
+        if now:  # it may be the last turn, after which sockets take their time to close
+            self._pulse.allow(_CLOSE_SECONDS)
         if now or time.monotonic() - self._beat >= 1:
             self._beat = time.monotonic()
             self._health.send(Health(self.name, time.time(), counters() | refusals(), self.trouble))
         else:
             self._health.welcome()
+
+    def allow(self, seconds: float) -> None:
+        """Say that this turn of the loop may take so long: it is not stuck before."""
+        self._pulse.allow(seconds)
 
     def close(self) -> None:
         """Send the last health, then close."""
@@ -74,12 +99,12 @@ class Process:
         self._asked = min(self._asked, time.monotonic())
 
 
-def run(name: str, main: Callable[[Process], None], settings: Settings, parent: int | None) -> int:
+def run(name: str, main: Callable[[Process], None], settings: Settings, parent: Parent | None) -> int:
     """Be a process of the pipeline until it ends.
 
     Parameters
     ----------
-    parent : process id of the one that started this, not to be outlived; None to be independent
+    parent : the one that started this; None to be independent
 
     Returns
     -------
@@ -88,9 +113,9 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
     """
     logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
     if parent is not None:
-        die_with(parent)
+        die_with(parent.pid)
     try:
-        process = Process(name, settings)
+        process = Process(name, settings, parent.pulse if parent else None)
         try:
             main(process)
         finally:

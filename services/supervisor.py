@@ -19,6 +19,7 @@ from typing import IO
 from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.services.loop import REFUSED
+from catstream.services.pulse import Pulse
 from catstream.settings import Settings
 from catstream.video.source import WHOLE
 from catstream.wire.endpoint import meeting_place, private_folder
@@ -32,6 +33,8 @@ _RESTARTS, _PER_SECONDS = 5, 60.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 5.0
 _FAREWELL_SECONDS = 12.0
 _APART_SECONDS = 3.0  # between the ends of compressor and detector, where both have ended well
+_BLINK_SECONDS = 0.5  # that count at most from one look at the children to the next: who slept longer saw nothing
+_STOPPED_SECONDS = 2.0  # that a process may stand still as SIGSTOP makes it, whatever it was doing
 _LAST_WORDS = 2000  # bytes of a child's log that may hold why it died
 _NEWS = 65536  # bytes of it that are looked through at once
 
@@ -44,15 +47,35 @@ class _Child:
 
     name: str
     log: IO[bytes]
+    pulse: Pulse = field(default_factory=Pulse)
     process: subprocess.Popen[bytes] | None = None
     restarts: deque[float] = field(default_factory=deque)
     due: float = 0.0
     seen: float = 0.0  # when it last ran
     told: int = 0  # bytes of the log that were news
+    turns: float = 0.0  # of its loop, when they were last counted
+    silent: float = 0.0  # seconds since the count last changed
+    stopped: float = 0.0  # of which it was stopped
+    hung: bool = False  # and was killed for it
 
     @property
     def finished(self) -> bool:
         return self.process is not None and self.process.poll() == 0
+
+    def hangs(self, seconds: float) -> bool:
+        """Whether its loop has stood still for too long, having been watched for so many seconds more."""
+        turns = self.pulse.turns
+        if turns != self.turns:
+            self.turns, self.silent, self.stopped = turns, 0.0, 0.0
+            return False
+        self.silent += seconds
+        self.stopped = self.stopped + seconds if self.silent > _BLINK_SECONDS and self._is_stopped() else 0.0
+        return self.silent > self.pulse.patience or self.stopped > _STOPPED_SECONDS
+
+    def _is_stopped(self) -> bool:
+        with contextlib.suppress(OSError):  # it is gone
+            return Path(f"/proc/{self.process and self.process.pid}/stat").read_text().rpartition(") ")[2][:1] == "T"
+        return False
 
     def news(self) -> list[str]:
         """The lines that it logged since the last time, without what Python says by itself."""
@@ -73,7 +96,8 @@ class _Child:
 class Supervisor:
     """The children of one pipeline.
 
-    Call `check` now and then: it restarts who died, after a pause that doubles, at most 5 times a minute each.
+    Call `check` ten times a second: it restarts who died or hangs, after a pause that doubles, at most 5 times a
+    minute each.
 
     Parameters
     ----------
@@ -107,6 +131,7 @@ class Supervisor:
         self._record = record
         # A restarted detector goes on with the times of a live source.
         self._since = time.monotonic() if since is None else since
+        self._checked = time.monotonic()
         self._children = {name: _Child(name, (folder / f"{name}.log").open("w+b")) for name in NAMES}
         for child in self._children.values():
             self._start(child)
@@ -132,7 +157,7 @@ class Supervisor:
         return self._children[name].news()
 
     def check(self) -> None:
-        """Restart who died, and log it.
+        """Restart who died, kill who hangs, and log it.
 
         Raises
         ------
@@ -142,6 +167,8 @@ class Supervisor:
         if self.finished:
             return
         detector = self._children["detector"]
+        before, self._checked = self._checked, time.monotonic()
+        watched = min(self._checked - before, _BLINK_SECONDS)
         for child in self._children.values():
             now = time.monotonic()
             if child.process is None:
@@ -151,10 +178,14 @@ class Supervisor:
             code = child.process.poll()
             if code is None:
                 child.seen = now
+                if child.hangs(watched) and not child.hung:
+                    _log.warning("the %s hangs: nothing came of it for %.1f s", child.name, child.silent)
+                    child.hung = True
+                    child.process.kill()
                 continue
             if code == 0:
-                # A detector that died after its end repeats it, to others that have left by then.
-                if child is not detector and detector.restarts and now - child.seen > _APART_SECONDS:
+                # It was told to end, and the detector was not; or that died after its end, and repeats it.
+                if child is not detector and now - child.seen > _APART_SECONDS:
                     self._start(child)
                 continue
             if code == REFUSED:
@@ -187,9 +218,14 @@ class Supervisor:
                     child.process.kill()
                     child.process.wait()
                 child.log.close()
+                child.pulse.close()
 
     def _start(self, child: _Child) -> None:
-        command = [sys.executable, "-m", "catstream.services", "--parent", str(os.getpid()), child.name]
+        child.pulse.close()
+        child.pulse, child.hung = Pulse(), False
+        child.turns, child.silent, child.stopped = 0.0, 0.0, 0.0
+        watched = ["--parent", str(os.getpid()), "--pulse", str(child.pulse.handle)]
+        command = [sys.executable, "-m", "catstream.services", *watched, child.name]
         for pair in self._settings.changed():
             command += ["--set", pair]
         if child.name == "detector":
@@ -208,6 +244,7 @@ class Supervisor:
             env=own,
             stdin=subprocess.DEVNULL,
             stderr=child.log,
+            pass_fds=[child.pulse.handle],
             start_new_session=True,  # Ctrl-C is for the parent, which then ends them in order
         )
 

@@ -9,6 +9,8 @@ from catstream.wire.sockets import Publisher, Subscriber
 
 __all__ = ["main"]
 
+_TRAIN_SECONDS = 60.0  # that learning a model may take, and the first one its imports
+
 
 def main(process: Process) -> None:
     """Learn a model from each sample that comes, until the stream ends."""
@@ -24,6 +26,7 @@ def main(process: Process) -> None:
             end = isinstance(message, End)
             # An older one comes from a compressor that lost the newer: it is made again, and a detector may need this.
             if message is not None and not end and message.version != version:
+                process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
                 version, trained = message.version, trained + 1
             models.welcome()

@@ -13,6 +13,7 @@ from catstream.box import Box
 from catstream.compression.generations import Generations
 from catstream.errors import ServiceError
 from catstream.messages import End
+from catstream.pipeline import Pipeline
 from catstream.services.supervisor import NAMES, Supervisor
 from catstream.settings import Settings
 from catstream.state import TREES
@@ -87,3 +88,21 @@ def check_for_a_minute(supervisor, turn=lambda: None):
         turn()
         supervisor.check()
         time.sleep(0.01)
+
+
+@pytest.mark.parametrize("victim", NAMES)
+def test_a_process_that_hangs_is_noticed_and_replaced(video, victim):
+    path, boxes = video
+    stopped, tracks = 0, []
+    with Pipeline(path, boxes[0], Settings(window=16)) as pipeline:
+        for track in pipeline:
+            tracks.append(track.frame)
+            if track.frame == 60:
+                stopped = pipeline.pids[victim]
+                os.kill(stopped, signal.SIGSTOP)
+            if track.frame > 60 and victim == "trainer" and not pipeline.restarts:
+                time.sleep(0.1)  # it is not needed for the rest of the video: do not reach the end before it is missed
+        assert pipeline.restarts >= 1
+        assert not psutil.pid_exists(stopped)
+        assert pipeline.totals == {"sent": len(boxes), "stored": len(boxes)}
+    assert tracks == list(range(len(boxes)))
