@@ -1,0 +1,70 @@
+"""A disk that is full or read-only: tracking goes on, it is said, and nothing that was kept is damaged."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+
+import pytest
+
+from catstream.compression.generations import Generations
+from catstream.pipeline import Pipeline
+from catstream.settings import Settings
+from catstream.state import TREES
+from catstream.subscription import subscribe
+
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small disk")
+
+#: A small window is soon full, a short pause soon over: the disk is noticed within this video.
+SETTINGS = Settings(window=16, checkpoint_seconds=0.2)
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A disk of 64 MB, a tmpfs."""
+    done = mount("-t", "tmpfs", "-o", "size=64m", "tmpfs", tmp_path)
+    if done.returncode:
+        pytest.skip(f"this machine mounts no tmpfs: {done.stderr.strip()}")
+    yield tmp_path
+    subprocess.run(["umount", "--lazy", tmp_path], check=True)
+
+
+def mount(*words):
+    return subprocess.run(["mount", *words], capture_output=True, text=True, check=False)
+
+
+def fill(disk, _):
+    with (disk / "ballast").open("wb", buffering=0) as file, contextlib.suppress(OSError):
+        while True:
+            file.write(bytes(1 << 16))
+
+
+def lock(disk, until):
+    until(lambda: not mount("-o", "remount,ro", disk).returncode)  # busy while a checkpoint is written
+
+
+DISKS = {
+    "full": (fill, lambda disk: (disk / "ballast").unlink(), "No space left"),
+    "read-only": (lock, lambda disk: mount("-o", "remount,rw", disk), "Read-only file system"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "mend", "reason"), DISKS.values(), ids=DISKS)
+def test_a_disk_that_takes_nothing_stops_nothing_and_is_said(video, disk, until, spoil, mend, reason):
+    path, boxes = video
+    state, tracks, said = disk / "kept", [], ""
+    with Pipeline(path, boxes[0], SETTINGS, state=state) as pipeline:
+        for track in pipeline:
+            tracks.append(track.frame)
+            if track.frame == 40:
+                spoil(disk, until)
+            if track.frame == 100:
+                with subscribe(pipeline.endpoint, "health", timeout=60) as reports:
+                    said = next(report.trouble for report in reports if report.trouble)
+                assert 0 < Generations(state / TREES).load(SETTINGS).seq < 100, "what was kept before is whole"
+                mend(disk)
+    assert reason in said
+    assert tracks == list(range(len(boxes)))
+    assert pipeline.totals == {"sent": len(boxes), "stored": len(boxes)}, "checkpoints went on once there was room"
+    assert Generations(state / TREES).load(SETTINGS).seq == len(boxes)
