@@ -205,7 +205,9 @@ def _mark(message: Health | Model | Sample | Preview) -> tuple[str, float]:
     """Who sent it, and what tells it from the one before."""
     if isinstance(message, Health):
         return message.process, message.time
-    return "", message.frame if isinstance(message, Preview) else message.version
+    if isinstance(message, Preview):  # while no frame is followed, all of a live source have one number
+        return "", hash((message.frame, message.jpeg))
+    return "", message.version
 
 
 @overload

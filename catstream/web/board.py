@@ -165,6 +165,8 @@ class Board:
             "reason": self.reason,
             "endpoint": self.endpoint,
             "processes": sorted(self.health),
+            "paused": bool(self.counter("detector", "paused")),
+            "waiting": bool(self.counter("detector", "waiting")),
             "lost_seconds": self.counter("detector", "lost_seconds"),
             "skipped": self.counter("detector", "skipped"),
         }

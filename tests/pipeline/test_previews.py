@@ -72,6 +72,16 @@ def test_who_begins_to_look_while_no_frame_comes_sees_the_newest(previews, looks
         assert next(reader).frame == 4
 
 
+def test_frames_that_pass_by_while_none_is_followed_are_seen_though_they_have_one_number(previews, looks, until):
+    seen = []
+    with looks() as reader:
+        reader.timeout = 0
+        for grey in (0, 255):
+            previews.show(3, np.full((48, 64, 3), grey, np.uint8), None)
+            until(lambda: seen.extend(_here(reader)) or any(_grey(preview) == grey for preview in seen), previews.turn)  # noqa: B023
+    assert [_grey(preview) for preview in seen] == [0, 255]
+
+
 def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
     seen = []
     with looks() as reader:
@@ -86,6 +96,10 @@ def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
         until(lambda: 199 in seen, look)
     assert seen == sorted(set(seen))
     assert len(seen) < 200
+
+
+def _grey(preview):
+    return int(np.median(cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)))
 
 
 def _here(reader):

@@ -41,11 +41,13 @@ function say(text, wrong = false) {
 
 /** Stand still, for a box to be drawn: the frame that it will be in, and how to go on afterwards. */
 async function pause() {
+  if (status.waiting) return { frame: Infinity, leave: null };
   const before = paused;
   const answer = await steer("pause");
   if (!answer) return null;
   say("Paused for your box.");
-  return { frame: answer.frame, leave: before ? null : () => steer("resume") };
+  // The frame after the last one that was followed is held, and the box is in that.
+  return { frame: answer.frame + 1, leave: before ? null : () => steer("resume") };
 }
 
 async function follow(box, leave) {
@@ -73,9 +75,11 @@ function showPaused(now) {
 function showState() {
   const running = status.standing === "running";
   const lost = running && status.lost_seconds > 0;
-  let state = running ? (track ? track.state : "waiting") : status.standing;
+  const waiting = running && status.waiting;
+  let state = running ? (track && !waiting ? track.state : "waiting") : status.standing;
   let words = { waiting: "waiting", gone: "pipeline gone", ended: "ended" }[state] || state;
   if (lost) [state, words] = ["gone", `source lost for ${Math.round(status.lost_seconds)} s`];
+  else if (waiting) words = "waiting for a box";
   else if (running && paused) words = `paused, ${words}`;
   const pill = $("#state");
   pill.dataset.state = state;
@@ -94,9 +98,8 @@ function showState() {
 const show = {
   status(part) {
     if (part.standing !== "running" && status.standing === "running") stage.cancel(false);
-    if (part.standing !== "running") paused = false;
     status = part;
-    showPaused(part.paused ?? paused);
+    showPaused(Boolean(part.paused));
   },
   track(part) {
     track = part;
@@ -139,6 +142,7 @@ $("#sure").onclose = (event) => {
   if (event.target.returnValue === "stop") steer("stop");
   event.target.returnValue = "";
 };
+addEventListener("resize", () => { stage.draw(); trees.redraw(); });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { stage.draw(); film.draw(); });
 showState();
 listen();

@@ -32,7 +32,7 @@ export class Stage {
       const wanted = this.next;
       this.next = null;
       const response = await fetch(`/pictures/${wanted.frame}.jpg`).catch(() => null);
-      if (!response?.ok || (this.still && this.still.frame < wanted.frame)) continue;
+      if (!response?.ok || (this.still && this.still.frame < wanted.frame)) continue; // it stands still
       const bitmap = await createImageBitmap(await response.blob()).catch(() => null);
       if (!bitmap) continue;
       this.bitmap?.close();

@@ -15,6 +15,7 @@ export function figure(kind, title, tone, drawing) {
   const caption = document.createElement("figcaption");
   const [left, right] = [document.createElement("span"), document.createElement("b")];
   left.textContent = title;
+  right.textContent = "–";
   caption.append(left, right);
   element.append(caption, drawing);
   return { element, caption, left, right };

@@ -30,6 +30,10 @@ export class Trees {
     }
   }
 
+  redraw() {
+    for (const tree of this.trees) if (tree.leaves >= 0) this.draw(tree, tree.leaves);
+  }
+
   draw(tree, count) {
     const before = new Set(nodes(Math.max(0, tree.leaves)).map(key));
     const kept = nodes(count);
