@@ -24,8 +24,8 @@ import numpy as np
 from table import Table, command, publish
 
 with atheris.instrument_imports(include=["catstream"]):
+    from catstream import storage
     from catstream.box import Box
-    from catstream.compression import storage
     from catstream.compression.compressor import Compressor
     from catstream.errors import CatstreamError, ProtocolError, RecordingError, ServiceError, SettingsError
     from catstream.messages import (

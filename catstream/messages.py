@@ -61,6 +61,7 @@ class Bearings:
     state      as in `Track`
     window     where it looks next
     sure       where it was when it was last sure
+    first      where it was in its first frame, None while it was not found yet
     usual      score that the object usually has
     elsewhere  whether it was found by a search of the whole frame, and is not trusted yet
     motion     the Kalman filter's parameters, None before it has any
@@ -70,6 +71,7 @@ class Bearings:
     state: State
     window: Box
     sure: Box
+    first: Box | None
     usual: float
     elsewhere: bool
     motion: Motion | None = None
@@ -90,6 +92,7 @@ class Features:
     extents   float32 (s, d): the object cut as it is, too small, too large, too wide and too narrow; s may be 0
     fits      float32 (s,): how well each of those fits, 1 as it is, towards 0 far from it
     bearings  from where a restarted detector goes on; None where the sender has none
+    begins    whether another object begins here: what was learned before is forgotten
     """
 
     seq: int
@@ -102,6 +105,7 @@ class Features:
     extents: np.ndarray
     fits: np.ndarray
     bearings: Bearings | None = None
+    begins: bool = False
 
 
 @dataclass(frozen=True, slots=True)

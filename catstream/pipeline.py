@@ -18,6 +18,7 @@ from typing import Self
 
 from catstream.box import Box
 from catstream.errors import RecordingError, ServiceError, SettingsError, VideoError
+from catstream.learned import Learned
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
@@ -44,8 +45,11 @@ class Pipeline:
     Parameters
     ----------
     source : a video file, a folder of images, a pattern, a camera, a stream: see `catstream.video.source`
-    box : x, y, w, h of the object in the first frame, in pixels
+    box : x, y, w, h of the object in the first frame, in pixels; with neither this nor a model the
+        first frame is held, or those of a live source pass by, until `catstream.control` sets a box
     settings : all defaults where None
+    model : file that `catstream save` wrote: the object is searched for, absent until it is found, and
+        learning goes on from there
     part : which frames of a file or folder there are to follow, `slice(100, 200, 2)` for 100, 102 ... 198
     record : file to write all that travels to, see `catstream.recording`; no features are missing there
     state : folder to keep what was learned in, so that a power cut does not end the run: once a second, and at the end
@@ -69,7 +73,8 @@ class Pipeline:
     SettingsError
         From the constructor, for settings that the source cannot be followed with: a live one in lockstep.
     ServiceError, ProtocolError
-        From the constructor, where nothing was kept in the folder to resume, or it is damaged.
+        From the constructor, for a model that cannot be read; where nothing was kept in the folder to resume, or it
+        is damaged.
     ServiceError
         On entering, where the endpoint or the folder of the state is in use. While iterating, where a process
         cannot be kept alive.
@@ -83,6 +88,7 @@ class Pipeline:
         box: Sequence[float] | None = None,
         settings: Settings | None = None,
         *,
+        model: str | os.PathLike[str] | None = None,
         part: slice = WHOLE,
         record: str | os.PathLike[str] | None = None,
         state: str | os.PathLike[str] | None = None,
@@ -96,13 +102,21 @@ class Pipeline:
         self.settings, self.part, self.notes = settings or Settings(), part, dict(notes or {})
         self.after: Position | None = None
         if self._kept is not None:
-            source, box = source or self._kept.source, box or self._kept.box
+            source = source or self._kept.source
+            if box is None and model is None:
+                box, model = self._kept.box, self._kept.model or None
             self.settings, self.notes = settings or self._kept.settings, {**self._kept.notes, **self.notes}
             self.part = self._kept.part if part == WHOLE else part
-        if source is None or box is None:
-            raise SettingsError("a new run needs a source, and a box in its first frame: give both")
-        self.source, self._box = str(source), Box(*map(float, box))
+        if source is None:
+            raise SettingsError("a new run needs a source: give one")
+        self.source = str(source)
+        self._box = Box(*map(float, box)) if box is not None else None
         self._record = None if record is None else Path(record)
+        self._model = Path(model) if model is not None else None
+        if self._box is not None and self._model is not None:
+            raise SettingsError("a box says where the object is, with a model it is searched for: give one of them")
+        if self._model is not None:
+            Learned.load(self._model)
         self._end: End | None = None
         self._health: dict[str, Health] = {}
         if self.settings.lockstep and is_live(self.source):
@@ -113,11 +127,13 @@ class Pipeline:
         with open_source(self.source, part=self.part) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
-        self._box.inside(*self.size)
+        if self._box is not None:
+            self._box.inside(*self.size)
         self.settings = self.settings.for_length(self.frames)
         path = self.source if self.live else str(Path(self.source).absolute())
         started = self._kept.started if self._kept else time.time()
-        self._origin = Origin(path, self._box, self.part, self.settings, self.size, started, self.notes)
+        kept = str(self._model.absolute()) if self._model is not None else ""
+        self._origin = Origin(path, self._box, self.part, self.settings, self.size, started, self.notes, kept)
         if self._kept is not None and self._state is not None:
             self._kept.check(self._state, self._origin)
 
@@ -137,6 +153,7 @@ class Pipeline:
                 self._origin.box,
                 settings,
                 folder,
+                model=self._model,
                 owned=True,
                 part=self.part,
                 record=self._record,
@@ -198,6 +215,17 @@ class Pipeline:
     def lost_seconds(self) -> float:
         """For how long a live source has been lost, 0 while it is not."""
         return self.health.get("detector", {}).get("lost_seconds", 0.0)
+
+    @property
+    def waits(self) -> bool:
+        """Whether it begins by waiting for a box."""
+        return self._box is None and self._model is None
+
+    @property
+    def holding(self) -> str:
+        """Why no frame is followed though there are some, empty where they are: "paused", or "waiting" for a box."""
+        told = self.health.get("detector", {})
+        return next((name for name in ("waiting", "paused") if told.get(name)), "")
 
     @contextmanager
     def _begun(self, folder: Path) -> Iterator[Path]:

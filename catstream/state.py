@@ -1,6 +1,7 @@
 """The state of a pipeline on disk: what it needs to go on after a power cut.
 
     DIR/origin.safetensors  what it was started with
+    DIR/orders.json         what was commanded: see `catstream.services.helm`
     DIR/trees/              the compressor's checkpoints: see `catstream.compression.generations`
 
 A pipeline holds DIR for itself, and its compressor DIR/trees: by locks of the kernel, which are
@@ -18,8 +19,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from catstream import storage
 from catstream.box import Box
-from catstream.compression import storage
 from catstream.compression.generations import Generations
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import Position
@@ -43,21 +44,23 @@ class Origin:
     """What a pipeline was started with.
 
     source    as `catstream.video.source.open_source` takes it, from any working directory
-    box       of the object in the first frame
+    box       of the object in the first frame, None where it was searched for, or waited for
     part      which frames of the source there are to follow
     settings  all of them
     size      width and height of the frames
     started   seconds since 1970
     notes     what whoever started it wants to know when it goes on: name -> text
+    model     file of the model that it is searched for with, empty where there is none
     """
 
     source: str
-    box: Box
+    box: Box | None
     part: slice
     settings: Settings
     size: tuple[int, int]
     started: float
     notes: dict[str, str] = field(default_factory=dict)
+    model: str = ""
 
     def save(self, folder: Path) -> None:
         """Begin the state in a folder that is held; or change what it says, where it goes on.
@@ -90,7 +93,7 @@ class Origin:
         facts: dict[str, Any] = storage.read(folder / _FILE)[1]
         try:
             made = {
-                "box": Box(*facts["box"]),
+                "box": facts["box"] and Box(*facts["box"]),
                 "part": slice(*facts["part"]),
                 "settings": Settings.of(facts["settings"]),
                 "size": tuple(facts["size"]),

@@ -10,15 +10,19 @@ Each command is asked again until it is answered, and carried out once.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from dataclasses import replace
+from time import monotonic
 from typing import Self
 from uuid import uuid4
 
 from catstream.box import Box
 from catstream.errors import RefusedError, SilenceError
-from catstream.messages import Answer, Command, Verb
+from catstream.learned import Learned
+from catstream.messages import Answer, Command, Model, Sample, Verb
 from catstream.wire.endpoint import find
-from catstream.wire.sockets import Requester
+from catstream.wire.sockets import Requester, Subscriber
 
 __all__ = ["Control", "control"]
 
@@ -40,9 +44,9 @@ class Control:
     """
 
     def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "") -> None:
-        place = find(endpoint, keys)
-        self.endpoint, self.timeout = str(place), timeout
-        self._commands = Requester("control", place)
+        self._place = find(endpoint, keys)
+        self.endpoint, self.timeout = str(self._place), timeout
+        self._commands = Requester("control", self._place)
 
     def set_box(self, box: Sequence[float], *, keep: bool = False) -> Answer:
         """Say where the object is in the newest frame: x, y, w, h in pixels.
@@ -60,6 +64,23 @@ class Control:
         """Take frames again."""
         return self._ask("resume")
 
+    def save(self, path: str | os.PathLike[str]) -> Answer:
+        """Write what was learned of the object to a file of this machine, whole or not at all: see `Learned`.
+
+        The pipeline writes nothing: the file is made here, of its newest model and sample.
+
+        Raises
+        ------
+        ServiceError
+            Where the file cannot be written.
+        """
+        answer = self._ask("save")
+        if answer.box is None:
+            raise RefusedError("save: the object was not seen yet: ask again once it was")
+        model, sample = self._newest(answer.version)
+        Learned(model, sample, answer.box).save(path)
+        return replace(answer, version=model.version)
+
     def stop(self) -> Answer:
         """End the stream as if the source had come to its end: all that was learned is stored first."""
         return self._ask("stop")
@@ -73,6 +94,20 @@ class Control:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _newest(self, version: int) -> tuple[Model, Sample]:
+        """The newest model, at least of this version, and the sample that it was learned from."""
+        model, samples, deadline = None, dict[int, Sample](), monotonic() + self.timeout
+        with Subscriber("models", self._place) as models, Subscriber("samples", self._place) as newest:
+            while monotonic() < deadline:
+                samples |= {sample.version: sample for sample in newest.waiting() if isinstance(sample, Sample)}
+                model = models.receive(0.05) or model
+                if model is not None and model.version >= version and model.version in samples:
+                    return model, samples[model.version]
+        raise SilenceError(
+            f"no model and its sample came from {self.endpoint} within {self.timeout:g} s: "
+            "ask how it is (catstream status)"
+        )
 
     def _ask(self, verb: Verb, box: Box | None = None, keep: bool = False) -> Answer:
         answer = self._commands.ask(Command(uuid4().hex, verb, box, keep), self.timeout)

@@ -18,10 +18,9 @@ from typing import Any
 
 import click
 
-from catstream.box import Box
 from catstream.errors import CatstreamError
 from catstream.services.loop import Parent, run
-from catstream.services.options import with_part, with_settings
+from catstream.services.options import with_model, with_object, with_part, with_settings
 from catstream.settings import Settings
 
 
@@ -45,33 +44,33 @@ def main(context: click.Context, parent: int | None, pulse: int | None) -> None:
 
 
 _source = click.argument("source")
-_box = click.option("--box", required=True, metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
 
 
 @main.command()
 @_source
-@_box
 @click.option("--resume", is_flag=True, help="Go on where a detector before this one stopped.")
 @click.option("--owned", is_flag=True, help="Somebody takes every track from the channel `results`.")
 @click.option("--recorded", is_flag=True, help="Begin once somebody listens to the tracks: the compressor records.")
+@click.option("--state", type=click.Path(path_type=Path), help="Folder to keep in what was commanded.")
 @click.option("--since", type=float, hidden=True, help="Moment that the times of a live source count from.")
+@with_object
 @with_part
 @with_settings
 @click.pass_obj
-def detector(parent: Parent | None, settings: Settings, source: str, box: str, **options: Any) -> None:
+def detector(parent: Parent | None, settings: Settings, **options: Any) -> None:
     """Frames in; tracks and features out, with the newest model there is."""
     import cv2
 
     from catstream.services import detector
 
     cv2.setNumThreads(1)
-    action = partial(detector.main, source=source, box=Box.parse(box), **options)
-    sys.exit(run("detector", action, settings, parent))
+    sys.exit(run("detector", partial(detector.main, **options), settings, parent))
 
 
 @main.command()
 @click.option("--state", type=click.Path(path_type=Path), help="Folder of the checkpoint to go on from.")
 @click.option("--record", type=click.Path(path_type=Path), help="File to write all that travels to, or to go on with.")
+@with_model
 @with_settings
 @click.pass_obj
 def compressor(parent: Parent | None, settings: Settings, **options: Any) -> None:
@@ -93,14 +92,14 @@ def trainer(parent: Parent | None, settings: Settings) -> None:
 
 @main.command()
 @_source
-@_box
+@with_object
 @with_part
 @with_settings
-def supervisor(settings: Settings, source: str, box: str, part: slice) -> None:
+def supervisor(settings: Settings, source: str, **options: Any) -> None:
     """Start the other three on a source, and keep them running."""
     from catstream.services import supervisor
 
-    supervisor.main(source, Box.parse(box), settings, part)
+    supervisor.main(source, settings, **options)
 
 
 if __name__ == "__main__":

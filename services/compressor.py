@@ -9,6 +9,7 @@ from pathlib import Path
 
 from catstream.compression.compressor import Compressor
 from catstream.compression.generations import Generations
+from catstream.learned import Learned
 from catstream.messages import End, Features, Position
 from catstream.recording.file import RecordingWriter
 from catstream.services.loop import Process
@@ -23,11 +24,12 @@ _STORE_SECONDS = 60.0  # that a slow disk may take
 _LOCK_SECONDS = 10.0  # that a compressor before this one may take to end
 
 
-def main(process: Process, state: Path | None, record: Path | None = None) -> None:
+def main(process: Process, model: Path | None, state: Path | None, record: Path | None = None) -> None:
     """Take every message once, until the stream ends.
 
     Parameters
     ----------
+    model : file of what was learned of the object before: the trees go on from it
     state : folder of the checkpoints that a restarted compressor goes on from; without one,
         what was taken counts as stored
     record : file to write all that travels to, features as they are taken; one that is there is gone on with
@@ -38,6 +40,8 @@ def main(process: Process, state: Path | None, record: Path | None = None) -> No
         if state is not None:
             generations = Generations(stack.enter_context(held(state / TREES, _LOCK_SECONDS)))
         compressor = generations.load(settings) if generations else Compressor(settings)
+        if model is not None and not compressor.seq:
+            compressor = Compressor.of(Learned.load(model).sample, settings)
         stored, tried, settled = compressor.seq, time.monotonic(), compressor.position
 
         def store(needed: bool = True) -> Position:
@@ -90,7 +94,7 @@ def main(process: Process, state: Path | None, record: Path | None = None) -> No
             if message is not None or settled is not before:
                 # The end of the stream holds no features: with all before it, it is stored too. A sample needs
                 # no checkpoint to be made: in lockstep the detector waits for its model.
-                now = replace(settled, version=compressor.version)
+                now = replace(settled, version=compressor.sampled)
                 if end:
                     now = replace(now, seq=message.seq, unsaved=now.unsaved and now.unsaved + 1)
                 features.acknowledge(now)

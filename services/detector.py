@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import logging
+import time
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 
 from catstream.box import Box
 from catstream.detection.detector import Detector
 from catstream.errors import VideoError
+from catstream.learned import Learned
 from catstream.messages import End, Features, Model, Position, Track
+from catstream.services.helm import Helm, Orders
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
-from catstream.video.frames import Source
+from catstream.video.frames import Frame, Source
 from catstream.video.source import WHOLE, open_source
 from catstream.wire.sockets import Publisher, Sender, Subscriber
 
@@ -22,6 +26,7 @@ __all__ = ["main"]
 _FAREWELL_SECONDS = 10.0
 _OPEN_SECONDS = 60.0  # that opening the source may take, and learning the first frame
 _SKIP_SECONDS = 0.1  # that decoding a frame may take which is passed over
+_HELD_SECONDS = 0.02  # from one look at the commands to the next while a frame is held
 _OWNER_SECONDS = 0.5  # the owner may listen no more
 
 _log = logging.getLogger(__name__)
@@ -30,11 +35,13 @@ _log = logging.getLogger(__name__)
 def main(
     process: Process,
     source: str,
-    box: Box,
+    box: Box | None,
+    model: Path | None,
     *,
     resume: bool,
     owned: bool,
     recorded: bool = False,
+    state: Path | None = None,
     part: slice = WHOLE,
     since: float | None = None,
 ) -> None:
@@ -44,18 +51,29 @@ def main(
     ----------
     source : as `catstream.video.source.open_source` takes it
     box : of the object in the first frame
+    model : file of what was learned of the object before, which is then searched for; without this or a box,
+        it waits until a box is commanded
     resume : go on where a detector before this one stopped
     owned : somebody takes every track from the channel `results`
     recorded : begin once somebody listens to the tracks
+    state : folder in which what was commanded is kept, for a detector after this one
     part, since : as `open_source` takes them
     """
     with ExitStack() as stack:
-        line = _Line(process, stack, owned)
+        learned = Learned.load(model) if model is not None else None
+        file = state / "orders.json" if state is not None else None
+        orders = Orders(box, begins=1) if box is not None else Orders(learned.box if learned else None)
+        if resume and file is not None and file.exists():
+            orders = Orders.load(file)
+        detector = Detector(process.settings)
+        helm = stack.enter_context(Helm(process.endpoint, detector, orders, file))
+        line = _Line(process, stack, helm, owned)
         if recorded:
             line.wait_for_listener()
-        detector = Detector(process.settings)
         if resume:
-            line.resume(detector, box)
+            line.resume(detector, learned)
+        elif learned is not None:
+            detector.seek(learned.model, learned.box)
         # From the last frame that was stored, which is passed over: there may be none after it.
         first = max(detector.seq - 1, 0)
         process.allow(_OPEN_SECONDS + first * _SKIP_SECONDS)
@@ -66,35 +84,50 @@ def main(
             for frame in frames:
                 if frame.number < detector.seq:
                     continue
-                for model in line.models.waiting():
-                    detector.adopt(model)
-                if detector.seq:
-                    track, features = detector.step(frame.image, frame.time)
-                else:
-                    process.allow(_OPEN_SECONDS)
-                    track, features = detector.init(frame.image, box, frame.time)
+                found = line.held(frame, detector.seq)
+                if line.over:
+                    break
+                if found is None and helm.holds:
+                    line.skipped += 1
+                    continue
+                if found is None:
+                    line.adopt(detector)
+                    if detector.seq < max(helm.orders.begins, 1):
+                        process.allow(_OPEN_SECONDS)
+                    found = _follow(detector, frame, helm.orders)
+                track, features = found
                 line.send(replace(track, pts=frame.pts), features)
                 line.previews.show(track.frame, frame.image, track.box)
                 if not frames.live:
                     line.wait(detector)
-                if process.ended:
+                if line.over:
                     break
-            if process.ended:
-                reason = "it was stopped"
+            reason = line.over or reason
         except VideoError as error:
             reason, failed = str(error), True
         line.end(detector.seq, reason, failed)
+
+
+def _follow(detector: Detector, frame: Frame, orders: Orders) -> tuple[Track, Features]:
+    """What a frame gives that was not followed before, by this detector or the one before it."""
+    seq = detector.seq + 1
+    if seq < orders.begins:  # of the object before, of which all is forgotten; only its owner lacks these tracks
+        return detector.miss(frame.time)
+    if seq == orders.begins and orders.box is not None:
+        return detector.init(frame.image, orders.box, frame.time)
+    return detector.step(frame.image, frame.time)
 
 
 class _Line:
     """The detector's channels, as one.
 
     source : where the frames come from, once it is open; what it counts is told with the detector's health
+    skipped : frames of it that were taken, and not followed as that is not wanted now
     """
 
-    def __init__(self, process: Process, stack: ExitStack, owned: bool) -> None:
+    def __init__(self, process: Process, stack: ExitStack, helm: Helm, owned: bool) -> None:
         window, endpoint = process.settings.window, process.endpoint
-        self._process = process
+        self._process, self._helm = process, helm
         self._features = stack.enter_context(Sender("features", endpoint, window))
         self._results = stack.enter_context(Sender("results", endpoint, window)) if owned else None
         self._tracks = stack.enter_context(Publisher("tracks", endpoint))
@@ -106,6 +139,12 @@ class _Line:
         self._lag = 0 if self._lockstep else process.settings.lag_frames
         self._version = 0
         self.source: Source | None = None
+        self.skipped = 0
+
+    @property
+    def over(self) -> str:
+        """Why no frame is followed any more, empty before."""
+        return "it was stopped" if self._process.ended else self._helm.over
 
     def wait_for_listener(self) -> None:
         """Wait until somebody listens to the tracks."""
@@ -114,8 +153,8 @@ class _Line:
             self._tracks.welcome()
             self._turn()
 
-    def resume(self, detector: Detector, first: Box) -> None:
-        """Go on after the last frame that all receivers have; from the start where there is no model yet."""
+    def resume(self, detector: Detector, learned: Learned | None) -> None:
+        """Go on after the last frame that all receivers have; from the object's first where there is no model of it."""
         model: Model | None = None
         while True:  # until the compressor and the trainer are of the same moment: either may have died too
             positions = [self._position(sender) for sender in self._senders]
@@ -124,10 +163,18 @@ class _Line:
                 break
             model = self.models.receive(0.05) or model
         start = min(positions, key=lambda position: position.seq)
-        if model is None or start.box is None:
-            start = Position()
+        first, begins = self._helm.orders.box, max(self._helm.orders.begins, 1)
+        if not version:
+            start = Position(min(start.seq, begins - 1))
+        bearings = start.bearings
+        if bearings is None and start.box is not None and first is not None:
+            bearings = detector.bearings_at(start.box, first)
+        if start.seq >= begins and bearings is not None and model is not None:
+            detector.resume(start.seq, bearings, model)
         else:
-            detector.resume(start.seq, first, start.bearings or detector.bearings_at(start.box), model)
+            detector.seq = start.seq
+            if learned is not None and not self._helm.orders.begins:
+                detector.seek(learned.model, learned.box)
         for sender, position in zip(self._senders, positions, strict=True):
             sender.resume(start.seq, position.seq)
 
@@ -136,6 +183,28 @@ class _Line:
         while (position := sender.position()) is None:
             self._turn()
         return position
+
+    def adopt(self, detector: Detector) -> None:
+        """Take in whatever models have come."""
+        for model in self.models.waiting():
+            detector.adopt(model)
+
+    def held(self, frame: Frame, number: int) -> tuple[Track, Features] | None:
+        """What the frame gives by a box that was commanded for it; of a file it is held for as long as is wanted."""
+        self._beat()
+        found = self._begun(frame)
+        if found is None and self._helm.holds:
+            self.previews.show(number, frame.image, None)
+            while found is None and self._waits:
+                time.sleep(_HELD_SECONDS)
+                self.idle()
+                found = self._begun(frame)
+        return found
+
+    def _begun(self, frame: Frame) -> tuple[Track, Features] | None:
+        if self._helm.wanted:
+            self._process.allow(_OPEN_SECONDS)
+        return self._helm.follow(frame)
 
     def send(self, track: Track, features: Features) -> None:
         """Send what one frame gave; wait where a window is full."""
@@ -146,44 +215,47 @@ class _Line:
             # Where a run can be repeated, the owner is never behind: the bearings are those of the features.
             while self._lockstep and self._results.taken < track.seq and not self._process.ended:
                 self._results.listen(0.02)
-                self._process.beat(self._counters)
+                self._beat()
         self._lessons.send(features)
         self._deliver(self._features, features)
-        self._process.beat(self._counters)
 
     def wait(self, detector: Detector) -> None:
         """Wait until the frame of `lag` frames ago is taken, and for the model that it led to, or a newer one."""
         due = self._features.sent - self._lag
-        while not self._process.ended:
+        while not self.over:
             if self._features.taken < due:
                 self._features.listen(0.02)
-            elif detector.model.version < self._features.made(due):
+            elif detector.heard < self._features.made(due):
                 if (model := self.models.receive(0.02)) is not None:
                     detector.adopt(model)
                 self._features.listen(0)  # a compressor may have died with the sample: it needs what led to it
             else:
                 break
-            self._process.beat(self._counters)
+            self._beat()
 
     def idle(self) -> bool:
-        """Stay in touch while the source gives no frame; returns whether to wait no more."""
+        """Stay in touch while there is no frame to follow; returns whether to wait no more."""
         for sender in self._senders:
             sender.listen(0)
         self.previews.turn()
-        self._process.beat(self._counters)
-        return self._process.ended
+        self._beat()
+        if self.source is not None and self.source.counters.get("lost_seconds"):
+            self._helm.refuse_boxes("the source is lost, and there is no frame for a box: ask again once it is back")
+        return bool(self.over)
 
     def end(self, seq: int, reason: str, failed: bool) -> None:
         """Say that nothing follows, and wait until all is stored; where the run was stopped, not for long."""
+        self._helm.end(reason)
         totals: dict[str, float] = {}
         for sender in self._senders:
             seconds = _OWNER_SECONDS if sender is self._results else _FAREWELL_SECONDS
             self._deliver(sender, End(seq + 1, reason, failed, totals), seconds)
             while sender.settled < sender.sent and not self._process.ended_for(seconds):
                 sender.listen(0.02)
-                self._process.beat(self._counters)
+                self._beat()
             if sender is self._features:
                 totals = {"sent": float(seq), "stored": float(min(sender.stored, seq))}
+        self._helm.release()
         for publisher in (self._tracks, self._lessons):
             publisher.send(End(seq + 1, reason, failed, totals))
         self._process.beat(self._counters, now=True)
@@ -192,7 +264,7 @@ class _Line:
         """Hand a message over; where the window stays full, until this long after the run was stopped."""
         while not sender.send(message):
             sender.listen(0.02)
-            self._process.beat(self._counters)
+            self._beat()
             if self._process.ended_for(seconds):
                 _log.warning(
                     "message %d of %s could not be sent: its receiver is gone", message.seq, sender.channel.name
@@ -200,15 +272,27 @@ class _Line:
                 return
 
     def _turn(self) -> None:
-        self._process.beat(self._counters)
+        self._beat()
         if self._process.ended:
             raise SystemExit(0)
 
+    @property
+    def _waits(self) -> bool:
+        """Whether a frame in hand waits; one of a live source does not."""
+        return self._helm.holds and not self.over and self.source is not None and not self.source.live
+
+    def _beat(self) -> None:
+        self._process.beat(self._counters, now=self._helm.listen())
+
     def _counters(self) -> dict[str, float]:
+        counters = self.source.counters if self.source else {}
+        if "skipped" in counters:
+            counters["skipped"] += self.skipped
         return {
             "sent": self._features.sent,
             "taken": self._features.taken,
             "stored": self._features.stored,
             "model_version": self._version,
-            **(self.source.counters if self.source else {}),
+            **self._helm.counters,
+            **counters,
         }

@@ -1,4 +1,4 @@
-"""Options that several commands take: settings, and which frames of a source."""
+"""Options that several commands take: settings, the object, and which frames of a source."""
 
 from __future__ import annotations
 
@@ -9,9 +9,28 @@ from typing import Any
 
 import click
 
+from catstream.box import Box
 from catstream.settings import PRESETS, Settings
 
-__all__ = ["with_part", "with_settings"]
+__all__ = ["with_model", "with_object", "with_part", "with_settings"]
+
+with_model = click.option(
+    "--model", type=click.Path(path_type=Path), metavar="FILE", help="What `catstream save` wrote of the object."
+)
+
+
+def with_object(command: Callable[..., None]) -> Callable[..., None]:
+    """Add `--box` and `--model`, one of them at most; the command gets a Box or None, and a path or None."""
+
+    @click.option("--box", metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
+    @with_model
+    @wraps(command)
+    def wrapped(box: str | None, model: Path | None, **options: Any) -> None:
+        if box is not None and model is not None:
+            raise click.UsageError("--box says where the object is, with --model it is searched for: give one of them")
+        command(box=Box.parse(box) if box is not None else None, model=model, **options)
+
+    return wrapped
 
 
 def with_part(command: Callable[..., None]) -> Callable[..., None]:

@@ -101,8 +101,10 @@ class Supervisor:
 
     Parameters
     ----------
+    box : of the object in the first frame, or None
     settings : with the endpoint where the processes meet
     folder : where logs are kept while the pipeline runs
+    model : file of what was learned of the object before; without this or a box one is waited for
     owned : whether somebody takes every track from the channel `results`
     part : which frames of the source there are to follow
     record : file to write all that travels to, or to go on with
@@ -114,10 +116,11 @@ class Supervisor:
     def __init__(
         self,
         source: str,
-        box: Box,
+        box: Box | None,
         settings: Settings,
         folder: Path,
         *,
+        model: Path | None = None,
         owned: bool,
         part: slice = WHOLE,
         record: Path | None = None,
@@ -125,8 +128,10 @@ class Supervisor:
         resume: bool = False,
         since: float | None = None,
     ) -> None:
-        self._source, self._box, self._settings, self._owned = source, box, settings, owned
+        self._source, self._settings, self._owned = source, settings, owned
         self._state, self._resume = state or folder, resume
+        self._object = ["--box", ",".join(map(repr, box))] if box is not None else []
+        self._model = ["--model", str(model)] if model is not None else []
         self._part = {"--start": part.start, "--end": part.stop, "--stride": part.step}
         self._record = record
         # A restarted detector goes on with the times of a live source.
@@ -229,14 +234,15 @@ class Supervisor:
         for pair in self._settings.changed():
             command += ["--set", pair]
         if child.name == "detector":
-            command += [self._source, "--box", ",".join(map(repr, self._box)), "--since", repr(self._since)]
+            command += [self._source, *self._object, "--since", repr(self._since)]
             for option, number in self._part.items():
                 command += [] if number is None else [option, str(number)]
             command += ["--owned"] * self._owned + ["--resume"] * (self._resume or bool(child.restarts))
             command += ["--recorded"] * (self._record is not None)
-        if child.name == "compressor":
-            command += ["--state", str(self._state)]
-            command += [] if self._record is None else ["--record", str(self._record)]
+        if child.name != "trainer":  # it holds nothing
+            command += ["--state", str(self._state), *self._model]
+        if child.name == "compressor" and self._record is not None:
+            command += ["--record", str(self._record)]
         child.seen = time.monotonic()
         own = {name: value for name, value in os.environ.items() if not name.startswith("CATSTREAM_")}
         child.process = subprocess.Popen(
@@ -249,13 +255,14 @@ class Supervisor:
         )
 
 
-def main(source: str, box: Box, settings: Settings, part: slice = WHOLE) -> None:
+def main(source: str, settings: Settings, box: Box | None, model: Path | None, part: slice = WHOLE) -> None:
     """Run a pipeline for whoever subscribes, until the source ends or a signal comes."""
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     with private_folder() as folder, meeting_place(settings.endpoint, folder, settings.keys) as endpoint:
-        supervisor = Supervisor(source, box, replace(settings, endpoint=str(endpoint)), folder, owned=False, part=part)
+        settings = replace(settings, endpoint=str(endpoint))
+        supervisor = Supervisor(source, box, settings, folder, model=model, owned=False, part=part)
         try:
             while not supervisor.finished and not ended.wait(0.05):
                 supervisor.check()

@@ -15,9 +15,10 @@ ROOT = Path(__file__).parents[1]
 #: From the ground up. A module imports from the floors below its own, and from its own folder.
 FLOORS = [
     {"errors"},
-    {"box"},
+    {"box", "storage"},
     {"messages", "settings", "ridge", "html"},
     {"detection", "compression", "training", "wire", "video", "adapters"},
+    {"learned"},
     {"tracker", "subscription", "steering", "recording", "sinks", "state"},
     {"services", "web"},
     {"pipeline"},
@@ -34,7 +35,7 @@ HOMES = {
     "numba": ["catstream/detection"],
     "filterpy": ["catstream/training/motion_em.py"],
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
-    "safetensors": ["catstream/compression"],
+    "safetensors": ["catstream/storage.py"],
     "pyarrow": ["catstream/sinks/parquet.py"],
     "supervision": ["catstream/adapters.py"],
     "av": ["catstream/video"],

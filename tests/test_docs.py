@@ -20,7 +20,7 @@ import click
 import pytest
 
 import catstream
-from catstream.cli import VERBS
+from catstream.cli import VERBS, verb
 from catstream.settings import PRESETS, describe
 from catstream.wire.channels import CHANNELS
 
@@ -79,7 +79,7 @@ def settings_table() -> str:
 
 
 def verbs() -> dict[str, click.Command]:
-    return {name: getattr(import_module(f"catstream.cli.{name}"), name) for name in VERBS}
+    return {name: verb(name) for name in VERBS}
 
 
 def commands_of(verb: click.Command) -> Iterator[click.Command]:

@@ -1,4 +1,4 @@
-"""The command line: a file a verb. Arguments and printing, no algorithm."""
+"""The command line: a file a verb, or a family of them. Arguments and printing, no algorithm."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 
 from catstream.errors import CatstreamError
 
-__all__ = ["main"]
+__all__ = ["VERBS", "main", "verb"]
 
 #: Verb -> what it does. Its module is imported only when it is called: some take long.
 VERBS = {
@@ -23,9 +23,25 @@ VERBS = {
     "record": "Keep what a running pipeline says, in one file.",
     "replay": "Play a recording to subscribers, or learn from it once more.",
     "status": "Ask a running pipeline how it is.",
+    "set-box": "Tell a running pipeline where the object is.",
+    "pause": "Have a running pipeline take no more frames.",
+    "resume": "Have a paused pipeline go on.",
+    "save": "Write what a running pipeline has learned to a file.",
+    "stop": "End a running pipeline as if its source had come to its end.",
     "keys": "Make keys, and say who may connect to a pipeline.",
     "settings": "List all settings, with their defaults and meaning.",
 }
+
+#: The module of verbs that share one.
+_TOGETHER = dict.fromkeys(("set-box", "pause", "resume", "save", "stop"), "steer")
+
+
+def verb(name: str) -> click.Command:
+    """The command of one of the `VERBS`."""
+    command: click.Command = getattr(
+        import_module(f"catstream.cli.{_TOGETHER.get(name, name)}"), name.replace("-", "_")
+    )
+    return command
 
 
 class _Verbs(click.Group):
@@ -33,7 +49,7 @@ class _Verbs(click.Group):
         return list(VERBS)
 
     def get_command(self, _: click.Context, name: str) -> click.Command | None:
-        return getattr(import_module(f"catstream.cli.{name}"), name) if name in VERBS else None
+        return verb(name) if name in VERBS else None
 
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Verbs"):

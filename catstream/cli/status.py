@@ -32,6 +32,7 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
 
     \b
     Prints
+      state      following, paused, or waiting for a box
       frames     how many were followed, and how many a second now
       learning   messages that the compressor has not taken yet, or not stored
       model      the version that the detector uses
@@ -89,6 +90,7 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
     return {
         "endpoint": place,
         "ok": len(reports) == len(_NAMES),
+        "state": _state(detector),
         "frames": whole(detector, "sent"),
         "frames_per_second": _rate(reports.get("detector", [])),
         "lag": behind("taken"),
@@ -110,6 +112,12 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
     }
 
 
+def _state(detector: dict[str, float]) -> str | None:
+    if not detector:
+        return None
+    return "waiting for a box" if detector.get("waiting") else "paused" if detector.get("paused") else "following"
+
+
 def _rate(heard: list[Health]) -> float | None:
     """Frames a second between the first and the last of a detector's reports."""
     if len(heard) < 2 or heard[-1].time <= heard[0].time:
@@ -129,6 +137,7 @@ def _text(found: dict[str, Any]) -> str:
     return "\n".join(
         (
             f"pipeline   {found['endpoint']}",
+            f"state      {shown('state')}",
             f"frames     {shown('frames')}, {shown('frames_per_second')} a second",
             f"learning   {shown('lag')} messages behind, {shown('not_stored')} not stored",
             f"model      {shown('model_version')}",

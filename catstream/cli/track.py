@@ -18,7 +18,7 @@ from catstream.box import Box
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
-from catstream.services.options import with_part, with_settings
+from catstream.services.options import with_object, with_part, with_settings
 from catstream.settings import Settings
 from catstream.video.results import ResultsWriter, last_position, tracks
 from catstream.video.source import is_live
@@ -31,20 +31,21 @@ _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 
 @click.command()
 @click.argument("source", required=False)
-@click.option("--box", metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
 @click.option("--output", type=_FOLDER, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--record", type=click.Path(path_type=Path), help="File to record the run to: `catstream replay`.")
 @click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
 @click.option("--state", type=_FOLDER, help="Folder to keep what was learned in, through power cuts.")
 @click.option("--resume", type=_FOLDER, help="Go on with what is kept in such a folder.")
+@with_object
 @with_part
 @with_settings
 def track(
     settings: Settings,
     part: slice,
     source: str | None,
-    box: str | None,
+    box: Box | None,
+    model: Path | None,
     output: Path | None,
     video: bool,
     record: Path | None,
@@ -52,7 +53,10 @@ def track(
     state: Path | None,
     resume: Path | None,
 ) -> None:
-    """Follow an object through a video, from its box in the first frame.
+    """Follow an object through a video.
+
+    It is shown by its box in the first frame, or found by what was learned of
+    it before, or waited for until `catstream set-box` says where it is.
 
     SOURCE is a video file, a folder of images, a pattern like
     images/%05d.png, a camera (0 or /dev/video0), or a stream (rtsp://... or
@@ -83,21 +87,24 @@ def track(
       catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
       catstream track walk.mp4 --box 120,80,64,48 --record walk.rec
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
+      catstream track 0 --model walker.safetensors
+      catstream track 0
       catstream track walk.mp4 --box 120,80,64,48 --output out --state kept
       catstream track --resume kept
     """
     if state is not None and resume is not None:
         raise click.UsageError("--state begins a run, --resume goes on with one: give one of them")
-    if resume is None and (source is None or box is None):
-        raise click.UsageError("a run needs SOURCE, and --box for the object in its first frame")
+    if resume is None and source is None:
+        raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
     if video and source is not None and is_live(source):
         raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
     if lockstep:
         settings = Settings.of({**settings.values(), "lockstep": True})
     pipeline = Pipeline(
         source,
-        Box.parse(box) if box is not None else None,
+        box,
         None if resume is not None and settings == Settings() else settings,
+        model=model,
         part=part,
         state=state,
         record=record,
@@ -116,6 +123,9 @@ def track(
     try:
         with ExitStack() as stack:
             stack.enter_context(pipeline)
+            if pipeline.waits:
+                where = f" --endpoint {pipeline.endpoint}"
+                console.print(f"it waits for a box: catstream set-box X,Y,W,H{where}", highlight=False)
             progress = stack.enter_context(run.progress(console))
             sinks = None
             for found in pipeline:
@@ -165,7 +175,7 @@ class _Sinks:
 
 
 class _StateColumn(ProgressColumn):
-    """The state of the track, or for how long a live source has been lost: no track comes then to say so."""
+    """The state of the track, or why no track comes to say so: the source is lost, or it is told to wait."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         super().__init__()
@@ -173,7 +183,8 @@ class _StateColumn(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         lost = self._pipeline.lost_seconds
-        return Text(f"{f'lost {lost:.0f} s' if lost else task.fields['state']:13}")
+        state = f"lost {lost:.0f} s" if lost else self._pipeline.holding or task.fields["state"]
+        return Text(f"{state:13}")
 
 
 class _Run:

@@ -51,7 +51,7 @@ def bearings_state(bearings: Bearings | None) -> State:
     if bearings.motion is not None and bearings.centre is not None:
         parts = {"process": bearings.motion.process, "observation": bearings.motion.observation}
         arrays = {f"bearings.{name}": array for name, array in {**parts, "centre": bearings.centre}.items()}
-    names = ("state", "window", "sure", "usual", "elsewhere")
+    names = ("state", "window", "sure", "first", "usual", "elsewhere")
     return arrays, {name: getattr(bearings, name) for name in names}
 
 
@@ -62,5 +62,5 @@ def bearings_of(arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> 
     motion, centre = None, arrays.get("bearings.centre")
     if centre is not None:
         motion = Motion(arrays["bearings.process"], arrays["bearings.observation"])
-    boxes = {name: Box(*facts[name]) for name in ("window", "sure")}
+    boxes = {name: facts[name] and Box(*facts[name]) for name in ("window", "sure", "first")}
     return Bearings(**(facts | boxes), motion=motion, centre=centre)

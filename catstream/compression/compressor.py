@@ -12,8 +12,9 @@ import os
 
 import numpy as np
 
+from catstream import storage
 from catstream.box import Box
-from catstream.compression import checkpoint, storage
+from catstream.compression import checkpoint
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, SettingsError
 from catstream.messages import Bearings, Features, Position, Sample
@@ -41,15 +42,29 @@ class Compressor:
                 "call Settings.for_length first, or set coreset_size"
             )
         self.settings = settings
-        self.trees = {name: CoresetTree(settings.coreset_size) for name in _TREES}
-        self.centres = np.empty((0, 2))
-        self._path: list[tuple[float, float]] = []
         self.seq = 0
         self.frame = -1
+        self.last_sample: Sample | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        """All but the stream of messages and the versions of samples, which go on."""
+        self.trees = {name: CoresetTree(self.settings.coreset_size) for name in _TREES}
+        self.centres = np.empty((0, 2))
+        self._path: list[tuple[float, float]] = []
         self.box: Box | None = None
         self.bearings: Bearings | None = None
-        self.last_sample: Sample | None = None
-        self._sampled_leaves = 0
+        self._sampled_leaves = 0  # 0 before the first sample of an object
+
+    @classmethod
+    def of(cls, sample: Sample, settings: Settings) -> Compressor:
+        """Go on with what a sample of an earlier stream summarises, in trees of one node each; versions go on."""
+        self = cls(settings)
+        for name in _TREES:
+            if (summary := getattr(sample, name)) is not None:
+                self.trees[name] = CoresetTree.of(summary, settings.coreset_size)
+        self.last_sample, self.centres, self._sampled_leaves = sample, sample.centres, self.leaves
+        return self
 
     def check(self, features: Features) -> None:
         """Raise ProtocolError where rows have another length than those before: they are of another stream."""
@@ -64,7 +79,8 @@ class Compressor:
     def take(self, features: Features) -> Sample | None:
         """Store one frame's features; a sample where the trees have grown enough since the last.
 
-        A message that is stored already (by `seq`) is ignored.
+        Where another object begins, all trees begin anew; versions of samples go on. A message
+        that is stored already (by `seq`) is ignored.
 
         Raises
         ------
@@ -79,6 +95,8 @@ class Compressor:
                 f"features {features.seq} came after {self.seq}: {features.seq - self.seq - 1} are missing, "
                 "send from the one after the last acknowledged"
             )
+        if features.begins:
+            self._forget()
         rows, labels = features.rows, features.labels
         if len(rows):
             # Only rows of the right length get as far as the first tree, so that all hold the same frames.
@@ -101,12 +119,17 @@ class Compressor:
     @property
     def position(self) -> Position:
         """Where the stream of messages goes on, once all that was taken is stored."""
-        return Position(self.seq, max(self.frame, 0), self.box, self.version, self.bearings)
+        return Position(self.seq, max(self.frame, 0), self.box, self.sampled, self.bearings)
 
     @property
     def leaves(self) -> int:
         """Leaves ever inserted into the trees."""
         return sum(self._leaves().values())
+
+    @property
+    def sampled(self) -> int:
+        """Version of the last sample, 0 where it was of another object."""
+        return self.version if self._sampled_leaves else 0
 
     def counters(self) -> dict[str, float]:
         """What health tells of it."""
@@ -189,7 +212,7 @@ class Compressor:
         if not (self.trees["object"].nodes and self.trees["background"].nodes and self.trees["loss"].nodes):
             return False
         last = self.last_sample
-        waited = last is None or self.frame - last.frame >= self.settings.train_frames
+        waited = last is None or not self._sampled_leaves or self.frame - last.frame >= self.settings.train_frames
         return waited and self.leaves > self._sampled_leaves
 
     def _sample(self) -> Sample:

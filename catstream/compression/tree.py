@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from catstream.compression import sampling, storage
+from catstream import storage
+from catstream.compression import sampling
 from catstream.compression.reduce import energy, reduce
 from catstream.errors import ProtocolError
 from catstream.messages import Summary
@@ -80,6 +81,29 @@ class CoresetTree:
         self.size = size
         self.nodes: list[Node] = []
         self.pending = np.empty((0, 0), np.float32)
+
+    @classmethod
+    def of(cls, summary: Summary, size: int) -> CoresetTree:
+        """A tree of one node, for all that a sample of another tree stands for: as heavy, and with the same mean.
+
+        Its count is rounded down to what a node may stand for. Where it is less than a leaf, its rows are pending.
+        What the sample had lost is in no bound of this tree.
+        """
+        tree = cls(size)
+        level = (summary.count // size).bit_length() - 1
+        if level < 0:
+            tree.insert(summary.rows)
+            return tree
+        count = size << level
+        heavy = summary.rows * np.float32(np.sqrt(count / len(summary.rows)))
+        kept = reduce(heavy, size, towards=summary.mean)
+        rows = np.zeros((size, heavy.shape[1]), np.float32)
+        rows[: len(kept)] = kept
+        tree.nodes.append(
+            Node(level, rows, count, summary.mean.astype(np.float64) * count, energy(heavy) - energy(kept))
+        )
+        tree.pending = np.empty((0, heavy.shape[1]), np.float32)
+        return tree
 
     @property
     def width(self) -> int:

@@ -8,10 +8,11 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection import bootstrap, extent, lessons, search
+from catstream.detection.hog import WINDOW, row_length
 from catstream.detection.lessons import Lesson
 from catstream.detection.motion import CentreFilter
 from catstream.detection.search import Found
-from catstream.errors import BoxError
+from catstream.errors import BoxError, ProtocolError
 from catstream.messages import Bearings, Features, Model, State, Track
 from catstream.settings import Settings
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["Detector"]
 
 _USUAL_RATE = 0.01  # share that a frame has in the score that the object usually has
+_SOUGHT_FACTORS = (1.0, 1.25**3, 1.25**-3)  # of the size of an object not found yet; a search tries those between
 
 
 class Detector:
@@ -29,7 +31,13 @@ class Detector:
     Costs the same for every frame: a few small images around the object; the whole
     frame where it is not sure (or always, `detection="full"`).
 
-    Call `init` with the first frame, then `step` for every other; `adopt` models as they come.
+    Call `init` with the first frame, or `seek` before it, then `step` for every other; `adopt` models as they come.
+
+    Attributes
+    ----------
+    seq : of the last message
+    model : the one in use
+    heard : version of the newest model that came, in use or not
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -37,13 +45,26 @@ class Detector:
         self.seq = 0
         self.state: State = "bootstrapping"
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
+        self.heard = 0
+        self._started = False  # whether there is anything to follow
+        self._forget()
+
+    def _forget(self) -> None:
+        """All but the stream of messages, which goes on."""
+        self._first_frame = self.seq  # of this object: an older model is of another one
         self._usual_score = 0.0
         self._elsewhere = False  # found by a search of the whole frame, and not trusted yet
+        self._first_box: Box | None = None  # None while it was not found yet
         self._centre: CentreFilter | None = None
         self._scm: SparseCollaborativeModel | None = None
 
+    @property
+    def box(self) -> Box | None:
+        """Where the object was last, in pixels; None before the first frame."""
+        return self._box.scaled(1 / self.settings.context) if self.seq and self._started else None
+
     def init(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
-        """Start on a box.
+        """Start on a box; what was followed before is forgotten.
 
         Parameters
         ----------
@@ -54,28 +75,80 @@ class Detector:
         Raises
         ------
         BoxError
-            For a box that is not in the frame, has no area, or is not a number.
+            For a box that is not in the frame, has no area, is not a number, or looks like what is around it.
+            Nothing is forgotten then.
         """
         height, width = image.shape[:2]
         # The window is wider than the object: the edge of an object tells most about where it is.
         box = Box(*map(float, box)).inside(width, height)
-        self._box = self._sure_box = self._first_box = box.scaled(self.settings.context)
+        window, scm = box.scaled(self.settings.context), None
         if self.settings.bootstrap == "scm":
             from catstream.detection.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
-            self._scm = SparseCollaborativeModel(image, box, self._random())
-            lesson = lessons.near(image, self._box, None, self._random(), self.settings)
+            scm = SparseCollaborativeModel(image, box, self._random())
+            lesson = lessons.near(image, window, None, self._random(), self.settings)
         else:
-            lesson = lessons.first(image, self._box, self._random(), self.settings)
-        self.model = bootstrap.stand_in(lesson, self.settings)
-        lesson += lessons.far(image, self._box, self.model, self.settings)
-        self.model = bootstrap.stand_in(lesson, self.settings)
-        self.seq, self.state = 1, "bootstrapping"
-        return self._answer(time, 1.0, lesson)
+            lesson = lessons.first(image, window, self._random(), self.settings)
+        model = bootstrap.stand_in(lesson, self.settings)
+        lesson += lessons.far(image, window, model, self.settings)
+        model = bootstrap.stand_in(lesson, self.settings)
+        self._forget()
+        self._box = self._sure_box = self._first_box = window
+        self.model, self._scm, self._started = model, scm, True
+        self.seq, self.state = self.seq + 1, "bootstrapping"
+        return self._answer(time, 1.0, lesson, begins=True)
+
+    def seek(self, model: Model, box: Box) -> None:
+        """Start with a model: the object is absent until it is found, in whichever frame and size that is.
+
+        Parameters
+        ----------
+        box : in pixels, about as large as the object may be
+
+        Raises
+        ------
+        ProtocolError
+            For a model of other features.
+        """
+        if len(model.weights) != row_length():
+            raise ProtocolError(
+                f"the model has {len(model.weights)} weights, the features of a window are {row_length()}: "
+                "learn it anew with this catstream"
+            )
+        self._box = self._sure_box = box.scaled(self.settings.context)
+        self.state, self._started = "absent", True
+        self.adopt(model)
+
+    def correct(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
+        """Go on with the same object at another box, whatever a search would have found.
+
+        Raises
+        ------
+        BoxError
+            As `init` does.
+        """
+        height, width = image.shape[:2]
+        self._box = self._sure_box = Box(*map(float, box)).inside(width, height).scaled(self.settings.context)
+        self.seq, self.state = self.seq + 1, "present"
+        self._elsewhere, self._first_box = False, self._first_box or self._box
+        if self._centre is not None:
+            self._centre.predict()
+            self._centre.update(self._box.centre)
+        score = float(search.scored_around(image, self._box, WINDOW, self.model).scores[0, 0])
+        lesson = lessons.near(image, self._box, self.model, self._random(), self.settings)
+        return self._answer(time, score, lesson)
+
+    def miss(self, time: float = 0.0) -> tuple[Track, Features]:
+        """Let a frame pass unseen: the object counts as absent."""
+        self.seq, self.state = self.seq + 1, "absent"
+        return self._answer(time, 0.0, Lesson.none())
 
     def adopt(self, model: Model) -> None:
-        """Go on with a model, unless it is older than the one in use."""
-        if model.version <= self.model.version:
+        """Go on with a model, unless it is older than the newest that came, or of an object before this one."""
+        if model.version <= self.heard:
+            return
+        self.heard = model.version
+        if model.frame < self._first_frame or not self._started:
             return
         self.model, self._scm = model, None
         if model.motion is not None and self.seq:
@@ -84,7 +157,7 @@ class Detector:
             else:
                 self._centre.adopt(model.motion)
 
-    def resume(self, seq: int, first: Box, bearings: Bearings, model: Model) -> None:
+    def resume(self, seq: int, bearings: Bearings, model: Model) -> None:
         """Go on after message `seq` of a stream that another detector began.
 
         With the model that the other one had by then, it goes on as that would have, bit for bit.
@@ -92,27 +165,26 @@ class Detector:
         Parameters
         ----------
         seq : the last Features that is stored
-        first : the object in the first frame, in pixels
         bearings : those of that message, or `bearings_at` where the object was last
         model : the newest there is
         """
-        self.seq, self.state = seq, bearings.state
-        self._first_box = first.scaled(self.settings.context)
+        self.seq, self.state, self._started = seq, bearings.state, True
+        self._first_box = bearings.first
         self._box, self._sure_box = bearings.window, bearings.sure
         self._usual_score, self._elsewhere = bearings.usual, bearings.elsewhere
         if bearings.motion is not None and bearings.centre is not None:
             self._centre = CentreFilter.resumed(bearings.motion, bearings.centre, bearings.state != "absent")
         self.adopt(model)
 
-    def bearings_at(self, box: Box) -> Bearings:
-        """Where nothing is known but where the object was last."""
+    def bearings_at(self, box: Box, first: Box) -> Bearings:
+        """Where nothing is known but where the object was last, and in its first frame."""
         window = box.scaled(self.settings.context)
-        return Bearings("present", window, window, 0.0, False)
+        return Bearings("present", window, window, first.scaled(self.settings.context), 0.0, False)
 
     def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
         """Find the object in the next frame."""
         settings = self.settings
-        if not self.seq:
+        if not self._started:
             raise BoxError("there is no box to follow yet: call init with a frame and a box first")
         self.seq += 1
         if self._centre is not None:
@@ -122,9 +194,12 @@ class Detector:
             found = self._scm.step(image)  # it has no word for absent
             self._box = found.box.scaled(settings.context).held_in(width, height)
             return self._answer(time, found.score, self._lesson(image, found.score))
-        found = self._find(image)
+        found = self._find(image) if self._first_box else self._seek(image)
         self._elsewhere &= found.score < settings.trust_score
         there = self._there(found.score)
+        if there and self._first_box is None:
+            self._box = self._sure_box = self._first_box = found.box
+            self._elsewhere = found.score < settings.trust_score
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
             self._box = extent.followed(self._box, found, settings).held_in(width, height)
@@ -163,8 +238,14 @@ class Detector:
                     return other
         return found
 
+    def _seek(self, image: np.ndarray) -> Found:
+        """The best window of the whole frame, of one of the sizes that the object may have."""
+        factor = _SOUGHT_FACTORS[self.seq % len(_SOUGHT_FACTORS)]
+        found = search.whole(image, self._box.scaled(factor), self.model, self.settings)
+        return self._fitted(image, found)
+
     def _fitted(self, image: np.ndarray, found: Found) -> Found:
-        return extent.fitted(image, found.box, self._first_box, self.model, self.settings)
+        return extent.fitted(image, found.box, self._first_box or found.box, self.model, self.settings)
 
     def _lesson(self, image: np.ndarray, score: float) -> Lesson:
         settings = self.settings
@@ -179,23 +260,16 @@ class Detector:
         """A fresh generator for each frame: what a frame teaches does not depend on the ones before."""
         return np.random.default_rng((self.settings.seed, self.seq))
 
-    def _answer(self, time: float, score: float, lesson: Lesson) -> tuple[Track, Features]:
-        frame = self.seq - 1
-        box = None if self.state == "absent" else self._box.scaled(1 / self.settings.context)
-        track = Track(self.seq, frame, time, self.state, box, float(score), self.model.version)
+    def _answer(self, time: float, score: float, lesson: Lesson, *, begins: bool = False) -> tuple[Track, Features]:
+        seq, frame = self.seq, self.seq - 1
+        box = None if self.state == "absent" else self.box
+        track = Track(seq, frame, time, self.state, box, float(score), self.model.version)
+        rows = lesson.rows, lesson.labels, lesson.weights, lesson.extents, lesson.fits
+        return track, Features(seq, frame, time, box, *rows, self._bearings(), begins)
+
+    def _bearings(self) -> Bearings | None:
+        if not self._started:
+            return None
         motion, centre = (self._centre.motion, self._centre.state) if self._centre is not None else (None, None)
-        bearings = Bearings(
-            self.state, self._box, self._sure_box, float(self._usual_score), self._elsewhere, motion, centre
-        )
-        return track, Features(
-            self.seq,
-            frame,
-            time,
-            box,
-            lesson.rows,
-            lesson.labels,
-            lesson.weights,
-            lesson.extents,
-            lesson.fits,
-            bearings,
-        )
+        boxes = self._box, self._sure_box, self._first_box
+        return Bearings(self.state, *boxes, float(self._usual_score), self._elsewhere, motion, centre)

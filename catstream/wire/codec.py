@@ -42,7 +42,7 @@ from catstream.messages import (
     Track,
 )
 
-__all__ = ["KINDS", "VERSION", "decode", "encode", "opening"]
+__all__ = ["KINDS", "VERSION", "check", "decode", "encode", "opening"]
 
 #: Of the envelope and of what the fields mean.
 VERSION = 1
@@ -89,7 +89,7 @@ def encode(message: Any) -> bytes:
     ProtocolError
         Where it is not what its kind promises: it would be refused on arrival.
     """
-    _check(message)
+    check(message)
     return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
 
 
@@ -137,7 +137,7 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
         message: Any = msgspec.convert(fields, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
         raise ProtocolError(f"{name}: {error}", "type") from None
-    _check(message)
+    check(message)
     return message
 
 
@@ -181,7 +181,7 @@ def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
     return fields
 
 
-def _check(message: Any) -> None:
+def check(message: Any) -> None:
     """Raise ProtocolError unless every field of a message keeps its promise."""
     lengths: dict[str, int] = {}
     for field in dataclasses.fields(message):
@@ -190,7 +190,7 @@ def _check(message: Any) -> None:
         if isinstance(value, np.ndarray):
             _check_array(value, type(message), field.name, where, lengths)
         elif dataclasses.is_dataclass(value):
-            _check(value)
+            check(value)
         else:
             _check_numbers(value, where)
     if isinstance(message, Features):

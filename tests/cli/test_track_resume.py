@@ -120,7 +120,7 @@ def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, 
         "frames 3::": ["track", "--resume", kept, "--start", "3"],
         "no pipeline was kept": ["track", "--resume", tmp_path / "none"],
         "give one of them": ["track", "--resume", kept, "--state", kept],
-        "needs SOURCE": ["track", source, "--state", tmp_path / "new"],
+        "needs SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
     }
     for word, command in refusals.items():
         code, _, errors = said(*command)

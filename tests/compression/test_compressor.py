@@ -166,7 +166,7 @@ def test_the_last_sample_can_be_had_again_though_the_trees_have_grown(settings, 
 @pytest.mark.parametrize("moving", [False, True])
 def test_the_bearings_of_the_last_message_are_kept_bit_for_bit(settings, messages, moving, rng, tmp_path):
     motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
-    bearings = Bearings("absent", Box(*rng.random(4)), Box(*rng.random(4)), rng.random(), True)
+    bearings = Bearings("absent", *(Box(*rng.random(4)) for _ in range(3)), rng.random(), True)
     if moving:
         bearings = dataclasses.replace(bearings, motion=motion, centre=centre)
     compressor = Compressor(settings)

@@ -1,0 +1,95 @@
+"""What was learned of an object, in a file: enough to find it again elsewhere, and to go on learning.
+
+The newest model, the sample of the coreset trees that it was learned from, and how large the object was.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from catstream import storage
+from catstream.box import Box
+from catstream.compression import checkpoint
+from catstream.errors import ProtocolError, ServiceError
+from catstream.messages import Model, Motion, Sample
+from catstream.wire.codec import check
+
+__all__ = ["Learned"]
+
+_KIND = "learned 1"  # and the version of what the file holds
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """A model, and what it was learned from.
+
+    model   the newest there was; of a file, as if it was learned before frame 0
+    sample  the one that the model was learned from
+    box     where the object was last, in pixels: its size is what a search begins with
+    """
+
+    model: Model
+    sample: Sample
+    box: Box
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write one safetensors file, whole or not at all.
+
+        Raises
+        ------
+        ServiceError
+            Where it cannot be written.
+        """
+        model = self.model
+        arrays, told = checkpoint.sample_state(self.sample)
+        arrays["weights"] = model.weights
+        if model.extent is not None:
+            arrays["extent"] = model.extent
+        if model.motion is not None:
+            arrays |= {"process": model.motion.process, "observation": model.motion.observation}
+        facts = {"kind": _KIND, "bias": model.bias, "box": list(self.box), "sample": told}
+        try:
+            storage.write(path, arrays, facts)
+        except OSError as error:
+            raise ServiceError(f"cannot write {str(path)!r} ({error}): give another file") from None
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        ServiceError
+            Where it cannot be read.
+        ProtocolError
+            Where it is torn, damaged, or another file.
+        """
+        if not Path(path).is_file():
+            raise ServiceError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
+        arrays, facts = storage.read(path)
+        try:
+            if facts.get("kind") != _KIND:
+                raise ValueError(f"it is of kind {facts.get('kind')!r}, not {_KIND!r}")
+            learned = cls._of(arrays, facts)
+            for message in (learned.model, learned.sample):
+                check(message)
+            x, y, w, h = learned.box
+            if not (np.isfinite((x, y)).all() and 0 < w < np.inf and 0 < h < np.inf):
+                raise ValueError(f"its box is {learned.box}")
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ProtocolError(f"{path} is not a saved model ({error}): `catstream save` writes one") from None
+        return learned
+
+    @classmethod
+    def _of(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Self:
+        sample = checkpoint.sample_of(arrays, facts["sample"])
+        if sample is None:
+            raise ValueError("it holds no sample")
+        motion = Motion(arrays["process"], arrays["observation"]) if "process" in arrays else None
+        model = Model(sample.version, 0, arrays["weights"], float(facts["bias"]), motion, arrays.get("extent"))
+        return cls(model, replace(sample, frame=0), Box(*map(float, facts["box"])))

@@ -1,0 +1,239 @@
+"""A running pipeline is told what to do: another object, a pause, the end; and begins with what was saved."""
+
+from __future__ import annotations
+
+import os
+import signal
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import cv2
+import pytest
+import zmq
+
+from catstream.errors import ProtocolError, RefusedError, ServiceError, SettingsError
+from catstream.learned import Learned
+from catstream.pipeline import Pipeline
+from catstream.settings import Settings
+from catstream.steering import control
+from catstream.subscription import subscribe
+from catstream.video.source import open_source
+from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import Endpoint
+
+#: A small window keeps the detector near the frame that a test has reached.
+SETTINGS = Settings(window=16)
+SECONDS = 60  # that an answer may take on a busy machine
+PATCH = (20, 150, 70, 60)  # of the lake, which the object does not come to
+
+
+@contextmanager
+def steered(source, box=None, **options):
+    """A pipeline, its helm, and somewhere to steer from while its tracks are taken."""
+    with (
+        Pipeline(source, box, SETTINGS, **options) as pipeline,
+        control(pipeline.endpoint, timeout=SECONDS) as helm,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        yield pipeline, helm, pool
+
+
+def taken(pipeline, tracks, answer):
+    """What a command is answered while tracks are taken."""
+    for track in pipeline:
+        tracks.append(track)
+        if answer.done():
+            return answer.result()
+    return answer.result()
+
+
+def told(pipeline, condition):
+    """The counters of the detector, once they are so."""
+    with subscribe(pipeline.endpoint, "health", timeout=SECONDS) as health:
+        return next(h.counters for h in health if h.process == "detector" and condition(h.counters))
+
+
+@pytest.fixture(scope="module")
+def saved(video, tmp_path_factory):
+    """What was learned in the first half of the video."""
+    path, boxes = video
+    file = tmp_path_factory.mktemp("saved") / "object.safetensors"
+    with steered(path, boxes[0], part=slice(0, 80)) as (pipeline, helm, pool):
+        answer = None
+        for track in pipeline:
+            if answer is None and track.model_version >= 4:
+                answer = pool.submit(helm.save, file)
+        assert answer.result().version >= 4
+    return file
+
+
+def test_without_a_box_the_first_frame_is_held_until_there_is_one(video):
+    path, boxes = video
+    with steered(path) as (pipeline, helm, _):
+        assert told(pipeline, lambda counters: counters["waiting"])["sent"] == 0
+        assert helm.set_box(boxes[0]).frame == 0
+        tracks = list(pipeline)
+    assert [track.frame for track in tracks] == list(range(len(boxes)))
+    assert tracks[0].box == pytest.approx(boxes[0])
+    truth = zip(tracks, boxes, strict=True)
+    assert sum(track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth) > 0.8 * len(tracks)
+    assert pipeline.totals == {"sent": len(boxes), "stored": len(boxes)}
+
+
+def test_a_paused_file_waits_and_a_box_is_for_the_frame_that_is_held(video):
+    path, boxes = video
+    with steered(path) as (pipeline, helm, _):
+        helm.pause()
+        assert helm.set_box(boxes[0]).frame == 0
+        assert helm.set_box(boxes[1]).frame == 1
+        told(pipeline, lambda counters: counters["paused"] and counters["sent"] == 2)
+        helm.resume()
+        tracks = list(pipeline)
+    assert [track.frame for track in tracks] == list(range(len(boxes)))
+    assert [track.box for track in tracks[:2]] == [pytest.approx(box) for box in boxes[:2]]
+
+
+@pytest.mark.parametrize("victim", ["nobody", "detector"])
+def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_whoever_dies(video, victim):
+    path, boxes = video
+    tracks = []
+    with steered(path, PATCH) as (pipeline, helm, pool):
+        for track in pipeline:
+            tracks.append(track)
+            if track.model_version >= 4:
+                break
+        wanted = boxes[len(tracks) + SETTINGS.window // 2]
+        answer = taken(pipeline, tracks, pool.submit(helm.set_box, wanted))
+        if victim != "nobody":
+            os.kill(pipeline.pids[victim], signal.SIGKILL)
+        tracks += pipeline
+    assert [track.frame for track in tracks] == list(range(len(boxes)))
+    assert pipeline.totals == {"sent": len(boxes), "stored": len(boxes)}
+    before, after = tracks[: answer.frame], tracks[answer.frame :]
+    assert (after[0].state, after[0].model_version) == ("bootstrapping", 0)
+    assert after[0].box == pytest.approx(wanted)
+    assert not any(track.box is not None and track.box.overlap(boxes[track.frame]) for track in before)
+    there = [track.box is not None and track.box.overlap(boxes[track.frame]) > 0.3 for track in after]
+    assert sum(there) > 0.8 * len(after)
+    newest = max(track.model_version for track in before)
+    assert after[-1].model_version > newest
+    assert all(track.model_version == 0 or track.model_version > newest for track in after)
+
+
+def test_the_same_object_elsewhere_keeps_its_model(video):
+    path, boxes = video
+    tracks = []
+    with steered(path, boxes[0]) as (pipeline, helm, pool):
+        for track in pipeline:
+            tracks.append(track)
+            if track.model_version >= 4:
+                break
+        answer = taken(pipeline, tracks, pool.submit(helm.set_box, boxes[len(tracks)], keep=True))
+        tracks += pipeline
+    corrected = tracks[answer.frame]
+    assert corrected.state == "present"
+    assert corrected.box == pytest.approx(boxes[corrected.frame - 1], abs=60)
+    assert corrected.model_version >= 4
+    versions = [track.model_version for track in tracks]
+    assert versions == sorted(versions)
+
+
+def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
+    path, boxes = video
+    with steered(path) as (pipeline, helm, pool):
+        helm.pause()
+        helm.set_box(boxes[0])
+        killed = pipeline.pids["detector"]
+        os.kill(killed, signal.SIGKILL)
+        # Supervised while its tracks are taken: of which there is one.
+        resumed = pool.submit(lambda: (told(pipeline, lambda counters: counters["paused"]), helm.resume()))
+        tracks = list(pipeline)
+        assert resumed.result()[0]["sent"] <= 1
+    assert pipeline.restarts == 1
+    assert [track.frame for track in tracks] == list(range(len(boxes)))
+
+
+def test_stopped_by_a_command_all_is_stored_and_nothing_failed(video):
+    path, boxes = video
+    with steered(path, boxes[0]) as (pipeline, helm, pool):
+        tracks = [next(iter(pipeline))]
+        taken(pipeline, tracks, pool.submit(helm.stop))
+        tracks += pipeline
+    assert 0 < len(tracks) < len(boxes)
+    assert [track.frame for track in tracks] == list(range(len(tracks)))
+    assert pipeline.totals == {"sent": len(tracks), "stored": len(tracks)}
+
+
+def test_what_cannot_be_done_is_refused_and_the_pipeline_goes_on(video):
+    path, boxes = video
+    with steered(path) as (pipeline, helm, _):
+        helm.pause()
+        for box, why in (((400, 10, 20, 20), "outside the frame"), ((10, 10, 1, 9), "at least 2 pixels")):
+            with pytest.raises(RefusedError, match=why):
+                helm.set_box(box)
+        with pytest.raises(RefusedError, match="nothing was learned"):
+            helm.save("never.safetensors")
+        with zmq.Context.instance().socket(zmq.DEALER) as stranger:
+            stranger.connect(Endpoint.parse(pipeline.endpoint).address(CHANNELS["control"]))
+            for data in (b"", b"\xc1", b"\x93\x01\xa4", bytes(9000)):
+                stranger.send(data)
+            told(pipeline, lambda counters: counters["refused"] == 4)
+        helm.set_box(boxes[0])
+        helm.resume()
+        assert len(list(pipeline)) == len(boxes)
+        assert pipeline.restarts == 0
+
+
+def test_a_saved_model_finds_the_object_and_learning_goes_on_from_it(video, saved):
+    path, boxes = video
+    version = Learned.load(saved).model.version
+    with Pipeline(path, settings=SETTINGS, model=saved, part=slice(80, None)) as pipeline:
+        tracks = list(pipeline)
+    assert tracks[0].model_version == version
+    assert "bootstrapping" not in {track.state for track in tracks}
+    truth = list(zip(tracks, boxes[80:], strict=True))
+    assert sum(track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth) > 0.8 * len(tracks)
+    versions = [track.model_version for track in tracks]
+    assert versions == sorted(versions)
+    assert versions[-1] > version
+
+
+def test_in_lockstep_a_run_from_a_saved_model_repeats_itself_also_where_the_detector_dies(video, saved):
+    settings = Settings(lockstep=True)
+    runs = []
+    for dies in (False, True):
+        tracks = []
+        with Pipeline(video[0], settings=settings, model=saved, part=slice(60, 130)) as pipeline:
+            for track in pipeline:
+                tracks.append(track)
+                if dies and track.frame == 30:
+                    os.kill(pipeline.pids["detector"], signal.SIGKILL)
+        assert pipeline.restarts == dies
+        runs.append(tracks)
+    assert runs[0] == runs[1]
+
+
+def test_the_object_is_absent_until_it_is_found_in_whatever_size(video, saved, rng, tmp_path):
+    path, _ = video
+    with open_source(path) as source:
+        images = [cv2.resize(frame.image, None, fx=1.9, fy=1.9) for frame, _ in zip(source, range(20), strict=False)]
+    empty = [rng.integers(0, 256, images[0].shape, "u1") for _ in range(5)]
+    for number, image in enumerate(empty + images):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
+    with Pipeline(str(tmp_path), settings=SETTINGS, model=saved) as pipeline:
+        tracks = list(pipeline)
+    assert {track.state for track in tracks[:5]} == {"absent"}
+    assert tracks[-1].state == "present"
+    assert tracks[-1].box.overlap(video[1][19].scaled(1.9).centred(*(1.9 * c for c in video[1][19].centre))) > 0.5
+
+
+def test_a_model_that_cannot_be_used_is_refused_before_anything_starts(video, saved, tmp_path):
+    path, boxes = video
+    torn = tmp_path / "torn"
+    torn.write_bytes(saved.read_bytes()[:-9])
+    with pytest.raises(ProtocolError, match="not a whole file"):
+        Pipeline(path, model=torn)
+    with pytest.raises(ServiceError, match="no saved model"):
+        Pipeline(path, model=tmp_path / "none")
+    with pytest.raises(SettingsError, match="one of them"):
+        Pipeline(path, boxes[0], model=saved)
