@@ -87,19 +87,19 @@ class Endpoint:
         hosts, _, port = text.removeprefix("tcp://").rpartition(":")
         first, *others = hosts.split(",")
         named = dict(other.partition("=")[::2] for other in others)
-        if not (port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
+        if not all(map(_is_host, [first, *named.values()])):
             port = ""
-        if not port or not all(map(_is_host, [first, *named.values()])):
-            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
-        if unknown := named.keys() - _LISTENERS:
-            raise ServiceError(f"{text!r} names {', '.join(unknown)}, there are {', '.join(sorted(_LISTENERS))}")
-        first, named = _plain(first), {name: _plain(host) for name, host in named.items()}
-        if keys is None and not all(map(_is_loopback, [first, *named.values()])):
+        elif keys is None and not all(map(_is_loopback, map(_plain, [first, *named.values()]))):
             raise ServiceError(
                 f"{text} can be reached from other machines, and nothing on it asks who is there: make keys "
                 "(catstream keys new DIR) and give them to all (--set keys=DIR), or give a folder or "
                 "tcp://127.0.0.1:PORT"
             )
+        if not (port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
+            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
+        if unknown := named.keys() - _LISTENERS:
+            raise ServiceError(f"{text!r} names {', '.join(unknown)}, there are {', '.join(sorted(_LISTENERS))}")
+        first, named = _plain(first), {name: _plain(host) for name, host in named.items()}
         return cls(host=first, port=int(port), hosts=named, keys=keys)
 
     def address(self, channel: Channel, sender: str | None = None) -> str:

@@ -57,9 +57,11 @@ def test_a_stranger_at_the_door_of_a_pipeline_is_counted_in_its_health(video, ke
             assert not stranger._messages.pending()
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "example.org"])
-def test_a_pipeline_that_others_can_reach_does_not_start_without_keys(video, host):
+@pytest.mark.parametrize(
+    "place", ["0.0.0.0:0", "192.0.2.1:5700", "example.org:5700", "127.0.0.1,trainer=192.0.2.1:5700"]
+)
+def test_a_pipeline_that_others_can_reach_does_not_start_without_keys(video, place):
     path, boxes = video
-    settings = Settings(endpoint=f"tcp://{host}:5700")
+    settings = Settings(endpoint=f"tcp://{place}")
     with pytest.raises(ServiceError, match="catstream keys new"), Pipeline(path, boxes[0], settings):
         pass
