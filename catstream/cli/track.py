@@ -34,6 +34,7 @@ _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 @click.option("--output", type=_FOLDER, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--record", type=click.Path(path_type=Path), help="File to record the run to: `catstream replay`.")
+@click.option("--view", type=int, is_flag=False, flag_value=8000, metavar="[PORT]", help="Serve a web page of it.")
 @click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
 @click.option("--state", type=_FOLDER, help="Folder to keep what was learned in, through power cuts.")
 @click.option("--resume", type=_FOLDER, help="Go on with what is kept in such a folder.")
@@ -49,6 +50,7 @@ def track(
     output: Path | None,
     video: bool,
     record: Path | None,
+    view: int | None,
     lockstep: bool,
     state: Path | None,
     resume: Path | None,
@@ -56,7 +58,8 @@ def track(
     """Follow an object through a video.
 
     It is shown by its box in the first frame, or found by what was learned of
-    it before, or waited for until `catstream set-box` says where it is.
+    it before, or waited for until `catstream set-box` says where it is, or
+    somebody who draws a box on the web page.
 
     SOURCE is a video file, a folder of images, a pattern like
     images/%05d.png, a camera (0 or /dev/video0), or a stream (rtsp://... or
@@ -88,7 +91,7 @@ def track(
       catstream track walk.mp4 --box 120,80,64,48 --record walk.rec
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
-      catstream track 0
+      catstream track 0 --view
       catstream track walk.mp4 --box 120,80,64,48 --output out --state kept
       catstream track --resume kept
     """
@@ -123,6 +126,12 @@ def track(
     try:
         with ExitStack() as stack:
             stack.enter_context(pipeline)
+            if view is not None:
+                from catstream.web.server import Server
+
+                server = Server(pipeline.endpoint, pipeline.settings.keys, port=view)
+                stack.enter_context(server.beside())
+                console.print(f"page: {server.url}", highlight=False)
             if pipeline.waits:
                 where = f" --endpoint {pipeline.endpoint}"
                 console.print(f"it waits for a box: catstream set-box X,Y,W,H{where}", highlight=False)

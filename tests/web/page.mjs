@@ -1,0 +1,56 @@
+// What a person does on the page, in a real browser; says what was seen, a line each.
+//   node page.mjs URL CHROMIUM PROFILE BOX, then on standard input: "restart" once the pipeline is another
+
+import { createInterface } from "node:readline";
+import { chromium } from "playwright-core";
+
+const [url, executablePath, profile, box] = process.argv.slice(2);
+const [left, top, wide, tall] = box.split(",").map(Number);
+const patience = { timeout: 60_000 };
+const options = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+  "--disable-component-update", "--disable-sync"];
+const browser = await chromium.launchPersistentContext(profile, {
+  executablePath, headless: true, args: options, viewport: { width: 1200, height: 900 },
+});
+
+try {
+  const page = browser.pages()[0] ?? (await browser.newPage());
+  const wrong = [];
+  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
+  page.on("pageerror", (error) => wrong.push(error.message));
+  await page.goto(url);
+  const state = page.locator("#state");
+  const is = (name) => page.waitForSelector(`#state[data-state="${name}"]`, patience);
+
+  await page.waitForFunction(() => document.querySelector("#veil").textContent === "", null, patience);
+  console.log("state", await state.innerText());
+  const view = await page.locator("#picture").boundingBox();
+  const scale = view.width / Number(process.argv[6]);
+  const at = (x, y) => [view.x + x * scale, view.y + y * scale];
+  await page.mouse.move(...at(left, top));
+  await page.mouse.down();
+  await page.mouse.move(...at(left + wide / 2, top + tall / 2));
+  await page.mouse.move(...at(left + wide, top + tall));
+  await page.mouse.up();
+  await page.click("#follow:not([disabled])", patience);
+  await is("present");
+  console.log("state", await state.innerText());
+  await is("absent");
+  console.log("state", await state.innerText());
+  await page.waitForSelector(".tree .node", { state: "attached", ...patience });
+  await page.waitForSelector(".film li canvas", patience);
+  console.log("film", (await page.locator(".film li").count()) > 0);
+
+  console.log("kill");
+  await is("gone");
+  console.log("state", await state.innerText());
+  for await (const line of createInterface({ input: process.stdin })) if (line === "restart") break;
+  await is("present");
+  console.log("state", await state.innerText());
+  await page.setViewportSize({ width: 360, height: 740 });
+  console.log("overflow", await page.evaluate(() => document.documentElement.scrollWidth - innerWidth));
+  console.log("errors", JSON.stringify(wrong.filter((text) => !text.includes("404"))));
+} finally {
+  await browser.close();
+}
+process.exit(0);

@@ -1,0 +1,94 @@
+"""The page in a real browser: a box drawn with the mouse is followed, until the object leaves, and after a restart."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import threading
+from pathlib import Path
+
+import pytest
+
+from catstream.pipeline import Pipeline
+from catstream.settings import Settings
+from catstream.video.demo import write
+from catstream.web.server import Server
+
+HERE = Path(__file__).parent
+SIZE = (320, 240)
+
+
+@pytest.fixture
+def browse(tmp_path):
+    """Starts a browser that does what `page.mjs` says; the lines that it prints, and where to write to it."""
+    node, chromium = shutil.which("node"), shutil.which("chromium")
+    if node is None or chromium is None or not (HERE / "node_modules" / "playwright-core").exists():
+        pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
+    browsers = []
+
+    def start(url, box):
+        profile, box = str(tmp_path / "profile"), ",".join(map(str, box))
+        browser = subprocess.Popen(
+            [node, HERE / "page.mjs", url, chromium, profile, box, str(SIZE[0])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        browsers.append(browser)
+        lines = []
+        reader = threading.Thread(target=lambda: lines.extend(line.strip() for line in browser.stdout))
+        reader.start()
+        browsers.append(reader)
+        return browser, lines
+
+    yield start
+    if browsers:
+        browser, reader = browsers
+        browser.stdin.close()
+        try:
+            browser.wait(30)
+        except subprocess.TimeoutExpired:
+            browser.kill()
+            browser.wait()
+        reader.join()
+        browser.stdout.close()
+
+
+def test_a_box_drawn_with_the_mouse_is_followed_until_it_leaves_and_after_a_restart(browse, folder, tmp_path, until):
+    path, boxes = write(tmp_path, 520, SIZE)
+    settings = Settings(endpoint=str(folder), window=4)  # it goes on only as its tracks are taken
+    server = Server(str(folder), port=0)
+    with server.beside():
+        with Pipeline(str(path), None, settings) as pipeline:
+            browser, lines = browse(server.url, boxes[0])
+
+            def said(line):
+                assert browser.poll() is None or line in lines, lines
+                return line in lines
+
+            waits = {"present": 20, "absent": 5}  # how many frames of a state there are before the page is looked at
+            for track in pipeline:
+                if track.state in waits:
+                    waits[track.state] -= 1
+                    if not waits[track.state]:
+                        until(lambda state=track.state: said(f"state {state}"), 120)
+                        del waits[track.state]
+                if not waits:
+                    break
+            until(lambda: said("kill"), 120)
+            for pid in pipeline.pids.values():
+                os.kill(pid, signal.SIGKILL)
+        until(lambda: said("state pipeline gone"), 120)
+        with Pipeline(str(path), boxes[0], settings) as pipeline:
+            browser.stdin.write("restart\n")
+            browser.stdin.flush()
+            seen = lines.index("state pipeline gone") + 1
+            for number, track in enumerate(pipeline):
+                if track.state == "present" and number > 50:
+                    until(lambda: "state present" in lines[seen:] and said("errors []"), 120)
+                    break
+    assert lines[0] == "state waiting for a box"
+    assert "film true" in lines
+    assert "overflow 0" in lines
