@@ -81,7 +81,7 @@ def messages() -> dict[str, tuple[Any, ...]]:
 
     box = Box(4.5, 3.0, 20.0, 10.0)
     motion = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
-    bearings = Bearings("present", box, box, 0.9, False, motion, array(5, 4, dtype="<f8"))
+    bearings = Bearings("present", box, box, box, 0.9, False, motion, array(5, 4, dtype="<f8"))
     none = np.empty((0, 5), "<f4")
     return {
         "answer": (Answer("7f", True, "followed from frame 9 on", 9, box, 4),),
@@ -134,7 +134,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
             *(encode(message) for several in seeds.values() for message in several),
         ),
         "storage": filed(folder / "a", storage.read, ProtocolError, (folder / "checkpoint").read_bytes()),
-        "checkpoint": filed(folder / "b", forged, ProtocolError, (folder / "checkpoint").read_bytes()),
+        "checkpoint": filed(folder / "b", forged, CatstreamError, (folder / "checkpoint").read_bytes()),
         "recording": filed(
             folder / "c",
             lambda path: list(Recording(path).messages()),
@@ -160,7 +160,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
 def forged(path: Path) -> None:
     """Load a checkpoint whose checksum fits, as who writes one on purpose sees to."""
     with patch.object(storage, "_checksum", lambda *_: Anything()):
-        Compressor.load(path, SETTINGS)
+        Compressor.load(path, SETTINGS).counters()
 
 
 class Anything:

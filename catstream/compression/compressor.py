@@ -187,7 +187,7 @@ class Compressor:
                     key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")
                 }
                 self.trees[name] = CoresetTree.from_state(own, tree_facts)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): take an older copy") from None
         if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset_size}:
             raise SettingsError(

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["CoresetTree", "Node"]
 
+_LEVELS = 64  # more leaves than any stream has
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
@@ -223,7 +225,7 @@ class CoresetTree:
                 tree.nodes.append(Node(int(level), rows, int(count), total, float.fromhex(dropped)))
             tree.pending = arrays["pending"]
             tree._check()
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(
                 f"not the state of a coreset tree ({error!r}): take an older copy of the file"
             ) from None
@@ -256,5 +258,7 @@ class CoresetTree:
             whole = node.rows.shape == (self.size, self.width) and node.sum.shape == (self.width,)
             if not whole or node.rows.dtype != np.float32 or node.sum.dtype != np.float64:
                 raise ValueError(f"a node of {node.rows.dtype} {node.rows.shape}")
-            if node.count != self.size << node.level or not np.isfinite(node.rows).all():
+            if not 0 <= node.level < _LEVELS or node.count != self.size << node.level:
                 raise ValueError(f"a node of level {node.level} and {node.count} rows")
+            if not (np.isfinite(node.rows).all() and np.isfinite(node.sum).all() and 0 <= node.dropped < np.inf):
+                raise ValueError(f"a node of level {node.level} with numbers that are not finite")

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from catstream.box import Box
+from catstream.compression import storage
 from catstream.compression.compressor import Compressor
 from catstream.errors import ProtocolError, SettingsError
 from catstream.messages import Bearings, Features, Motion, Sample
@@ -191,6 +192,19 @@ def test_a_torn_state_is_refused(settings, messages, share, tmp_path):
     compressor.save(path)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ProtocolError, match="take an older copy"):
+        Compressor.load(path, settings)
+
+
+@pytest.mark.parametrize(("energy", "level"), [("0x1p9999", 0), ("nan", 0), ("0x1p3", 10**9)])
+def test_a_forged_state_is_refused(energy, level, settings, messages, tmp_path):
+    """Its checksum fits: whoever writes one on purpose sees to that."""
+    compressor, path = Compressor(settings), tmp_path / "state"
+    take(compressor, messages, 37)
+    compressor.save(path)
+    arrays, facts = storage.read(path)
+    facts["trees"]["object"]["nodes"][0] = [level, facts["trees"]["object"]["nodes"][0][1], energy]
+    storage.write(path, arrays, facts)
     with pytest.raises(ProtocolError, match="take an older copy"):
         Compressor.load(path, settings)
 
