@@ -1,0 +1,86 @@
+"""How a run goes on after everything was killed, as by a power cut, at random moments.
+
+Again and again `catstream track` and all its processes get SIGKILL, once a random number of new rows has come, and
+`--resume` goes on. When all moments are through, the run goes on to its end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+from sequences import scratch
+from table import Table, command, publish
+
+from catstream.compression.generations import Generations
+from catstream.errors import ServiceError
+from catstream.settings import Settings
+from catstream.state import TREES
+from catstream.video.demo import write
+from catstream.video.results import tracks
+
+TRACK = [sys.executable, "-c", "from catstream.cli import main; main()", "track"]
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    moments, most = (2, 5) if options.quick else (options.moments, options.rows)
+    frames = moments * most
+    place, chance = scratch(), random.Random(options.seed)
+    video, boxes = write(place, frames, (320, 240))
+    kept, out = place / "kept", place / "out"
+    begin = [str(video), "--box", ",".join(map(str, boxes[0])), "--output", str(out), "--state", str(kept)]
+    go_on = ["--resume", str(kept)]
+    watched(begin, out, chance.randrange(most))
+    seconds = [watched(go_on, out, chance.randrange(most)) for _ in range(moments - 1)]
+    seconds.append(watched(go_on, out, None))
+
+    rows = [track.frame for track in tracks(out)]
+    stored = Generations(kept / TREES).load(Settings()).seq
+    columns = ("killed", "frames", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")
+    row = (moments, frames, frames - len(set(rows)), len(rows) - len(set(rows)), stored)
+    yield Table("Resume", columns, [(*row, float(np.median(seconds)), max(seconds))], f"seed {options.seed}")
+
+
+def watched(arguments: list[str], out: Path, rows: int | None) -> float:
+    """Run until more new rows have come, then kill it with its children; to the end where None.
+
+    Returns seconds to the first new row.
+    """
+    started, before, first = time.monotonic(), written(out), 0.0
+    process = subprocess.Popen([*TRACK, *arguments], stderr=subprocess.DEVNULL)
+    while process.poll() is None:
+        new = written(out) - before
+        first = first or (new and time.monotonic() - started)
+        if rows is not None and new > rows:
+            family = [psutil.Process(process.pid), *psutil.Process(process.pid).children()]
+            for one in family:
+                one.kill()
+            process.wait()
+            psutil.wait_procs(family)
+            return first
+        time.sleep(0.02)
+    if process.returncode or rows is not None:
+        raise ServiceError(f"`catstream track {' '.join(arguments)}` ended too early, with {process.returncode}")
+    return first or time.monotonic() - started
+
+
+def written(out: Path) -> int:
+    """Rows that there are."""
+    table = out / "tracks.csv"
+    return max(table.read_text().count("\n") - 1, 0) if table.exists() else 0
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--moments", type=int, default=20, help="how often all is killed (default: %(default)s)")
+    parser.add_argument("--rows", type=int, default=40, help="new rows before that, at most (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options.json)
