@@ -260,5 +260,5 @@ class CoresetTree:
                 raise ValueError(f"a node of {node.rows.dtype} {node.rows.shape}")
             if not 0 <= node.level < _LEVELS or node.count != self.size << node.level:
                 raise ValueError(f"a node of level {node.level} and {node.count} rows")
-            if not (np.isfinite(node.rows).all() and np.isfinite(node.sum).all() and 0 <= node.dropped < np.inf):
+            if not (np.isfinite(node.rows).all() and np.isfinite(node.sum).all() and np.isfinite(node.dropped)):
                 raise ValueError(f"a node of level {node.level} with numbers that are not finite")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
+from catstream import storage
 from catstream.box import Box
-from catstream.compression import storage
 from catstream.compression.compressor import Compressor
 from catstream.errors import ProtocolError, SettingsError
 from catstream.messages import Bearings, Features, Motion, Sample
