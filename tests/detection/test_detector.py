@@ -9,8 +9,8 @@ import pytest
 from catstream.box import Box
 from catstream.detection.detector import Detector
 from catstream.detection.hog import row_length
-from catstream.errors import BoxError
-from catstream.messages import Motion
+from catstream.errors import BoxError, ProtocolError
+from catstream.messages import Model, Motion
 from catstream.settings import Settings
 
 START = Box(60, 50, 48, 40)
@@ -118,7 +118,7 @@ def test_another_detector_goes_on_where_one_stopped(scene):
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
     track, features = detector.step(scene((64, 52)))
-    other.resume(features.seq, START, other.bearings_at(track.box), model)
+    other.resume(features.seq, other.bearings_at(track.box, START), model)
     track, _ = other.step(scene((68, 54)))
     assert (track.seq, track.state) == (3, "present")
     assert track.box.overlap(Box(68, 54, 48, 40)) > 0.8
@@ -133,7 +133,7 @@ def test_with_the_bearings_of_a_frame_another_detector_goes_on_bit_for_bit(scene
         _, features = detector.step(scene((left, 50)))
     if absent:
         _, features = detector.step(scene())
-    other.resume(features.seq, START, features.bearings, model)
+    other.resume(features.seq, features.bearings, model)
     for left in range(84, 100, 4):
         (track, features), (again, repeated) = (stage.step(scene((left, 50))) for stage in (detector, other))
         assert again == track
@@ -144,7 +144,7 @@ def test_a_frame_teaches_the_same_whatever_came_before(scene):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
-    other.resume(1, START, other.bearings_at(START), model)
+    other.resume(1, other.bearings_at(START, START), model)
     one, two = (stage.step(scene((60, 50)))[1] for stage in (detector, other))
     np.testing.assert_allclose(one.rows, two.rows, atol=1e-5)
 
@@ -175,3 +175,59 @@ def test_an_object_at_the_edge_stays_a_box_in_the_frame(scene):
         frame = np.roll(scene((60, 50)), x - 60, axis=1)
         track, _ = detector.step(frame)
         assert track.box is None or 0 <= track.box.centre[0] < 320
+
+
+def test_another_object_begins_with_a_model_of_its_own_and_older_ones_are_not_adopted(scene):
+    detector = started(scene)
+    detector.adopt(dataclasses.replace(detector.model, version=1))
+    for left in (60, 62):
+        detector.step(scene((left, 50)))
+    track, features = detector.init(scene((64, 50)), Box(64, 50, 48, 40))
+    assert (track.seq, track.state, track.model_version, features.begins) == (4, "bootstrapping", 0, True)
+    stand_in = detector.model
+    detector.adopt(dataclasses.replace(stand_in, version=2, frame=2))
+    assert (detector.model, detector.heard) == (stand_in, 2), "it is of the object before"
+    detector.adopt(dataclasses.replace(stand_in, version=3, frame=3))
+    assert detector.model.version == 3
+
+
+@pytest.mark.parametrize(
+    "box", [(400, 10, 20, 20), (10, 10, 0, 10), (150, 20, 30, 30)], ids=["outside", "empty", "flat"]
+)
+def test_a_box_that_cannot_be_followed_leaves_what_is(box):
+    image = np.full((120, 200, 3), 90, np.uint8)
+    image[40:80, 20:60] = np.random.default_rng(2).integers(0, 256, (40, 40, 3))
+    detector = Detector(Settings())
+    detector.init(image, Box(20, 40, 40, 40))
+    with pytest.raises(BoxError):
+        detector.init(image, Box(*box))
+    assert (detector.seq, detector.box) == (1, Box(20, 40, 40, 40))
+    assert detector.step(image)[0].state != "absent"
+
+
+def test_a_model_finds_its_object_in_a_frame_that_it_never_saw(scene):
+    teacher = started(scene)
+    model = dataclasses.replace(teacher.model, version=7)
+    detector = Detector(Settings())
+    detector.seek(model, START)
+    absent, _ = detector.step(scene())
+    found = [detector.step(scene((90, 60)))[0] for _ in range(3)][-1]
+    assert (absent.state, absent.model_version) == ("absent", 7)
+    assert found.state == "present"
+    assert found.box.overlap(Box(90, 60, 48, 40)) > 0.6
+
+
+def test_a_model_of_other_features_is_refused():
+    with pytest.raises(ProtocolError, match="learn it anew"):
+        Detector(Settings()).seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START)
+
+
+def test_a_corrected_box_is_gone_on_with_and_teaches(scene):
+    detector = started(scene)
+    detector.adopt(dataclasses.replace(detector.model, version=1))
+    track, features = detector.correct(scene((90, 60)), Box(90, 60, 48, 40))
+    assert (track.seq, track.state, track.model_version) == (2, "present", 1)
+    assert track.box == Box(90, 60, 48, 40)
+    assert len(features.rows)
+    assert not features.begins
+    assert detector.step(scene((92, 60)))[0].box.overlap(Box(92, 60, 48, 40)) > 0.7

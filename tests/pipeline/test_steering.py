@@ -93,7 +93,7 @@ def test_a_paused_file_waits_and_a_box_is_for_the_frame_that_is_held(video):
     assert [track.box for track in tracks[:2]] == [pytest.approx(box) for box in boxes[:2]]
 
 
-@pytest.mark.parametrize("victim", ["nobody", "detector"])
+@pytest.mark.parametrize("victim", ["nobody", "detector", "compressor"])
 def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_whoever_dies(video, victim):
     path, boxes = video
     tracks = []
@@ -225,6 +225,29 @@ def test_the_object_is_absent_until_it_is_found_in_whatever_size(video, saved, r
     assert {track.state for track in tracks[:5]} == {"absent"}
     assert tracks[-1].state == "present"
     assert tracks[-1].box.overlap(video[1][19].scaled(1.9).centred(*(1.9 * c for c in video[1][19].centre))) > 0.5
+
+
+def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera):
+    path, boxes = video
+    with open_source(path) as source:
+        image = next(source).image
+    still = camera(lambda _: image)
+    with steered(still.url) as (pipeline, helm, _):
+        told(pipeline, lambda counters: counters["waiting"] and counters["skipped"] >= 3)
+        helm.set_box(boxes[0])
+        helm.pause()
+        passed = told(pipeline, lambda counters: counters["paused"])
+        assert told(pipeline, lambda counters: counters["skipped"] > passed["skipped"])["sent"] == passed["sent"]
+        helm.resume()
+        tracks = []
+        for track in pipeline:
+            tracks.append(track)
+            if len(tracks) == passed["sent"] + 3:
+                helm.stop()
+    assert tracks[0].box == pytest.approx(boxes[0])
+    assert [track.frame for track in tracks] == list(range(len(tracks)))
+    assert all(track.box.overlap(boxes[0]) > 0.8 for track in tracks)
+    assert pipeline.totals == {"sent": len(tracks), "stored": len(tracks)}
 
 
 def test_a_model_that_cannot_be_used_is_refused_before_anything_starts(video, saved, tmp_path):

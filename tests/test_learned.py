@@ -1,0 +1,121 @@
+"""What was learned, in a file: as it was, or not at all; and trees that go on from it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
+from catstream.compression.tree import CoresetTree
+from catstream.errors import ProtocolError, ServiceError
+from catstream.learned import Learned
+from catstream.messages import Features, Model, Motion
+from catstream.settings import Settings
+
+SIZE, WIDTH = 8, 20
+
+
+def features(rng, seq, begins=False):
+    """What a frame teaches: rows of an object around 1, and of a background around -1."""
+    labels = np.repeat(np.float32([1, 0]), 4)
+    rows = rng.normal(scale=0.2, size=(8, WIDTH)).astype(np.float32) + np.where(labels[:, None], 1, -1)
+    ones = np.ones(8, np.float32)
+    box = Box(1.0, 2.0, 30.0, 40.0)
+    return Features(
+        seq, seq - 1, seq / 25, box, rows.astype(np.float32), labels, ones, rows[:4], ones[:4], None, begins
+    )
+
+
+@pytest.fixture
+def compressor(rng):
+    """One that has seen a while."""
+    compressor = Compressor(Settings(coreset_size=SIZE))
+    for seq in range(1, 101):
+        compressor.take(features(rng, seq))
+    return compressor
+
+
+@pytest.fixture
+def learned(compressor, rng):
+    sample = compressor.last_sample
+    motion = Motion(np.eye(4), np.eye(2))
+    weights = rng.normal(size=WIDTH).astype(np.float32)
+    return Learned(
+        Model(sample.version, sample.frame, weights, -0.25, motion, weights), sample, Box(1.0, 2.0, 30.0, 40.0)
+    )
+
+
+def test_what_is_saved_comes_back_bit_for_bit_with_frames_that_count_anew(learned, tmp_path):
+    learned.save(tmp_path / "one")
+    read = Learned.load(tmp_path / "one")
+    anew = (dataclasses.replace(part, frame=0) for part in (learned.model, learned.sample))
+    np.testing.assert_equal(dataclasses.asdict(read), dataclasses.asdict(Learned(*anew, learned.box)))
+
+
+@pytest.mark.parametrize("share", [0, 0.3, 0.99])
+def test_a_torn_file_is_refused(learned, tmp_path, share):
+    learned.save(tmp_path / "one")
+    whole = (tmp_path / "one").read_bytes()
+    (tmp_path / "one").write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ProtocolError, match="not a whole file"):
+        Learned.load(tmp_path / "one")
+
+
+def test_another_file_of_ours_is_refused(compressor, tmp_path):
+    compressor.save(tmp_path / "one")
+    with pytest.raises(ProtocolError, match="not a saved model"):
+        Learned.load(tmp_path / "one")
+
+
+def test_where_it_cannot_be_written_it_says_so_and_leaves_nothing(learned, tmp_path):
+    with pytest.raises(ServiceError, match="cannot write"):
+        learned.save(tmp_path / "none" / "one")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("size", [SIZE // 2, SIZE, 2 * SIZE])
+def test_a_tree_of_a_sample_stands_for_as_many_rows_with_the_same_mean(compressor, size):
+    tree = compressor.trees["object"]
+    summary = tree.sample()
+    other = CoresetTree.of(summary, size)
+    assert summary.count / 2 < other.rows_seen <= summary.count
+    np.testing.assert_allclose(other.sum / other.rows_seen, tree.sum / tree.rows_seen, rtol=1e-5)
+    directions = np.linalg.qr(np.random.default_rng(3).normal(size=(WIDTH, 3)))[0]
+    ours, theirs = (
+        sum(float(np.sum((node.rows @ directions) ** 2)) for node in each.nodes) / each.rows_seen
+        for each in (other, tree)
+    )
+    assert ours == pytest.approx(theirs, rel=0.2)
+    CoresetTree.from_state(*other.state())
+
+
+def test_a_compressor_goes_on_from_a_sample_with_its_version_and_its_weight(learned, rng, tmp_path):
+    learned.save(tmp_path / "one")
+    compressor = Compressor.of(Learned.load(tmp_path / "one").sample, Settings(coreset_size=SIZE))
+    assert compressor.sampled == learned.sample.version
+    samples = [sample for seq in range(1, 30) if (sample := compressor.take(features(rng, seq)))]
+    assert [sample.version for sample in samples] == [learned.sample.version + 1 + i for i in range(len(samples))]
+    assert samples[-1].object.count > learned.sample.object.count / 2
+
+
+def test_where_another_object_begins_nothing_of_the_one_before_is_left_but_the_versions(compressor, rng):
+    version, fresh = compressor.version, Compressor(Settings(coreset_size=SIZE))
+    stream = [features(rng, seq, begins=seq == 101) for seq in range(101, 140)]
+    ours = [compressor.take(message) for message in stream]
+    theirs = [fresh.take(dataclasses.replace(message, seq=message.seq - 100)) for message in stream]
+    for one, other in zip(ours, theirs, strict=True):
+        if one is not None:
+            np.testing.assert_equal(
+                dataclasses.asdict(one), dataclasses.asdict(dataclasses.replace(other, version=other.version + version))
+            )
+    assert [one is None for one in ours] == [other is None for other in theirs]
+    assert ours[-1] is not None or any(ours)
+
+
+def test_until_its_first_sample_another_object_has_none(compressor, rng):
+    assert compressor.sampled
+    compressor.take(features(rng, 101, begins=True))
+    assert compressor.sampled == 0
