@@ -1,0 +1,102 @@
+"""`catstream set-box`, `pause`, `resume`, `save` and `stop`, as a person uses them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import time
+
+import pytest
+
+from catstream.cli import VERBS
+from catstream.video.source import open_source
+
+STEER = ["set-box", "pause", "resume", "save", "stop"]
+PATIENT = ("--timeout", 60)
+
+
+@pytest.fixture
+def steer(said, tmp_path):
+    """Gives a command to the pipeline of this test: exit code, what it said."""
+
+    def give(*words):
+        code, output, errors = said(*words, "--endpoint", tmp_path / "run", *PATIENT)
+        assert "Traceback" not in errors
+        return code, (output or errors).strip()
+
+    return give
+
+
+@pytest.fixture
+def state(said, tmp_path):
+    """What `catstream status` says that the pipeline of this test does."""
+
+    def ask():
+        code, output, _ = said("status", "--json", "--endpoint", tmp_path / "run", "--wait", 60)
+        assert code == 0
+        return json.loads(output)["state"]
+
+    return ask
+
+
+def rows(folder):
+    return list(csv.DictReader((folder / "tracks.csv").read_text().splitlines()))
+
+
+def test_a_run_without_a_box_is_shown_the_object_and_goes_on_when_it_may(video, catstream, steer, state, tmp_path):
+    source, box = video
+    run = catstream("track", source, "--output", tmp_path / "out", "--set", f"endpoint={tmp_path / 'run'}")
+    assert steer("pause") == (0, "paused before the first frame")
+    assert state() == "waiting for a box"
+    assert steer("set-box", "400,10,20,20")[0] == 1
+    code, answer = steer("set-box", box)
+    assert (code, answer.endswith("in frame 0")) == (0, True), answer
+    assert state() == "paused"
+    code, answer = steer("save", tmp_path / "one")
+    assert (code, "nothing was learned of the object yet" in answer) == (1, True), answer
+    assert steer("resume") == (0, "it goes on after frame 0")
+    errors = run.communicate(timeout=120)[1]
+    assert run.returncode == 0, errors
+    assert "it waits for a box: catstream set-box X,Y,W,H --endpoint" in errors
+    assert "60 messages sent, 60 stored" in errors
+    assert len(rows(tmp_path / "out")) == 60
+
+
+def test_what_a_stopped_run_has_saved_finds_the_object_in_another(video, catstream, said, steer, camera, tmp_path):
+    source, box = video
+    with open_source(source) as film:
+        image = next(film).image
+    url = camera(lambda _: image).url
+    run = catstream("track", url, "--box", box, "--set", f"endpoint={tmp_path / 'run'}")
+    deadline = time.monotonic() + 120
+    while (saved := steer("save", tmp_path / "one"))[0]:
+        assert time.monotonic() < deadline, saved
+    assert saved[1].endswith(f"is in {tmp_path / 'one'}")
+    code, answer = steer("stop")
+    assert (code, answer.startswith("the stream ends after frame")) == (0, True)
+    assert run.wait(120) == 0
+    code, _, errors = said("track", source, "--model", tmp_path / "one", "--output", tmp_path / "out")
+    assert code == 0, errors
+    found = rows(tmp_path / "out")
+    assert [row["state"] for row in found] == ["present"] * 60
+    assert int(found[0]["model_version"]) >= 1
+
+
+def test_box_and_model_together_are_refused(video, said, tmp_path):
+    source, box = video
+    code, _, errors = said("track", source, "--box", box, "--model", tmp_path / "one")
+    assert code == 2
+    assert "give one of them" in errors.replace("\n", " ")
+
+
+@pytest.mark.parametrize("verb", STEER)
+def test_where_no_pipeline_runs_one_line_says_so(said, tmp_path, verb):
+    assert verb in VERBS
+    words = {"set-box": ["1,2,3,4"], "save": [tmp_path / "one"]}.get(verb, [])
+    code, output, errors = said(verb, *words, "--endpoint", tmp_path / "run", "--timeout", 0.2)
+    assert (code, output) == (1, "")
+    assert errors.startswith("catstream: nothing at ")
+    assert f"answered {verb} within 0.2 s: is a pipeline running there" in errors
+    nowhere = {**os.environ, "TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}
+    assert said(verb, *words, env=nowhere)[2].startswith("catstream: no pipeline of yours is running")
