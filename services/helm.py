@@ -76,7 +76,7 @@ class Helm:
     def __init__(self, endpoint: Endpoint, detector: Detector, orders: Orders, file: Path | None) -> None:
         self.orders, self.over = orders, STOPPED if orders.stopped else ""
         self._detector, self._file = detector, file
-        self._boxes: deque[Command] = deque()  # that wait for a frame
+        self._boxes: deque[tuple[Command, Box]] = deque()  # that wait for a frame
         self._commands = Responder("control", endpoint)
         self._hold(orders)
 
@@ -101,8 +101,8 @@ class Helm:
         for command in commands:
             if self.over and command.verb != "save":
                 self._answer(command, False, f"it ends: {self.over}")
-            elif command.verb == "set-box":
-                self._boxes.append(command)
+            elif command.verb == "set-box" and command.box is not None:
+                self._boxes.append((command, command.box))
             else:
                 self._answer(command, *self._done(command))
         return bool(commands)
@@ -110,26 +110,25 @@ class Helm:
     def follow(self, frame: Frame) -> tuple[Track, Features] | None:
         """What a frame gives where a box for it was commanded, else None; one box a frame."""
         while self._boxes:
-            command = self._boxes.popleft()
-            assert command.box is not None
+            command, box = self._boxes.popleft()
             keeps = command.keep and self._detector.model.version > 0
             try:
                 place = self._detector.correct if keeps else self._detector.init
-                found = place(frame.image, command.box, frame.time)
+                found = place(frame.image, box, frame.time)
             except BoxError as error:
                 self._answer(command, False, str(error))
                 continue
             if not keeps:
-                self._hold(replace(self.orders, box=command.box, begins=found[0].seq))
+                self._hold(replace(self.orders, box=box, begins=found[0].seq))
             what = "the same object goes on" if keeps else "another object begins"
-            self._answer(command, True, f"{what} at {command.box} in frame {found[0].frame}")
+            self._answer(command, True, f"{what} at {box} in frame {found[0].frame}")
             return found
         return None
 
     def refuse_boxes(self, reason: str) -> None:
         """Answer the boxes that wait: there is no frame for them."""
         while self._boxes:
-            self._answer(self._boxes.popleft(), False, reason)
+            self._answer(self._boxes.popleft()[0], False, reason)
 
     def end(self, reason: str) -> None:
         """No frame follows: all is refused but to save what was learned."""
