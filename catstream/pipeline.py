@@ -218,8 +218,8 @@ class Pipeline:
 
     @property
     def waits(self) -> bool:
-        """Whether it begins by waiting for a box."""
-        return self._box is None and self._model is None
+        """Whether it begins by waiting for a box; one that goes on may have one by now."""
+        return self._box is None and self._model is None and self._kept is None
 
     @property
     def holding(self) -> str:
