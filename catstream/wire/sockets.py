@@ -21,6 +21,7 @@ needs one that may (`catstream.wire.gate`). What is refused is counted and dropp
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections import deque
 from collections.abc import Callable
 from time import monotonic
@@ -57,6 +58,8 @@ _EVENTS = (
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
+
+_NUMBERS = itertools.count(1)  # of sockets that are told of connections
 
 
 class _Socket:
@@ -150,7 +153,7 @@ class _Socket:
 
     def _watch(self) -> None:
         """Have ZeroMQ tell of connections from now on."""
-        address = f"inproc://events-{id(self)}"
+        address = f"inproc://events-{next(_NUMBERS)}"  # a closed one may be there a little longer
         self._socket.monitor(address, _EVENTS)
         self._events = self._socket.context.socket(zmq.PAIR)
         self._events.rcvhwm = 0  # with a limit ZeroMQ would stand still until they are taken
