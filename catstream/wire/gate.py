@@ -64,6 +64,7 @@ class _Gate:
                 _, request, domain, address, _, mechanism, *credentials = question
                 status, name = self._answer(domain, address.decode(errors="replace"), mechanism, credentials)
                 socket.send_multipart([_VERSION, request, status, b"", name, b""])
+            socket.unbind(_ADDRESS)  # at once, for the next one: ZeroMQ closes some time later
 
     def _answer(self, domain: bytes, address: str, mechanism: bytes, credentials: list[bytes]) -> tuple[bytes, bytes]:
         """Whether a peer may come in, and its name."""
