@@ -28,6 +28,7 @@ with atheris.instrument_imports(include=["catstream"]):
     from catstream.box import Box
     from catstream.compression.compressor import Compressor
     from catstream.errors import CatstreamError, ProtocolError, RecordingError, ServiceError, SettingsError
+    from catstream.learned import Learned
     from catstream.messages import (
         Answer,
         Bearings,
@@ -123,6 +124,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
         labels, weights = np.array([1, 0, 1, 0], "f4"), np.ones(4, "f4")
         compressor.take(Features(seq, seq, 0.0, Box(1.0, 2.0, 9.0, 9.0), rows, labels, weights, rows[:2], labels[:2]))
     compressor.save(folder / "checkpoint")
+    Learned(seeds["model"][0], seeds["sample"][0], Box(1.0, 2.0, 9.0, 9.0)).save(folder / "learned")
     with RecordingWriter(folder / "recording", Run("0.1.0", {})) as writer:
         for kind in (Track, Features, Model, End):
             writer.write(seeds[kind.__name__.lower()][0])
@@ -134,7 +136,13 @@ def decoders(folder: Path) -> dict[str, Decoder]:
             *(encode(message) for several in seeds.values() for message in several),
         ),
         "storage": filed(folder / "a", storage.read, ProtocolError, (folder / "checkpoint").read_bytes()),
-        "checkpoint": filed(folder / "b", forged, CatstreamError, (folder / "checkpoint").read_bytes()),
+        "checkpoint": filed(
+            folder / "b",
+            forged(lambda path: Compressor.load(path, SETTINGS).counters()),
+            CatstreamError,
+            (folder / "checkpoint").read_bytes(),
+        ),
+        "saved model": filed(folder / "e", forged(Learned.load), ProtocolError, (folder / "learned").read_bytes()),
         "recording": filed(
             folder / "c",
             lambda path: list(Recording(path).messages()),
@@ -157,10 +165,14 @@ def decoders(folder: Path) -> dict[str, Decoder]:
     return found
 
 
-def forged(path: Path) -> None:
-    """Load a checkpoint whose checksum fits, as who writes one on purpose sees to."""
-    with patch.object(storage, "_checksum", lambda *_: Anything()):
-        Compressor.load(path, SETTINGS).counters()
+def forged(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
+    """Read a file as if its checksum fits: who writes one on purpose sees to that."""
+
+    def reading(path: Path) -> None:
+        with patch.object(storage, "_checksum", lambda *_: Anything()):
+            read(path)
+
+    return reading
 
 
 class Anything:

@@ -81,7 +81,7 @@ class Learned:
             x, y, w, h = learned.box
             if not (np.isfinite((x, y)).all() and 0 < w < np.inf and 0 < h < np.inf):
                 raise ValueError(f"its box is {learned.box}")
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a saved model ({error}): `catstream save` writes one") from None
         return learned
 
