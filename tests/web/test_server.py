@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from contextlib import ExitStack
 from urllib.parse import urlsplit
 
@@ -46,9 +47,11 @@ def pipeline(folder):
 
 
 def news(page, name, turn):
-    """The first part of that name that the page is told."""
+    """The first part of that name that the page is told; fails where it is not within a minute."""
+    deadline = time.monotonic() + 60
     with page.stream("GET", "/events") as events:
         for line in events.iter_lines():
+            assert time.monotonic() < deadline, f"the page was told no {name} in time"
             turn()
             if line.startswith("data: ") and name in (parts := json.loads(line.removeprefix("data: "))):
                 return parts[name]
