@@ -162,12 +162,10 @@ def test_a_secret_that_others_can_read_is_not_used(keys):
         Keys.load(keys)
 
 
-def test_a_damaged_file_is_named(keys):
-    (keys / "server.pub").write_text("public = 'short'\n")
-    with pytest.raises(ServiceError, match=r"server|no public key"):
-        Keys.load(keys)
-    (keys / "client.key").write_bytes(b"\xff\x00")
-    with pytest.raises(ServiceError, match=r"damaged|no public key"):
+@pytest.mark.parametrize("text", [b"", b"public = 'short'", b"public = 1", b"\xff\x00", b"public = " + b"[" * 4000])
+def test_a_damaged_file_is_named(keys, text):
+    (keys / "client.key").write_bytes(text)
+    with pytest.raises(ServiceError, match="make new keys"):
         Keys.load(keys)
 
 
