@@ -29,6 +29,7 @@ __all__ = ["Endpoint", "find", "meeting_place", "private_folder", "running"]
 _LONGEST_PATH = 107  # bytes that the kernel takes for the name of a Unix socket
 _PREFIX = "catstream-"  # of private folders
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
+_MARK = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # file in the private folder of a running pipeline that says where its processes meet
 
 
@@ -166,12 +167,25 @@ def _file(channel: Channel, sender: str) -> str:
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A fresh folder that only this user may enter, gone afterwards."""
-    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=_homes()[0]))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    """A fresh folder that only this user may enter, gone afterwards; those of processes that were killed go with it."""
+    home = _homes()[0]
+    _sweep(home)
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=home))
+    with (folder / ".mark").open("w") as mark:
+        fcntl.flock(mark, fcntl.LOCK_EX)  # until this process is gone
+        (folder / ".mark").rename(folder / _MARK)  # never there without its lock
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _sweep(home: Path) -> None:
+    """Remove the private folders whose owner was killed."""
+    for path in home.glob(f"{_PREFIX}*/{_MARK}"):
+        with contextlib.suppress(OSError), path.open("r+") as mark:  # it may be gone by now, or another user's
+            if os.fstat(mark.fileno()).st_uid == os.geteuid() and not _locked(mark.fileno()):
+                shutil.rmtree(path.parent, ignore_errors=True)
 
 
 @contextlib.contextmanager

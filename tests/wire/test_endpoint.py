@@ -144,10 +144,11 @@ def test_the_folder_of_a_killed_pipeline_is_free_again(folder):
 
 
 def test_no_socket_file_is_left_of_a_pipeline(folder):
+    before = set(folder.iterdir())
     with meeting_place(str(folder), folder) as endpoint:
         for channel, sender in PLACES:
             Path(endpoint.address(channel, sender).removeprefix("ipc://")).touch()
-    assert not list(folder.iterdir())
+    assert set(folder.iterdir()) == before
 
 
 def test_a_running_pipeline_is_found_until_it_ends(folder):
@@ -174,6 +175,18 @@ def test_a_killed_pipeline_is_not_found():
         assert Endpoint.parse(str(place)) not in running()
     finally:
         shutil.rmtree(place)
+
+
+def test_the_folder_of_a_killed_process_goes_with_the_next_one_and_that_of_a_living_one_stays(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    script = "import os, signal; from catstream.wire.endpoint import private_folder\n"
+    script += "with private_folder() as folder: os.kill(os.getpid(), signal.SIGKILL)"
+    subprocess.run([sys.executable, "-c", script], env={**os.environ, "TMPDIR": str(tmp_path)})
+    (left,) = tmp_path.iterdir()
+    with private_folder() as first, private_folder() as second:
+        assert not left.exists()
+        assert set(tmp_path.iterdir()) == {first, second}
 
 
 def test_without_a_place_there_must_be_just_one_pipeline(tmp_path, monkeypatch):
