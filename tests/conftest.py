@@ -2,21 +2,62 @@
 
 from __future__ import annotations
 
+import random
+import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
 import numpy as np
 import pytest
 
+from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import private_folder
+
 
 @pytest.fixture
 def rng():
     """Random numbers, the same in every run."""
     return np.random.default_rng(20260101)
+
+
+@pytest.fixture
+def folder():
+    """A private folder with a name that is short enough for sockets."""
+    with private_folder() as path:
+        yield path
+
+
+@pytest.fixture
+def tcp():
+    """A tcp endpoint: as many free ports in a row as the channels take."""
+    ports = max(channel.port + len(channel.senders) for channel in CHANNELS.values())
+    for first in random.sample(range(20000, 32000, ports), 50):
+        with ExitStack() as stack:
+            try:
+                for port in range(first, first + ports):
+                    stack.enter_context(socket.socket()).bind(("127.0.0.1", port))
+            except OSError:
+                continue
+        return f"tcp://127.0.0.1:{first}"
+    raise AssertionError("no free ports on this machine")
+
+
+@pytest.fixture
+def until():
+    """Wait until a condition holds, turn after turn, and return what it returned; fail where it never does."""
+
+    def wait(condition, turn=lambda: time.sleep(0.01), seconds=120.0):
+        deadline = time.monotonic() + seconds
+        while not (found := condition()):
+            assert time.monotonic() < deadline, "it did not happen in time"
+            turn()
+        return found
+
+    return wait
 
 
 class Camera:

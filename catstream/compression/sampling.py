@@ -10,12 +10,10 @@ direction, evenly over all rows makes every row "the mean plus a variation".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from catstream.compression.tree import Node
+from catstream.compression.node import Node
 
 __all__ = ["sample", "share", "spread"]
 

@@ -23,7 +23,7 @@ _LAST_WORDS_SECONDS = 20.0  # that quick readers have to take what is still on i
 
 
 class Crowd:
-    """Readers of the tracks of one pipeline, while it is open. They run at the lowest priority: what is measured
+    """Readers of the tracks of one pipeline, while it is open. They run where a core is idle: what is measured
     is the pipeline, not what readers do with a track.
 
     Parameters
@@ -100,7 +100,7 @@ class Crowd:
 def _listen(endpoint: str, keys: str, numbers: range, pause: float, heard: Any, missed: Any, parent: int) -> None:
     """Be some of the readers, until the end."""
     die_with(parent)
-    os.nice(19)
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     readers = {number: Subscriber("tracks", Endpoint.parse(endpoint, keys)) for number in numbers}
     gaps = {number: Gaps() for number in numbers}
     for number, _, message in dawdling(readers, pause) if pause else arrivals(readers):

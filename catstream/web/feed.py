@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import Iterator
 from time import monotonic
 
@@ -13,6 +14,8 @@ from catstream.web.board import Board
 from catstream.wire.endpoint import find
 
 __all__ = ["Feed"]
+
+_log = logging.getLogger(__name__)
 
 _SILENCE_SECONDS = 4.0  # each process is heard once a second
 _PAUSE_SECONDS = 0.5
@@ -67,6 +70,9 @@ class Feed:
                 await self._attached()
             except CatstreamError as error:
                 self.board.lost(str(error))
+            except Exception as error:  # whatever it is: nobody would notice a feed that is gone
+                _log.exception("The page lost the pipeline, and attaches anew.")
+                self.board.lost(f"{type(error).__name__}: {error}")
             self.place = self.keys = ""
             await asyncio.sleep(_PAUSE_SECONDS)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -27,17 +26,3 @@ def calm(video):
 
     path, boxes = video
     return chaos.undisturbed(path, boxes[0])
-
-
-@pytest.fixture
-def until():
-    """Wait until a condition holds, and return what it returned; fail where it does not within two minutes."""
-
-    def wait(condition):
-        deadline = time.monotonic() + 120
-        while not (found := condition()):
-            assert time.monotonic() < deadline, "it did not happen in time"
-            time.sleep(0.01)
-        return found
-
-    return wait

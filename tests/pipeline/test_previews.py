@@ -34,12 +34,6 @@ def looks(folder, previews, until):
     return begin
 
 
-@pytest.fixture
-def until(until):
-    """Turns what waits for its turn, too."""
-    return lambda condition, turn: until(lambda: (turn(), condition())[1])
-
-
 def test_a_picture_is_small_and_says_how_large_the_frame_is(previews, looks):
     image = np.zeros((720, 1280, 3), np.uint8)
     with looks() as reader:

@@ -47,7 +47,7 @@ def test_no_process_outlives_its_supervisor(video, service, number, code, until,
     children = until(lambda: len(found := psutil.Process(supervisor.pid).children()) == len(NAMES) and found)
     supervisor.send_signal(number)
     assert supervisor.wait(30) == code
-    until(lambda: not any(alive(child.pid) for child in children), 30)
+    until(lambda: not any(alive(child.pid) for child in children))
 
 
 def test_a_process_whose_parent_is_gone_already_ends_at_once(folder, service):

@@ -30,19 +30,12 @@ def number_of(image: np.ndarray) -> int:
     return low + 64 * high
 
 
-def until(condition):
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.01)
-
-
 def test_a_stream_says_what_it_is(camera):
     with open_source(camera(numbered).url) as source:
         assert (source.name, source.frames, source.size, source.live) == ("one", None, (128, 96), True)
 
 
-def test_every_frame_is_taken_or_counted_as_skipped_and_the_last_taken_is_the_newest(camera):
+def test_every_frame_is_taken_or_counted_as_skipped_and_the_last_taken_is_the_newest(camera, until):
     cam, taken = camera(numbered), []
     with open_source(cam.url) as source:
         for frame in source:
@@ -76,7 +69,7 @@ def test_times_count_from_the_moment_that_is_given(camera):
         assert 1000 <= next(source).time < 1030
 
 
-def test_a_camera_that_leaves_and_returns_is_opened_again(camera):
+def test_a_camera_that_leaves_and_returns_is_opened_again(camera, until):
     cam = camera(numbered)
     with open_source(cam.url) as source:
         next(source)
@@ -90,7 +83,7 @@ def test_a_camera_that_leaves_and_returns_is_opened_again(camera):
     assert [frame.number for frame in frames] == [1, 2, 3]
 
 
-def test_a_camera_that_is_silent_is_opened_again(camera, monkeypatch, caplog):
+def test_a_camera_that_is_silent_is_opened_again(camera, monkeypatch, caplog, until):
     monkeypatch.setattr(live, "_SILENT_SECONDS", 0.5)
     cam = camera(numbered)
     with open_source(cam.url) as source:
@@ -104,7 +97,7 @@ def test_a_camera_that_is_silent_is_opened_again(camera, monkeypatch, caplog):
     assert "one is back after" in caplog.text
 
 
-def test_why_it_is_lost_is_logged_once(camera, monkeypatch, caplog):
+def test_why_it_is_lost_is_logged_once(camera, monkeypatch, caplog, until):
     monkeypatch.setattr(live, "_LONGEST_PAUSE", 0.01)
     cam, tried = camera(numbered), []
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import ExitStack
 
 import httpx
@@ -12,7 +11,6 @@ import pytest
 from catstream.box import Box
 from catstream.messages import Features, Model, Preview, Track
 from catstream.web.server import Server
-from catstream.wire.endpoint import private_folder
 
 JPEG = b"\xff\xd8\xff\xe0 a picture"
 
@@ -47,13 +45,6 @@ def facts():
 
 
 @pytest.fixture
-def folder():
-    """A private folder with a name that is short enough for sockets."""
-    with private_folder() as path:
-        yield path
-
-
-@pytest.fixture
 def serve(folder):
     """Starts pages: what asks them, and where they are."""
     with ExitStack() as stack:
@@ -64,17 +55,3 @@ def serve(folder):
             return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
 
         yield start
-
-
-@pytest.fixture
-def until():
-    """Wait until a condition holds, and return what it returned; fail where it does not within a minute."""
-
-    def wait(condition, seconds=60.0):
-        deadline = time.monotonic() + seconds
-        while not (found := condition()):
-            assert time.monotonic() < deadline, "it did not happen in time"
-            time.sleep(0.02)
-        return found
-
-    return wait

@@ -73,21 +73,21 @@ def test_a_box_drawn_with_the_mouse_is_followed_until_it_leaves_and_after_a_rest
                 if track.state in waits:
                     waits[track.state] -= 1
                     if not waits[track.state]:
-                        until(lambda state=track.state: said(f"state {state}"), 120)
+                        until(lambda state=track.state: said(f"state {state}"))
                         del waits[track.state]
                 if not waits:
                     break
-            until(lambda: said("kill"), 120)
+            until(lambda: said("kill"))
             for pid in pipeline.pids.values():
                 os.kill(pid, signal.SIGKILL)
-        until(lambda: said("state pipeline gone"), 120)
+        until(lambda: said("state pipeline gone"))
         with Pipeline(str(path), boxes[0], settings) as pipeline:
             browser.stdin.write("restart\n")
             browser.stdin.flush()
             seen = lines.index("state pipeline gone") + 1
             for number, track in enumerate(pipeline):
                 if track.state == "present" and number > 50:
-                    until(lambda: "state present" in lines[seen:] and said("errors []"), 120)
+                    until(lambda: "state present" in lines[seen:] and said("errors []"))
                     break
     assert lines[0] == "state waiting for a box"
     assert "film true" in lines

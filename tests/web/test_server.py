@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from urllib.parse import urlsplit
 
@@ -11,6 +12,7 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.messages import Health
+from catstream.web.board import Board
 from catstream.web.guard import Bucket
 from catstream.web.server import Server
 from catstream.wire.endpoint import Endpoint
@@ -47,15 +49,23 @@ def pipeline(folder):
 
 
 def news(page, name, turn):
-    """The first part of that name that the page is told; fails where it is not within a minute."""
+    """The first part of that name that the page is told, while turns are made; fails where none is."""
     deadline = time.monotonic() + 60
-    with page.stream("GET", "/events") as events:
-        for line in events.iter_lines():
-            assert time.monotonic() < deadline, f"the page was told no {name} in time"
+
+    def told():
+        with page.stream("GET", "/events") as events:
+            for line in events.iter_lines():
+                assert time.monotonic() < deadline, f"the page was told no {name} in time"
+                if line.startswith("data: ") and name in (parts := json.loads(line.removeprefix("data: "))):
+                    return parts[name]
+        raise AssertionError("the stream ended")
+
+    with ThreadPoolExecutor(1) as pool:
+        found = pool.submit(told)
+        while not found.done():  # whether the page has news or not: it listens from a moment on that nobody knows
             turn()
-            if line.startswith("data: ") and name in (parts := json.loads(line.removeprefix("data: "))):
-                return parts[name]
-    raise AssertionError("the stream ended")
+            time.sleep(0.05)
+    return found.result()
 
 
 def test_the_page_needs_nothing_from_elsewhere_and_runs_no_script_of_others(page):
@@ -99,16 +109,29 @@ def test_it_is_healthy_by_itself_and_ready_with_all_processes(page, pipeline, un
 
 def test_tracks_come_to_the_page_as_they_are_sent(page, pipeline, facts):
     def turn():
-        pipeline["detector"].send(Health("detector", 1.0, {}))
+        pipeline["detector"].send(Health("detector", time.monotonic(), {}))
         pipeline["tracks"].send(facts.track(5))
 
-    turn()
     assert news(page, "track", turn) == {"frame": 5, "time": 0.5, "state": "present", "version": 1}
+
+
+def test_a_message_that_it_fails_on_does_not_end_the_feed(page, pipeline, facts, monkeypatch, caplog):
+    def fails(*_):
+        monkeypatch.undo()
+        raise ArithmeticError("it cannot be")
+
+    def turn():
+        pipeline["detector"].send(Health("detector", time.monotonic(), {}))
+        pipeline["tracks"].send(facts.track(5))
+
+    monkeypatch.setattr(Board, "take", fails)
+    assert news(page, "track", turn)["frame"] == 5
+    assert "ArithmeticError: it cannot be" in caplog.text
 
 
 def test_pictures_are_asked_of_the_pipeline_only_while_somebody_looks(page, pipeline, facts, until):
     def turn():
-        pipeline["detector"].send(Health("detector", 1.0, {}))
+        pipeline["detector"].send(Health("detector", time.monotonic(), {}))
         pipeline["previews"].send(facts.preview(7))
         return True
 

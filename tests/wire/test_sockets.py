@@ -104,7 +104,7 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_what_it_has_taken(endp
             sender.listen(0.05)  # nobody answers: it asks where the receiver is, and will send all again
         for _ in range(10):
             turn()
-        until(lambda: sender.taken == 1, turn, seconds=5)
+        until(lambda: sender.taken == 1, turn)
     assert taken == [1]
 
 
@@ -407,7 +407,7 @@ def test_what_was_sent_last_arrives_though_its_sender_closes_at_once(endpoint, u
             samples.send(large)
             samples.send(End(1, "it was the last"))
             samples.close()
-            until(lambda: heard and isinstance(heard[-1], End), lambda: heard.extend(reader.waiting()), seconds=5)
+            until(lambda: heard and isinstance(heard[-1], End), lambda: heard.extend(reader.waiting()))
 
     for _ in range(10):  # a race, as the next
         run()
@@ -421,7 +421,7 @@ def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_on
             until(lambda: receiver.receive(0.05), lambda: sender.listen(0))
             receiver.acknowledge(Position(1))
             pool.submit(receiver.close)
-            until(lambda: sender.stored == 1, lambda: sender.listen(0.02), seconds=5)
+            until(lambda: sender.stored == 1, lambda: sender.listen(0.02))
 
     for _ in range(10):  # a race, which was lost every other time
         run()
