@@ -1,7 +1,7 @@
 """What subscribers cost a pipeline: frames a second with many attached, some of them frozen, beside none attached.
 
-All runs follow the same rendered video. The readers run where a core is idle: what is measured is the pipeline, not what
-readers do with a track.
+All runs follow the same rendered video. The readers run where a core is idle: what is measured is the
+pipeline, not what readers do with a track.
 """
 
 from __future__ import annotations
