@@ -125,7 +125,7 @@ class Ordeal:
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     cycles = 2 if options.quick else options.cycles
-    source, truth = long(named(options, "TLD_01_david"), 60 if options.quick else 10 * cycles + 100)
+    source, truth = long(named(options, "TLD_01_david"), 60 if options.quick else 25 * cycles + 100)
     box, faults, times, ends = Box(*map(float, truth[0])), schedule(cycles, options.seed), [], []
     calm = undisturbed(source, box)
     for label in [options.run] if options.run else RUNS:

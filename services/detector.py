@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from catstream.messages import End, Features, Model, Position, Track
 from catstream.services.helm import Helm, Orders
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
+from catstream.video.ahead import ahead
 from catstream.video.frames import Frame, Source
 from catstream.video.source import WHOLE, open_source
 from catstream.wire.sockets import Publisher, Sender, Subscriber
@@ -79,9 +80,10 @@ def main(
         process.allow(_OPEN_SECONDS + first * _SKIP_SECONDS)
         frames = stack.enter_context(open_source(source, first, part=part, since=since, idle=line.idle))
         line.source = frames
+        coming = frames if frames.live else stack.enter_context(closing(ahead(frames)))
         reason, failed = "the source came to its end", False
         try:
-            for frame in frames:
+            for frame in coming:
                 if frame.number < detector.seq:
                     continue
                 found = line.held(frame, detector.seq)

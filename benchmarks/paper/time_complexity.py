@@ -24,6 +24,7 @@ from catstream.box import Box
 from catstream.compression.tree import CoresetTree
 from catstream.detection import affine
 from catstream.detection.hog import row_length
+from catstream.detection.pyramid import Pyramid
 from catstream.evaluation.datasets import Sequence
 from catstream.training.one_class import one_class
 
@@ -53,7 +54,7 @@ def points_of(sequence: Sequence, count: int) -> np.ndarray:
     present = int(np.isfinite(sequence.boxes).all(axis=1).sum())
     copies, rng = -(-count // present), np.random.default_rng(0)
     rows = [
-        affine.copies(image, Box(*box), copies, rng)
+        affine.copies(Pyramid(image), Box(*box), copies, rng)
         for image, box in zip(sequence.frames(), sequence.boxes, strict=True)
         if np.isfinite(box).all()
     ]

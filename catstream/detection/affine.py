@@ -10,6 +10,7 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection.hog import CELL, MARGIN, WINDOW, grid
+from catstream.detection.pyramid import Pyramid
 from catstream.detection.windows import cut
 
 __all__ = ["copies"]
@@ -17,13 +18,12 @@ __all__ = ["copies"]
 _SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations: a factor, a share of the box, radians
 
 
-def copies(image: np.ndarray, box: Box, count: int, rng: np.random.Generator) -> np.ndarray:
+def copies(frame: Pyramid, box: Box, count: int, rng: np.random.Generator) -> np.ndarray:
     """Features of `count` copies of a box; the first is the box itself.
 
     Parameters
     ----------
-    image : uint8 (h, w, 3) or (h, w)
-    box : in pixels of the image
+    box : in pixels of the frame
     rng : where scale, shift and rotation come from
 
     Returns
@@ -38,6 +38,6 @@ def copies(image: np.ndarray, box: Box, count: int, rng: np.random.Generator) ->
     for scale, right, down, turn in change:
         factor = np.exp(_SCALE * scale) / (WINDOW * CELL)
         centre = x + _SHIFT * right * box.w, y + _SHIFT * down * box.h
-        patch = cut(image, *centre, box.w * factor, box.h * factor, size, _TURN * turn)
+        patch = cut(frame, *centre, box.w * factor, box.h * factor, size, _TURN * turn)
         rows.append(grid(patch)[MARGIN:-MARGIN, MARGIN:-MARGIN].reshape(-1))
     return np.array(rows, np.float32)

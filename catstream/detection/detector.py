@@ -11,6 +11,7 @@ from catstream.detection import bootstrap, extent, lessons, search
 from catstream.detection.hog import WINDOW, row_length
 from catstream.detection.lessons import Lesson
 from catstream.detection.motion import CentreFilter
+from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
 from catstream.errors import BoxError, ProtocolError
 from catstream.messages import Bearings, Features, Model, State, Track
@@ -78,19 +79,19 @@ class Detector:
             For a box that is not in the frame, has no area, is not a number, or looks like what is around it.
             Nothing is forgotten then.
         """
-        height, width = image.shape[:2]
+        frame = Pyramid(image)
         # The window is wider than the object: the edge of an object tells most about where it is.
-        box = Box(*map(float, box)).inside(width, height)
+        box = Box(*map(float, box)).inside(*frame.size)
         window, scm = box.scaled(self.settings.context), None
         if self.settings.bootstrap == "scm":
             from catstream.detection.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
             scm = SparseCollaborativeModel(image, box, self._random())
-            lesson = lessons.near(image, window, None, self._random(), self.settings)
+            lesson = lessons.near(frame, window, None, self._random(), self.settings)
         else:
-            lesson = lessons.first(image, window, self._random(), self.settings)
+            lesson = lessons.first(frame, window, self._random(), self.settings)
         model = bootstrap.stand_in(lesson, self.settings)
-        lesson += lessons.far(image, window, model, self.settings)
+        lesson += lessons.far(frame, window, model, self.settings)
         model = bootstrap.stand_in(lesson, self.settings)
         self._forget()
         self._box = self._sure_box = self._first_box = window
@@ -127,15 +128,15 @@ class Detector:
         BoxError
             As `init` does.
         """
-        height, width = image.shape[:2]
-        self._box = self._sure_box = Box(*map(float, box)).inside(width, height).scaled(self.settings.context)
+        frame = Pyramid(image)
+        self._box = self._sure_box = Box(*map(float, box)).inside(*frame.size).scaled(self.settings.context)
         self.seq, self.state = self.seq + 1, "present"
         self._elsewhere, self._first_box = False, self._first_box or self._box
         if self._centre is not None:
             self._centre.predict()
             self._centre.update(self._box.centre)
-        score = float(search.scored_around(image, self._box, WINDOW, self.model).scores[0, 0])
-        lesson = lessons.near(image, self._box, self.model, self._random(), self.settings)
+        score = float(search.scored_around(frame, self._box, WINDOW, self.model).scores[0, 0])
+        lesson = lessons.near(frame, self._box, self.model, self._random(), self.settings)
         return self._answer(time, score, lesson)
 
     def miss(self, time: float = 0.0) -> tuple[Track, Features]:
@@ -189,12 +190,12 @@ class Detector:
         self.seq += 1
         if self._centre is not None:
             self._box = self._box.centred(*self._centre.predict())
-        height, width = image.shape[:2]
+        frame = Pyramid(image)
         if self._scm is not None:
             found = self._scm.step(image)  # it has no word for absent
-            self._box = found.box.scaled(settings.context).held_in(width, height)
-            return self._answer(time, found.score, self._lesson(image, found.score))
-        found = self._find(image) if self._first_box else self._seek(image)
+            self._box = found.box.scaled(settings.context).held_in(*frame.size)
+            return self._answer(time, found.score, self._lesson(frame, found.score))
+        found = self._find(frame) if self._first_box else self._seek(frame)
         self._elsewhere &= found.score < settings.trust_score
         there = self._there(found.score)
         if there and self._first_box is None:
@@ -202,14 +203,14 @@ class Detector:
             self._elsewhere = found.score < settings.trust_score
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
-            self._box = extent.followed(self._box, found, settings).held_in(width, height)
+            self._box = extent.followed(self._box, found, settings).held_in(*frame.size)
             if found.score >= settings.sure_score:
                 self._sure_box = self._box
         else:
             self.state = "absent"
         if self._centre is not None:
             self._centre.update(self._box.centre if there else None)
-        return self._answer(time, found.score, self._lesson(image, found.score) if there else Lesson.none())
+        return self._answer(time, found.score, self._lesson(frame, found.score) if there else Lesson.none())
 
     def _there(self, score: float) -> bool:
         """Whether the best score in a frame is the object's: high enough, also for what this one usually scores."""
@@ -222,38 +223,38 @@ class Detector:
             self._usual_score += _USUAL_RATE * (score - self._usual_score)
         return there
 
-    def _find(self, image: np.ndarray) -> Found:
+    def _find(self, frame: Pyramid) -> Found:
         settings = self.settings
         if settings.detection == "full":
-            return self._fitted(image, search.whole(image, self._box, self.model, settings))
-        found = self._fitted(image, search.local(image, self._box, self.model, settings))
+            return self._fitted(frame, search.whole(frame, self._box, self.model, settings))
+        found = self._fitted(frame, search.local(frame, self._box, self.model, settings))
         lost = found.score < settings.lost_score
         unsure = found.score < settings.sure_score or self._elsewhere
         if lost or (unsure and self.seq % settings.whole_frames == 0):
-            other = search.whole(image, self._sure_box.centred(*self._box.centre), self.model, settings)
+            other = search.whole(frame, self._sure_box.centred(*self._box.centre), self.model, settings)
             if other.score > settings.return_score and other.score > found.score + settings.jump_margin:
-                other = self._fitted(image, search.local(image, other.box, self.model, settings))
+                other = self._fitted(frame, search.local(frame, other.box, self.model, settings))
                 if other.score > found.score:
                     self._elsewhere = True
                     return other
         return found
 
-    def _seek(self, image: np.ndarray) -> Found:
+    def _seek(self, frame: Pyramid) -> Found:
         """The best window of the whole frame, of one of the sizes that the object may have."""
         factor = _SOUGHT_FACTORS[self.seq % len(_SOUGHT_FACTORS)]
-        found = search.whole(image, self._box.scaled(factor), self.model, self.settings)
-        return self._fitted(image, found)
+        found = search.whole(frame, self._box.scaled(factor), self.model, self.settings)
+        return self._fitted(frame, found)
 
-    def _fitted(self, image: np.ndarray, found: Found) -> Found:
-        return extent.fitted(image, found.box, self._first_box or found.box, self.model, self.settings)
+    def _fitted(self, frame: Pyramid, found: Found) -> Found:
+        return extent.fitted(frame, found.box, self._first_box or found.box, self.model, self.settings)
 
-    def _lesson(self, image: np.ndarray, score: float) -> Lesson:
+    def _lesson(self, frame: Pyramid, score: float) -> Lesson:
         settings = self.settings
         if score < settings.teach_score or self._elsewhere:
             return Lesson.none()
-        lesson = lessons.near(image, self._box, self.model, self._random(), settings)
+        lesson = lessons.near(frame, self._box, self.model, self._random(), settings)
         if score > settings.mine_score and self.seq % settings.mine_frames == 0:
-            lesson += lessons.far(image, self._box, self.model, settings)
+            lesson += lessons.far(frame, self._box, self.model, settings)
         return lesson
 
     def _random(self) -> np.random.Generator:

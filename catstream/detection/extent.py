@@ -13,6 +13,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.detection import search, windows
 from catstream.detection.hog import WINDOW
+from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
 from catstream.messages import Model
 from catstream.settings import Settings
@@ -23,7 +24,7 @@ _FINE_CELLS = WINDOW + 2  # cells searched at each size: the place found at anot
 _GROWTH = 1.18  # factor of size that no object grows by in a frame
 
 
-def fitted(image: np.ndarray, box: Box, first: Box, model: Model, settings: Settings) -> Found:
+def fitted(frame: Pyramid, box: Box, first: Box, model: Model, settings: Settings) -> Found:
     """The best window within a cell of a box, at the size and the aspect that both models like best together.
 
     Parameters
@@ -31,7 +32,7 @@ def fitted(image: np.ndarray, box: Box, first: Box, model: Model, settings: Sett
     first : the window of the first frame, whose extent is likelier than others
     """
     sizes = _steps(settings.scale_count)
-    tried = [search.scored_around(image, box.scaled(_size(k, settings)), _FINE_CELLS, model) for k in sizes]
+    tried = [search.scored_around(frame, box.scaled(_size(k, settings)), _FINE_CELLS, model) for k in sizes]
     places = [search.highest(scored.scores) for scored in tried]
     scores = np.array([scored.scores[place] for scored, place in zip(tried, places, strict=True)])
     now = math.log(box.area / first.area) / 2
@@ -41,14 +42,14 @@ def fitted(image: np.ndarray, box: Box, first: Box, model: Model, settings: Sett
     i = int(values.argmax())
     between = _size(windows.vertex(values, i), settings)
     found = Found(float(scores[i]), tried[i].box(*tried[i].refined(*places[i])).scaled(between))
-    return found if model.extent is None else _widened(image, found, first, model, settings)
+    return found if model.extent is None else _widened(frame, found, first, model, settings)
 
 
-def _widened(image: np.ndarray, found: Found, first: Box, model: Model, settings: Settings) -> Found:
+def _widened(frame: Pyramid, found: Found, first: Box, model: Model, settings: Settings) -> Found:
     """The same place, size and score, at the best aspect."""
     aspects = _steps(settings.aspect_count)
     boxes = [found.box.scaled(*_stretch(k, settings)) for k in aspects]
-    tried = [search.scored_around(image, box, WINDOW, model) for box in boxes]
+    tried = [search.scored_around(frame, box, WINDOW, model) for box in boxes]
     values = np.array(
         [scored.scores[0, 0] + settings.extent_weight * (scored.row(0, 0) @ model.extent) for scored in tried]
     )
@@ -73,7 +74,7 @@ def followed(before: Box, found: Found, settings: Settings) -> Box:
     return before.scaled(size * stretch, size / stretch).centred(*found.box.centre)
 
 
-def cuts(image: np.ndarray, box: Box, own: np.ndarray, settings: Settings) -> tuple[list[np.ndarray], list[float]]:
+def cuts(frame: Pyramid, box: Box, own: np.ndarray, settings: Settings) -> tuple[list[np.ndarray], list[float]]:
     """The object cut as it is and badly, and how well each cut fits; nothing where extent is not learned.
 
     Parameters
@@ -88,7 +89,7 @@ def cuts(image: np.ndarray, box: Box, own: np.ndarray, settings: Settings) -> tu
         return [], []
     trials = [(k, box.scaled(_size(k, settings))) for k in _steps(settings.scale_count) if k]
     trials += [(k, box.scaled(*_stretch(k, settings))) for k in _steps(settings.aspect_count) if k]
-    rows = [windows.around(image, trial, WINDOW)[0].reshape(-1) for _, trial in trials]
+    rows = [windows.around(frame, trial, WINDOW)[0].reshape(-1) for _, trial in trials]
     fits = [math.exp(-((k / settings.extent_sigma) ** 2) / 2) for k, _ in trials]
     return [own, *rows], [1.0, *fits]
 

@@ -13,6 +13,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.detection import affine, extent, search, windows
 from catstream.detection.hog import WINDOW, row_length
+from catstream.detection.pyramid import Pyramid
 from catstream.messages import Model
 from catstream.settings import Settings
 
@@ -55,32 +56,32 @@ class Lesson:
         )
 
 
-def first(image: np.ndarray, box: Box, rng: np.random.Generator, settings: Settings) -> Lesson:
+def first(frame: Pyramid, box: Box, rng: np.random.Generator, settings: Settings) -> Lesson:
     """What the first frame teaches: n affine copies of the box and n windows around it, a leaf of each tree."""
-    copies = affine.copies(image, box, settings.coreset_size, rng)
+    copies = affine.copies(frame, box, settings.coreset_size, rng)
     lesson = Lesson.of(list(copies), 1, settings.object_weight)
-    lesson += _around(image, box, None, settings.coreset_size, rng, settings)
-    return _with_extents(lesson, image, box, copies[0], settings)
+    lesson += _around(frame, box, None, settings.coreset_size, rng, settings)
+    return _with_extents(lesson, frame, box, copies[0], settings)
 
 
-def near(image: np.ndarray, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings) -> Lesson:
+def near(frame: Pyramid, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings) -> Lesson:
     """What a later frame teaches: the object, affine copies of it, near misses, background, and its extent."""
-    own = list(affine.copies(image, box, 1 + settings.copies, rng))
+    own = list(affine.copies(frame, box, 1 + settings.copies, rng))
     lesson = Lesson.of(own, 1, settings.object_weight / len(own))
-    lesson += _around(image, box, model, settings.near_negatives, rng, settings)
-    return _with_extents(lesson, image, box, own[0], settings)
+    lesson += _around(frame, box, model, settings.near_negatives, rng, settings)
+    return _with_extents(lesson, frame, box, own[0], settings)
 
 
-def far(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Lesson:
+def far(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Lesson:
     """Hard negatives: the windows of the whole frame that look most like the object and are not it."""
-    scored = search.scored_whole(image, box, model)
+    scored = search.scored_whole(frame, box, model)
     places = windows.peaks(scored.scores, settings.far_negatives + 1, WINDOW // 2)
     rows = [scored.row(*place) for place in places if scored.box(*place).overlap(box) < 0.2]
     return Lesson.of(rows[: settings.far_negatives], 0)
 
 
-def _with_extents(lesson: Lesson, image: np.ndarray, box: Box, own: np.ndarray, settings: Settings) -> Lesson:
-    rows, fits = extent.cuts(image, box, own, settings)
+def _with_extents(lesson: Lesson, frame: Pyramid, box: Box, own: np.ndarray, settings: Settings) -> Lesson:
+    rows, fits = extent.cuts(frame, box, own, settings)
     return replace(lesson, extents=_array(rows), fits=np.array(fits, np.float32))
 
 
@@ -89,10 +90,10 @@ def _array(rows: list[np.ndarray]) -> np.ndarray:
 
 
 def _around(
-    image: np.ndarray, box: Box, model: Model | None, negatives: int, rng: np.random.Generator, settings: Settings
+    frame: Pyramid, box: Box, model: Model | None, negatives: int, rng: np.random.Generator, settings: Settings
 ) -> Lesson:
     """Near misses, and background: with a model half of it the highest scoring windows, the rest anywhere."""
-    cells, _, _ = windows.around(image, box, _CELLS)
+    cells, _, _ = windows.around(frame, box, _CELLS)
     lesson = Lesson.none()
     for down, across in rng.integers(-_NEAR, _NEAR + 1, size=(settings.near_misses, 2)):
         distance = down * down + across * across

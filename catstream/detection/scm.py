@@ -21,6 +21,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from catstream.box import Box
+from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
 from catstream.detection.windows import cut
 
@@ -70,7 +71,7 @@ class SparseCollaborativeModel:
         moves = self._rng.normal(size=(self._particles, 5)) * _SPREAD * [size, size, 1, 1, 1]
         moves[0] = 0
         states = self._state + moves
-        states[:, :2] = states[:, :2].clip(0, [grey.shape[1] - 1, grey.shape[0] - 1])
+        states[:, :2] = states[:, :2].clip(0, np.subtract(grey.size, 1))
         cuts = self._cuts(grey, states)
         best, confidence = self._most_likely(cuts)
         self._state = states[best]
@@ -98,7 +99,7 @@ class SparseCollaborativeModel:
                 best, most = int(some[likelihoods.argmax()]), float(likelihoods.max())
         return best, float(confidences[best])
 
-    def _background(self, grey: np.ndarray) -> np.ndarray:
+    def _background(self, grey: Pyramid) -> np.ndarray:
         """Negative templates: an annulus, the object's edge included ("Templates")."""
         return self._cuts(grey, self._beside(_NEGATIVES, 0.25, 0.5))
 
@@ -109,7 +110,7 @@ class SparseCollaborativeModel:
         states[:, :2] += shifts[(abs(shifts) >= least).any(axis=1)][:count] * self._box[2:]
         return states
 
-    def _cuts(self, grey: np.ndarray, states: np.ndarray) -> np.ndarray:
+    def _cuts(self, grey: Pyramid, states: np.ndarray) -> np.ndarray:
         """The frame as each state sees it, uint8 (count, 32, 32)."""
         across = self._first.w / _SIDE * np.exp(states[:, 2] + states[:, 3])
         down = self._first.h / _SIDE * np.exp(states[:, 2] - states[:, 3])
@@ -192,8 +193,8 @@ class _Generative:
         return _unit(views[:, :: self._STRIDE, :: self._STRIDE].reshape(-1, self._PATCH**2))
 
 
-def _grey(image: np.ndarray) -> np.ndarray:
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+def _grey(image: np.ndarray) -> Pyramid:
+    return Pyramid(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 
 
 def _squares(rows: np.ndarray) -> np.ndarray:

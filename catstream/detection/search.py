@@ -13,6 +13,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.detection import windows
 from catstream.detection.hog import CELL, WINDOW
+from catstream.detection.pyramid import Pyramid
 from catstream.detection.windows import Scored
 from catstream.messages import Model
 from catstream.settings import Settings
@@ -31,23 +32,23 @@ class Found:
     box: Box
 
 
-def local(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
+def local(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
     """The best window near a box, of its size.
 
     Distance costs a little of the score, so that of two equal windows the nearer wins.
     """
     cells = WINDOW + 2 * round((settings.search_area - 1) * WINDOW / 2)
-    scored = scored_around(image, box, cells, model)
+    scored = scored_around(frame, box, cells, model)
     away = (np.arange(cells - WINDOW + 1) - (cells - WINDOW) // 2) / WINDOW
     place = highest(scored.scores - settings.distance_penalty * (away[:, None] ** 2 + away**2))
     return Found(float(scored.scores[place]), scored.box(*scored.refined(*place)))
 
 
-def whole(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Found:
+def whole(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
     """The best window of a whole frame, at three sizes: that of a box, and a quarter less and more."""
     best, least = Found(-np.inf, box), -np.inf
     for factor in _FAR_FACTORS:
-        scored = scored_whole(image, box.scaled(factor), model)
+        scored = scored_whole(frame, box.scaled(factor), model)
         place = highest(scored.scores)
         score = float(scored.scores[place])
         worth = score - settings.extent_penalty * abs(np.log(factor))
@@ -57,19 +58,19 @@ def whole(image: np.ndarray, box: Box, model: Model, settings: Settings) -> Foun
     return best
 
 
-def scored_around(image: np.ndarray, box: Box, cells: int, model: Model) -> Scored:
+def scored_around(frame: Pyramid, box: Box, cells: int, model: Model) -> Scored:
     """Scores of all windows in `cells` x `cells` cells around a box."""
-    features, origin, step = windows.around(image, box, cells)
+    features, origin, step = windows.around(frame, box, cells)
     return Scored(features, windows.respond(features, model.weights, model.bias), origin, step)
 
 
-def scored_whole(image: np.ndarray, box: Box, model: Model) -> Scored:
+def scored_whole(frame: Pyramid, box: Box, model: Model) -> Scored:
     """Scores of all windows of the size of a box in a frame.
 
     Where the frame, resized so that the box is a window, would be too large to search in time,
     it is the part around the box.
     """
-    height, width = image.shape[:2]
+    width, height = frame.size
     window = WINDOW * CELL
     reach = np.sqrt(_MOST_PIXELS / (width * window / box.w * height * window / box.h))
     left, top = 0, 0
@@ -77,8 +78,8 @@ def scored_whole(image: np.ndarray, box: Box, model: Model) -> Scored:
         x, y = box.centre
         w, h = int(width * reach), int(height * reach)
         left, top = int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))
-        image = image[top : top + h, left : left + w]
-    features, origin, step = windows.whole(image, box)
+        frame = Pyramid(frame.image[top : top + h, left : left + w])
+    features, origin, step = windows.whole(frame, box)
     origin = origin[0] + left, origin[1] + top
     return Scored(features, windows.respond(features, model.weights, model.bias), origin, step)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
+from catstream.detection.pyramid import Pyramid
 
 __all__ = ["Scored", "around", "cut", "peaks", "respond", "row_at", "vertex", "whole"]
 
@@ -57,7 +58,7 @@ def row_at(cells: np.ndarray, row: int, column: int) -> np.ndarray:
     return cells[row : row + WINDOW, column : column + WINDOW].reshape(-1)
 
 
-def around(image: np.ndarray, box: Box, cells: int) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+def around(frame: Pyramid, box: Box, cells: int) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
     """Features of `cells` x `cells` cells around a box, at the size that makes the box a window.
 
     Returns
@@ -66,12 +67,12 @@ def around(image: np.ndarray, box: Box, cells: int) -> tuple[np.ndarray, tuple[f
     """
     step = box.w / WINDOW, box.h / WINDOW
     x, y = box.centre
-    patch = cut(image, x, y, step[0] / CELL, step[1] / CELL, (cells + 2 * MARGIN) * CELL)
+    patch = cut(frame, x, y, step[0] / CELL, step[1] / CELL, (cells + 2 * MARGIN) * CELL)
     inner = grid(patch)[MARGIN:-MARGIN, MARGIN:-MARGIN]
     return inner, (x - cells / 2 * step[0], y - cells / 2 * step[1]), step
 
 
-def cut(image: np.ndarray, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
+def cut(frame: Pyramid, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
     """A square of `size` pixels cut from a frame, centred at (x, y); beyond the edge the last pixel is repeated.
 
     Parameters
@@ -83,17 +84,8 @@ def cut(image: np.ndarray, x: float, y: float, across: float, down: float, size:
     -------
     uint8 (size, size, 3) or (size, size), as the frame
     """
-    shrink = int(min(across, down))
-    if shrink >= 2:
-        # Linear interpolation would skip pixels: average whole blocks first.
-        reach = size * max(across, down) * (0.75 if turn else 0.5) + shrink
-        left, top = max(int(x - reach), 0), max(int(y - reach), 0)
-        part = image[top : max(int(y + reach), top + shrink), left : max(int(x + reach), left + shrink)]
-        part = part[: part.shape[0] // shrink * shrink, : part.shape[1] // shrink * shrink]
-        if part.size:
-            image = cv2.resize(part, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-            x, y = (x - left) / shrink, (y - top) / shrink
-            across, down = across / shrink, down / shrink
+    image, wide = frame.near(min(across, down))
+    x, y, across, down = x / wide, y / wide, across / wide, down / wide
     cos, sin = np.cos(turn), np.sin(turn)
     matrix = np.array([[across * cos, -down * sin, 0.0], [across * sin, down * cos, 0.0]])
     matrix[:, 2] = np.array([x, y]) - 0.5 - matrix[:, :2] @ np.full(2, (size - 1) / 2)
@@ -101,20 +93,21 @@ def cut(image: np.ndarray, x: float, y: float, across: float, down: float, size:
     return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
-def whole(image: np.ndarray, box: Box) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+def whole(frame: Pyramid, box: Box) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
     """Features of the whole frame, resized so that `box` is as large as a window.
 
     Returns
     -------
     float32 (rows, columns, 34); origin and step as in `Scored`
     """
-    height, width = image.shape[:2]
+    width, height = frame.size
     columns = max(WINDOW, round(width / box.w * WINDOW))
     rows = max(WINDOW, round(height / box.h * WINDOW))
-    shrinks = columns * CELL < width and rows * CELL < height
     size = (columns * CELL, rows * CELL)
-    resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return grid(resized), (0.0, 0.0), (width / columns, height / rows)
+    scale = min(width / size[0], height / size[1])
+    image, wide = frame.near(scale)
+    resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR)
+    return grid(resized), (0.0, 0.0), (image.shape[1] * wide / columns, image.shape[0] * wide / rows)
 
 
 def respond(cells: np.ndarray, weights: np.ndarray, bias: float) -> np.ndarray:

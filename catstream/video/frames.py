@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-__all__ = ["RATE", "Frame", "Source", "reason", "upright"]
+__all__ = ["RATE", "Frame", "Source", "Upright", "reason"]
 
 #: Frames a second of a source that does not say: images have no clock.
 RATE = 25.0
@@ -70,9 +70,20 @@ class Source(ABC):
         self.close()
 
 
-def upright(frame: Any) -> np.ndarray:
-    """The image of a frame that PyAV decoded: phones store upright videos lying down, and the turn beside them."""
-    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90))
+class Upright:
+    """Images of frames that PyAV decoded: phones store upright videos lying down, and the turn beside them.
+
+    One for each source: to begin a conversion costs more than to convert.
+    """
+
+    def __init__(self) -> None:
+        from av.video.reformatter import VideoReformatter
+
+        self._reformatter = VideoReformatter()
+
+    def __call__(self, frame: Any) -> np.ndarray:
+        image = self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
+        return np.ascontiguousarray(np.rot90(image, frame.rotation // 90))
 
 
 def reason(error: Any) -> str:

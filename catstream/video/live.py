@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import cv2
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, reason, upright
+from catstream.video.frames import RATE, Frame, Source, Upright, reason
 
 __all__ = ["LiveSource"]
 
@@ -64,6 +64,7 @@ class LiveSource(Source):
         self.skipped = self.reopened = 0
         self._text, self._shown = text, re.sub(r"//[^/]*@", "//", text)  # without user and password
         self._number, self._zero, self._idle = start, since, idle
+        self._upright = Upright()
         self._news = threading.Condition()  # guards what follows
         self._newest: tuple[float, Any] | None = None
         self._problem = ""  # why it is lost, empty while it is not
@@ -120,7 +121,7 @@ class LiveSource(Source):
         return newest
 
     def _frame(self, moment: float, decoded: Any) -> Frame:
-        image = upright(decoded)
+        image = self._upright(decoded)
         size = image.shape[1], image.shape[0]
         self.size = self.size if any(self.size) else size
         if size != self.size:

@@ -30,7 +30,7 @@ from typing import Any
 import cv2
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, reason, upright
+from catstream.video.frames import RATE, Frame, Source, Upright, reason
 
 __all__ = ["WHOLE", "image_files", "is_live", "natural_order", "open_source"]
 
@@ -217,7 +217,7 @@ def _video(path: Path, part: slice, start: int) -> Source:
 def _read_video(path: Path, container: Any, rate: float, wanted: range, start: int) -> Iterator[Frame]:
     stream = container.streams.video[0]
     stream.thread_type = "NONE"  # the processes are the parallelism
-    number, time, zero, shape = 0, 0.0, None, None
+    number, time, zero, shape, upright = 0, 0.0, None, None, Upright()
     with container:
         for frame in _good_frames(path, container, stream, rate):
             zero = frame.pts if zero is None else zero

@@ -7,6 +7,7 @@ import pytest
 from catstream.box import Box
 from catstream.detection import extent, windows
 from catstream.detection.hog import WINDOW
+from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
 from catstream.settings import Settings
 from catstream.tracker import Tracker
@@ -42,15 +43,17 @@ def test_the_box_follows_an_object_that_gets(draw, w, h):
 def test_a_cut_fits_the_less_the_further_it_is_off(draw):
     settings = Settings(scale_count=5, aspect_count=3)
     image, box = draw(48, 40)
-    own = windows.around(image, box, WINDOW)[0].reshape(-1)
-    rows, fits = extent.cuts(image, box, own, settings)
+    frame = Pyramid(image)
+    own = windows.around(frame, box, WINDOW)[0].reshape(-1)
+    rows, fits = extent.cuts(frame, box, own, settings)
     assert rows[0] is own
     assert fits == pytest.approx([1, *np.exp([-2, -0.5, -0.5, -2]), *np.exp([-0.5, -0.5])])
     assert all(np.abs(row - own).max() > 0.01 for row in rows[1:])
 
 
 def test_where_extent_is_not_learned_nothing_is_cut(draw):
-    assert extent.cuts(*draw(48, 40), np.empty(0), Settings(extent_weight=0)) == ([], [])
+    image, box = draw(48, 40)
+    assert extent.cuts(Pyramid(image), box, np.empty(0), Settings(extent_weight=0)) == ([], [])
 
 
 def test_a_box_follows_by_its_rates():

@@ -6,6 +6,7 @@ import pytest
 from catstream.box import Box
 from catstream.detection import affine, windows
 from catstream.detection.hog import CHANNELS, WINDOW, grid, row_length
+from catstream.detection.pyramid import Pyramid
 from catstream.detection.windows import Scored
 
 
@@ -15,11 +16,11 @@ def image(rng):
 
 
 def test_a_cut_at_its_own_scale_is_a_slice(image):
-    np.testing.assert_array_equal(windows.cut(image, 100, 80, 1, 1, 64), image[48:112, 68:132])
+    np.testing.assert_array_equal(windows.cut(Pyramid(image), 100, 80, 1, 1, 64), image[48:112, 68:132])
 
 
 def test_a_cut_beyond_the_edge_repeats_the_last_pixel(image):
-    patch = windows.cut(image, 0, 100, 1, 1, 64)
+    patch = windows.cut(Pyramid(image), 0, 100, 1, 1, 64)
     np.testing.assert_array_equal(patch[:, :32], np.repeat(patch[:, 32:33], 32, axis=1))
 
 
@@ -27,7 +28,7 @@ def test_a_cut_beyond_the_edge_repeats_the_last_pixel(image):
 def test_a_cut_shows_the_same_place_at_every_scale(zoom):
     ramp = np.add.outer(np.arange(600), np.arange(800)).astype(np.float32)
     image = (ramp / ramp.max() * 255).astype(np.uint8)
-    patch = windows.cut(image, 400, 300, zoom, zoom, 64).astype(float)
+    patch = windows.cut(Pyramid(image), 400, 300, zoom, zoom, 64).astype(float)
     expected = (700 + np.add.outer(np.arange(64) - 31.5, np.arange(64) - 31.5) * zoom - 1) / ramp.max() * 255
     inside = (expected > 3) & (expected < 250)
     assert np.abs(patch - expected)[inside].max() < 2.5
@@ -35,11 +36,11 @@ def test_a_cut_shows_the_same_place_at_every_scale(zoom):
 
 @pytest.mark.parametrize("x", [-500.0, 0.0, 239.0, 5000.0])
 def test_a_cut_far_outside_is_still_an_image(image, x):
-    assert windows.cut(image, x, x, 4.2, 3.1, 96).shape == (96, 96, 3)
+    assert windows.cut(Pyramid(image), x, x, 4.2, 3.1, 96).shape == (96, 96, 3)
 
 
 def test_cells_around_a_box_are_those_of_the_frame(image):
-    cells, origin, step = windows.around(image, Box(64, 48, 64, 64), 12)
+    cells, origin, step = windows.around(Pyramid(image), Box(64, 48, 64, 64), 12)
     np.testing.assert_array_equal(cells, grid(image)[4:16, 6:18])
     assert (origin, step) == ((48, 32), (8, 8))
 
@@ -54,13 +55,13 @@ def test_every_window_scores_weights_times_row_plus_bias(rng):
 
 def test_the_window_of_a_score_is_a_box_in_the_frame(image):
     box = Box(30, 40, 50, 70)
-    cells, origin, step = windows.around(image, box, 20)
+    cells, origin, step = windows.around(Pyramid(image), box, 20)
     found = Scored(cells, np.zeros((13, 13), np.float32), origin, step).box(6, 6)
     assert found == pytest.approx(box)
 
 
 def test_a_whole_frame_is_resized_until_the_box_is_a_window(image):
-    cells, origin, step = windows.whole(image, Box(10, 10, 40, 50))
+    cells, origin, step = windows.whole(Pyramid(image), Box(10, 10, 40, 50))
     assert cells.shape == (200 // 50 * WINDOW, 240 // 40 * WINDOW, CHANNELS)
     assert (origin, step) == ((0, 0), (5, 6.25))
 
@@ -88,7 +89,7 @@ def test_peaks_stop_at_the_threshold():
 
 def test_affine_copies_are_seeded_and_the_first_is_the_box(image):
     box = Box(64, 48, 64, 64)
-    one, two = (affine.copies(image, box, 5, np.random.default_rng(7)) for _ in range(2))
+    one, two = (affine.copies(Pyramid(image), box, 5, np.random.default_rng(7)) for _ in range(2))
     np.testing.assert_array_equal(one, two)
     np.testing.assert_array_equal(one[0], grid(image)[6:14, 8:16].reshape(-1))
     assert np.abs(one[1:] - one[0]).max(axis=1).min() > 0
@@ -96,6 +97,6 @@ def test_affine_copies_are_seeded_and_the_first_is_the_box(image):
 
 def test_copies_differ_more_from_elsewhere_than_from_the_box(image):
     smooth = np.repeat(np.repeat(image[:50, :60], 4, axis=0), 4, axis=1)
-    rows = affine.copies(smooth, Box(64, 48, 64, 64), 8, np.random.default_rng(0))
-    elsewhere = affine.copies(smooth, Box(128, 100, 64, 64), 1, np.random.default_rng(0))
+    rows = affine.copies(Pyramid(smooth), Box(64, 48, 64, 64), 8, np.random.default_rng(0))
+    elsewhere = affine.copies(Pyramid(smooth), Box(128, 100, 64, 64), 1, np.random.default_rng(0))
     assert np.linalg.norm(rows[1:] - rows[0], axis=1).max() < np.linalg.norm(elsewhere - rows[0])

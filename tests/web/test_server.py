@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -130,15 +131,17 @@ def test_a_message_that_it_fails_on_does_not_end_the_feed(page, pipeline, facts,
 
 
 def test_pictures_are_asked_of_the_pipeline_only_while_somebody_looks(page, pipeline, facts, until):
+    frames = itertools.count()
+
     def turn():
         pipeline["detector"].send(Health("detector", time.monotonic(), {}))
-        pipeline["previews"].send(facts.preview(7))
+        pipeline["previews"].send(facts.preview(next(frames)))
         return True
 
     until(lambda: turn() and page.get("/metrics").text.count("\ncatstream_up 1.0\n"))
     assert not pipeline["previews"].heard
-    assert news(page, "picture", turn)["frame"] == 7
-    assert page.get("/pictures/7.jpg").content == facts.preview(7).jpeg
+    frame = news(page, "picture", turn)["frame"]
+    assert page.get(f"/pictures/{frame}.jpg").content == facts.preview(frame).jpeg
     until(lambda: turn() and not pipeline["previews"].heard)
 
 

@@ -1,0 +1,55 @@
+"""Reading ahead."""
+
+import threading
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from catstream.errors import VideoError
+from catstream.video.ahead import ahead
+from catstream.video.frames import Frame, Source
+
+
+class Numbers(Source):
+    """So many frames, then what is wrong with the next one."""
+
+    def __init__(self, count, problem=None):
+        super().__init__("numbers", count, 25.0, (8, 8))
+        self.read, self.readers = 0, set()
+        self._problem = problem
+
+    def __next__(self):
+        self.readers.add(threading.current_thread().name)
+        if self.read == self.frames:
+            raise self._problem or StopIteration
+        self.read += 1
+        return Frame(self.read - 1, 0.0, np.zeros((8, 8, 3), np.uint8))
+
+    def close(self):
+        pass
+
+
+def test_all_frames_come_in_order_read_by_another_thread():
+    source = Numbers(5)
+    assert [frame.number for frame in ahead(source)] == [0, 1, 2, 3, 4]
+    assert len(source.readers) == 1
+    assert threading.current_thread().name not in source.readers
+
+
+def test_what_breaks_is_told_after_the_frames_before_it():
+    frames = ahead(Numbers(2, VideoError("it breaks at frame 2")))
+    assert [next(frames).number, next(frames).number] == [0, 1]
+    with pytest.raises(VideoError, match="frame 2"):
+        next(frames)
+
+
+def test_it_is_never_more_than_one_frame_ahead_and_its_thread_ends_with_it():
+    source = Numbers(50)
+    with closing(ahead(source)) as frames:
+        for frame in frames:
+            assert source.read <= frame.number + 2
+            if frame.number == 7:
+                break
+    (reader,) = source.readers
+    assert reader not in {thread.name for thread in threading.enumerate()}
