@@ -44,7 +44,12 @@ class Trainer:
             weights += direction / np.float32(contrast)
         weights /= np.float32(weights @ (mean - background_mean))
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
-        extent = ridge.fit(sample.extent.rows, self.settings.extent_ridge) if sample.extent is not None else None
+        extent = None
+        if sample.extent is not None:
+            # What the score says of a cut already is taken off: the two are added up where size and aspect are chosen.
+            rows = sample.extent.rows.copy()
+            rows[:, -1] -= rows[:, :-2] @ weights
+            extent = ridge.fit(rows, self.settings.extent_ridge)
         return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), motion, extent)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:

@@ -8,6 +8,7 @@ import pytest
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
 from catstream.errors import ProtocolError
+from catstream.messages import Summary
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
@@ -38,6 +39,15 @@ def test_centres_give_a_motion(sample):
     centres = np.cumsum(np.random.default_rng(0).normal(size=(64, 2)), axis=0)
     assert Trainer(Settings()).train(dataclasses.replace(sample, centres=centres)).motion is not None
     assert Trainer(Settings()).train(sample).motion is None
+
+
+def test_score_and_extent_together_say_how_well_a_cut_fits(sample, rng):
+    x, fits = rng.normal(size=(40, len(sample.object.mean))), rng.uniform(size=40)
+    rows = np.column_stack([x, np.ones(40), fits]).astype(np.float32)
+    cuts = Summary(rows, rows.mean(axis=0), 40, (0,))
+    model = Trainer(Settings(extent_ridge=1e-3)).train(dataclasses.replace(sample, extent=cuts))
+    together = x @ (model.weights + model.extent)
+    np.testing.assert_allclose(together - together.mean(), fits - fits.mean(), atol=1e-3)
 
 
 def test_an_object_like_the_background_is_refused(sample):
