@@ -132,7 +132,7 @@ class Settings:
             "of its factor.",
             ge=0,
         ),
-    ] = 0.3
+    ] = 0.5
     extent_weight: Annotated[
         float, _about("Weight of the extent model beside the appearance model where size and ratio are chosen.", ge=0)
     ] = 1.0
