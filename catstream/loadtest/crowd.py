@@ -8,7 +8,7 @@ from time import monotonic
 from typing import Any, Self
 
 from catstream.loadtest.children import SPAWN, start
-from catstream.loadtest.listening import arrivals, dawdling
+from catstream.loadtest.listening import rounds
 from catstream.messages import End
 from catstream.services.loop import die_with
 from catstream.subscription import Gaps
@@ -18,13 +18,14 @@ from catstream.wire.sockets import Subscriber
 __all__ = ["Crowd"]
 
 _TOGETHER = 20  # readers in one process: a process each would be more than most machines hold
-_PAUSE_SECONDS = 0.5  # from one message to the next of a slow reader
+#: Messages that a reader takes at once, at most, and seconds until it takes the next.
+_QUICK, _SLOW = (64, 0.05), (1, 0.5)
 _LAST_WORDS_SECONDS = 20.0  # that quick readers have to take what is still on its way
 
 
 class Crowd:
-    """Readers of the tracks of one pipeline, while it is open. They run where a core is idle: what is measured
-    is the pipeline, not what readers do with a track.
+    """Readers of the tracks of one pipeline, while it is open. They run where a core is idle, and the quick
+    ones take what has come twenty times a second: what is measured is the pipeline, not what readers do with a track.
 
     Parameters
     ----------
@@ -40,11 +41,11 @@ class Crowd:
         self._since = 0.0  # when they were frozen
         self._groups: list[list[Any]] = []
         first = 0
-        for size, pause in ((self._quick, 0.0), (slow, _PAUSE_SECONDS), (frozen, 0.0)):
+        for size, pace in ((self._quick, _QUICK), (slow, _SLOW), (frozen, _QUICK)):
             self._groups.append([])
             for begin in range(first, first + size, _TOGETHER):
                 numbers = range(begin, min(begin + _TOGETHER, first + size))
-                arguments = (endpoint, keys, numbers, pause, self._heard, self._missed, os.getpid())
+                arguments = (endpoint, keys, numbers, pace, self._heard, self._missed, os.getpid())
                 self._groups[-1].append(SPAWN.Process(target=_listen, args=arguments))
             first += size
 
@@ -97,13 +98,16 @@ class Crowd:
                     process.join()
 
 
-def _listen(endpoint: str, keys: str, numbers: range, pause: float, heard: Any, missed: Any, parent: int) -> None:
+def _listen(
+    endpoint: str, keys: str, numbers: range, pace: tuple[int, float], heard: Any, missed: Any, parent: int
+) -> None:
     """Be some of the readers, until the end."""
     die_with(parent)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     readers = {number: Subscriber("tracks", Endpoint.parse(endpoint, keys)) for number in numbers}
     gaps = {number: Gaps() for number in numbers}
-    for number, _, message in dawdling(readers, pause) if pause else arrivals(readers):
+    most, pause = pace
+    for number, message in rounds(readers, pause, most):
         gaps[number].take(message.seq)
         missed[number] = gaps[number].missed
         if not isinstance(message, End):

@@ -1,4 +1,4 @@
-"""Listening to many sockets at once, quickly or slowly."""
+"""Listening to many sockets at once: to each message as it comes, or now and then."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from catstream.messages import End
 from catstream.wire.sockets import Subscriber
 
-__all__ = ["arrivals", "dawdling"]
+__all__ = ["arrivals", "rounds"]
 
 _TURN_SECONDS = 0.1
 
@@ -36,10 +36,16 @@ def arrivals(
                     break
 
 
-def dawdling(readers: Mapping[Key, Subscriber], pause: float) -> Iterator[tuple[Key, float, Any]]:
-    """The same, but a message of each reader, then a pause, for ever."""
-    while True:
+def rounds(readers: Mapping[Key, Subscriber], pause: float, most: int) -> Iterator[tuple[Key, Any]]:
+    """Who received what: at most so many messages of each, then a pause of seconds; each until its End."""
+    left = dict(readers)
+    while left:
         for key, reader in readers.items():
-            if (message := reader.receive(0)) is not None:
-                yield key, time.monotonic(), message
+            for _ in range(most if key in left else 0):
+                if (message := reader.receive(0)) is None:
+                    break
+                yield key, message
+                if isinstance(message, End):
+                    del left[key]
+                    break
         time.sleep(pause)
