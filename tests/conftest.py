@@ -50,8 +50,8 @@ def tcp():
 def until():
     """Wait until a condition holds, turn after turn, and return what it returned; fail where it never does."""
 
-    def wait(condition, turn=lambda: time.sleep(0.01), seconds=120.0):
-        deadline = time.monotonic() + seconds
+    def wait(condition, turn=lambda: time.sleep(0.01)):
+        deadline = time.monotonic() + 120
         while not (found := condition()):
             assert time.monotonic() < deadline, "it did not happen in time"
             turn()
