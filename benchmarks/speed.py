@@ -9,8 +9,9 @@ import argparse
 from collections.abc import Iterator
 from statistics import median
 
+from accuracy import videos
 from journey import travel
-from sequences import named, rendered, sequences, video
+from sequences import named, rendered, video
 from table import Table, command, publish
 from throughput import MODES, steps
 
@@ -49,7 +50,7 @@ def beside_peers(options: argparse.Namespace) -> Table:
             trackers.append(name)
         except SettingsError as error:  # says how to get it
             note += f"\n{error}"
-    runs = evaluate(sequences(options), trackers, Settings())
+    runs = evaluate(videos(options), trackers, Settings())
     own = [run for run in runs if run.tracker == "catstream"]
     rows = []
     for tracker in trackers:
@@ -72,5 +73,7 @@ def rate(frames: int, size: tuple[int, int], settings: Settings) -> float:
 
 
 if __name__ == "__main__":
-    options = command(__doc__).parse_args()
+    parser = command(__doc__)
+    parser.add_argument("--frames", type=int, help="of each sequence beside the peers, the first ones (default: all)")
+    options = parser.parse_args()
     publish(figures(options), options.json)

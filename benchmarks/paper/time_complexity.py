@@ -88,16 +88,18 @@ def draw(training: list[tuple[float, ...]], building: list[tuple[float, ...]], f
 
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4), layout="constrained")
     points, everything, *coresets = zip(*training, strict=True)
-    left.loglog(points, everything, label="all points")
+    left.semilogy(points, everything, label="all points")
     for n, times in zip(SIZES[1:3], coresets, strict=True):
-        left.loglog(points, times, label=f"coreset, n = {n}")
+        left.semilogy(points, times, label=f"coreset, n = {n}")
     points, *times = zip(*building, strict=True)
     for n, each in zip(SIZES, times, strict=True):
-        right.semilogx(points, each, label=f"n = {n}")
+        right.plot(points, each, label=f"n = {n}")
     left.set(xlabel="points", ylabel="one training, ms")
     right.set(xlabel="points", ylabel="building the tree, us a point", ylim=(0, None))
-    left.legend()
-    right.legend()
+    for axes in (left, right):
+        axes.set_xscale("log", base=2)
+        axes.xaxis.set_major_formatter("{x:.0f}")
+        axes.legend()
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=120)
     pyplot.close(figure)
