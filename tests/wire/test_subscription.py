@@ -160,7 +160,7 @@ def test_what_nobody_listens_to_is_not_even_made(endpoint, until):
         lessons.send(no_message)
         with catstream.subscribe(str(endpoint), "features"):
             until(lambda: lessons.heard, lessons.welcome)
-            with pytest.raises(TypeError):
+            with pytest.raises(KeyError):
                 lessons.send(no_message)
         until(lambda: not lessons.heard, lessons.welcome)
         lessons.send(no_message)
