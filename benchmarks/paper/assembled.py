@@ -63,8 +63,7 @@ def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> Run:
     """The loop of `catstream.tracker.Tracker`, with other trees, and an end to learning."""
     frames = len(sequence) - start
     settings = recipe.settings.for_length(frames)
-    detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
-    compressor.trees = {tree: recipe.tree(settings.coreset_size) for tree in compressor.trees}
+    detector, compressor, trainer = Detector(settings), Compressor(settings, recipe.tree), Trainer(settings)
     boxes, scores, moments = [], [], [perf_counter()]
     with threadpool_limits(1), one_thread():
         for row, image in enumerate(sequence.frames(start)):

@@ -31,17 +31,24 @@ class Compressor:
     Constant time a frame on average, logarithmic memory. The same messages make
     the same samples, bit for bit, also across `save` and `load`.
 
+    Parameters
+    ----------
+    tree : class of its trees: what `sample` of one shows is learned from
+
+    Attributes
+    ----------
     last_sample : the newest, None before the first
     bearings : what came with the last message: a restarted detector goes on from there
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, tree: type[CoresetTree] = CoresetTree) -> None:
         if settings.coreset_share:
             raise SettingsError(
                 f"coreset_share={settings.coreset_share:g} is a share of a video's length: "
                 "call Settings.for_length first, or set coreset_size"
             )
         self.settings = settings
+        self._tree = tree
         self.seq = 0
         self.frame = -1
         self.last_sample: Sample | None = None
@@ -49,7 +56,7 @@ class Compressor:
 
     def _forget(self) -> None:
         """All but the stream of messages and the versions of samples, which go on."""
-        self.trees = {name: CoresetTree(self.settings.coreset_size) for name in _TREES}
+        self.trees = {name: self._tree(self.settings.coreset_size) for name in _TREES}
         self.centres = np.empty((0, 2))
         self._path: list[tuple[float, float]] = []
         self.box: Box | None = None

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from catstream import storage
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
+from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, SettingsError
 from catstream.messages import Bearings, Features, Motion, Sample
 from catstream.settings import Settings
@@ -79,6 +80,15 @@ def test_rows_of_the_loss_tree_give_the_loss_of_any_model(settings, messages, rn
         loss = sum(float(m.weights @ (m.rows @ model[:-2] + model[-2] - m.labels) ** 2) for m in seen)
         approximate = float(np.sum((kept @ model) ** 2))
         assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
+
+
+def test_trees_of_another_class_stay_when_another_object_begins(settings, messages):
+    class Other(CoresetTree):
+        pass
+
+    compressor = Compressor(settings, Other)
+    compressor.take(dataclasses.replace(next(messages), begins=True))
+    assert {type(tree) for tree in compressor.trees.values()} == {Other}
 
 
 def test_a_message_stored_already_is_ignored(settings, messages):
