@@ -38,7 +38,8 @@ class RootTree(CoresetTree):
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     recipes = {}
     for source, tree in (("root", RootTree), ("hierarchy", CoresetTree)):
-        recipes[f"paper's way, {source}"] = Recipe(Settings(**PRESETS["one-class-paper"]), tree)
+        if not options.ours:
+            recipes[f"paper's way, {source}"] = Recipe(Settings(**PRESETS["one-class-paper"]), tree)
         recipes[f"our settings, {source}"] = Recipe(Settings(), tree)
     runs = follow_all(options, videos(options), recipes)
     rows = [(name, *means(found), spread(found), *PAPER[name.split(", ")[1]]) for name, found in runs.items()]
@@ -47,5 +48,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 if __name__ == "__main__":
-    options = accuracy_command(__doc__, starts=3).parse_args()
+    parser = accuracy_command(__doc__, starts=3)
+    parser.add_argument("--ours", action="store_true", help="with our settings only")
+    options = parser.parse_args()
     publish(figures(options), options.json)
