@@ -38,7 +38,7 @@ def arrivals(
 
 def rounds(readers: Mapping[Key, Subscriber], pause: float, most: int) -> Iterator[tuple[Key, Any]]:
     """Who received what: at most so many messages of each, then a pause of seconds; each until its End."""
-    left = dict(readers)
+    left = set(readers)
     while left:
         for key, reader in readers.items():
             for _ in range(most if key in left else 0):
@@ -46,6 +46,6 @@ def rounds(readers: Mapping[Key, Subscriber], pause: float, most: int) -> Iterat
                     break
                 yield key, message
                 if isinstance(message, End):
-                    del left[key]
+                    left.remove(key)
                     break
         time.sleep(pause)

@@ -191,7 +191,7 @@ def check(message: Any) -> None:
         value = getattr(message, name)
         if isinstance(value, np.ndarray):
             _check_array(value, kind, name, lengths)
-        elif type(value) in _ARRAYS:
+        elif type(value) in _NAMES:
             check(value)
         else:
             _check_numbers(value, kind, name)

@@ -95,7 +95,7 @@ def test_usage_tells_who_is_busy(sleepers):
     while time.process_time() < deadline:
         pass
     usage.look(1.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
-    assert usage.samples["busy"][0].cores > 0.2
+    assert usage.samples["busy"][0].cores > 0.27  # the kernel counts in hundredths
     assert usage.samples["idle"][0].cores < usage.samples["busy"][0].cores
     assert usage.samples[REST][0].cores >= 0
     assert 0 < usage.samples["idle"][0].memory < usage.samples["busy"][0].memory
