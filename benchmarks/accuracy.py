@@ -26,7 +26,7 @@ __all__ = ["accuracy_command", "compared", "difference", "means", "videos"]
 MEANS = ("AUC", "success", "precision")
 
 
-def accuracy_command(about: str | None, starts: int = 1) -> argparse.ArgumentParser:
+def accuracy_command(about: str | None, starts: int = 1, *, kept: bool = True) -> argparse.ArgumentParser:
     """The options of a benchmark that follows many sequences."""
     parser = command(about)
     parser.add_argument(
@@ -34,7 +34,8 @@ def accuracy_command(about: str | None, starts: int = 1) -> argparse.ArgumentPar
     )
     parser.add_argument("--frames", type=int, help="of each sequence, the first ones (default: all)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once (default: %(default)s)")
-    parser.add_argument("--output", type=Path, help="folder that keeps runs: finished ones are not run again")
+    if kept:
+        parser.add_argument("--output", type=Path, help="folder that keeps runs: finished ones are not run again")
     return parser
 
 

@@ -12,8 +12,9 @@ from sequences import rendered
 from table import Table, command, publish
 
 from catstream.compression.reduce import reduce
+from catstream.detection.cells import Cells
+from catstream.detection.colours import shades
 from catstream.detection.hog import grid
-from catstream.detection.windows import respond
 from catstream.evaluation.datasets import Sequence
 from catstream.messages import Sample
 from catstream.settings import Settings
@@ -46,10 +47,12 @@ def milliseconds(call: Callable[[], object], runs: int) -> float:
 def detection(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:
     """Of one image of 640x480 pixels."""
     image = next(sequence.frames())
-    cells = grid(image)
-    weights = cells[:8, :8].reshape(-1).copy()
+    cells = Cells.of(image)
+    weights = cells.row(0, 0)
     yield "HOG and colour, 640x480", lambda: grid(image)
-    yield f"score all {(cells.shape[0] - 7) * (cells.shape[1] - 7)} windows of it", lambda: respond(cells, weights, 0.0)
+    yield "shades of its colours", lambda: shades(image)
+    windows = (cells.shape[0] - 7) * (cells.shape[1] - 7)
+    yield f"score all {windows} windows of it", lambda: cells.respond(weights, 0.0)
 
 
 def learning(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:

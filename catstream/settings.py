@@ -111,6 +111,7 @@ class Settings:
         _about("Search around the object and the whole frame when unsure (local), or all of every frame (full)."),
     ] = "local"
 
+    colours: Annotated[bool, _about("Learn which colours the object has, wherever in it they are.")] = True
     context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
     search_area: Annotated[float, _about("Side of the local search as a multiple of the window's.", ge=1.5, le=6)] = 2.5
     scale_count: Annotated[int, _about("Sizes that a search tries, an odd number.", ge=1, le=15)] = 7
@@ -163,6 +164,15 @@ class Settings:
     copies: Annotated[
         int, _about("Affine copies of the object a frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)
     ] = 5
+    other_backgrounds: Annotated[
+        float,
+        _about(
+            "Share of the first frame's affine copies that are put on another background: what is behind the object "
+            "there is not learned with it.",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.9
     object_weight: Annotated[
         float, _about("Ordinary rows that the object's row of a frame counts for in the loss tree.", gt=0)
     ] = 4.0
@@ -283,6 +293,8 @@ _PAPER = {
     "bootstrap": "scm",
     "extent_weight": 0.0,
     "extent_prior": 0.0,
+    "colours": False,
+    "other_backgrounds": 0.0,
     "present_share": 0.0,
     "return_share": 0.0,
 }

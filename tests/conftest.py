@@ -13,9 +13,18 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 import pytest
+import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
+from threadpoolctl import threadpool_limits
 
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """As in the pipeline: with more, BLAS adds in another order, and bits differ."""
+    with threadpool_limits(1):
+        yield
 
 
 @pytest.fixture

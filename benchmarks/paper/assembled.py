@@ -1,4 +1,4 @@
-"""A tracker put together by hand from the library's stages, with another kind of coreset tree in it."""
+"""Trackers put together by hand from the library's stages, of several recipes, on the same sequences."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from time import perf_counter
+from unittest.mock import patch
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -16,6 +17,8 @@ from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.detection.detector import Detector
+from catstream.detection.scm import SparseCollaborativeModel
+from catstream.detection.search import Found
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import starts_of
 from catstream.evaluation.peers import one_thread
@@ -45,18 +48,46 @@ def follow_all(
 ) -> dict[str, list[Run]]:
     """Runs of each recipe over all sequences and starts, in the same order in each."""
     starts, jobs = (1, 1) if options.quick else (options.starts, options.jobs)
-    tasks = [
-        (name, recipe, sequence, start)
-        for name, recipe in recipes.items()
-        for sequence in sequences
-        for start in starts_of(sequence, starts)
-    ]
+    tasks = [(recipes, sequence, start) for sequence in sequences for start in starts_of(sequence, starts)]
     runs: dict[str, list[Run]] = {name: [] for name in recipes}
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for run in (map if jobs == 1 else pool.map)(follow, *zip(*tasks, strict=True)):
-            runs[run.tracker].append(run)
-            print(f"{run.tracker}: {run.name}", file=sys.stderr)
+        for found in (map if jobs == 1 else pool.map)(follow_each, *zip(*tasks, strict=True)):
+            for run in found:
+                runs[run.tracker].append(run)
     return runs
+
+
+def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: int) -> list[Run]:
+    """Runs of each recipe on one sequence, from the same frame."""
+    runs = []
+    # SCM depends on none of what recipes differ in, and takes longer than all else: each frame once for all of them.
+    with patch("catstream.detection.scm.SparseCollaborativeModel", Shared()):
+        for name, recipe in recipes.items():
+            runs.append(follow(name, recipe, sequence, start))
+            print(f"{name}: {sequence.name}", file=sys.stderr)
+    return runs
+
+
+class Shared:
+    """Stands for the class of SCM on one sequence: the first who asks for a frame has it searched."""
+
+    model: SparseCollaborativeModel
+
+    def __init__(self) -> None:
+        self.found: list[Found] = []
+
+    def __call__(self, image: np.ndarray, box: Box, rng: np.random.Generator) -> Shared:
+        if not self.found:
+            self.model = SparseCollaborativeModel(image, box, rng)
+        self.told = 0
+        return self
+
+    def step(self, image: np.ndarray) -> Found:
+        """As the model's own."""
+        if self.told == len(self.found):
+            self.found.append(self.model.step(image))
+        self.told += 1
+        return self.found[self.told - 1]
 
 
 def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> Run:

@@ -14,7 +14,8 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
 
-from accuracy import accuracy_command, compared, means, videos
+from accuracy import accuracy_command, means, videos
+from assembled import Recipe, follow_all
 from table import Table, publish
 
 from catstream.settings import PRESETS, Settings
@@ -25,13 +26,13 @@ PAPER = {1: (0.49, 0.59), 2.5: (0.51, 0.59), 5: (0.53, 0.61), 10: (0.56, 0.62), 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     found = videos(options, "TLD_")
-    variants, sizes = {}, list(PAPER)[-1:] if options.quick else list(PAPER)
+    recipes, sizes = {}, list(PAPER)[-1:] if options.quick else list(PAPER)
     for percent in sizes:
         share = {"coreset_share": percent / 100}
         copies = {"copies": int(25 // percent) - 1}
-        variants[f"paper's, {percent} %"] = Settings(**PRESETS["one-class-paper"] | share | copies)
-        variants[f"ours, {percent} %"] = Settings(**share)
-    runs = compared(options, found, variants)
+        recipes[f"paper's, {percent} %"] = Recipe(Settings(**PRESETS["one-class-paper"] | share | copies))
+        recipes[f"ours, {percent} %"] = Recipe(Settings(**share))
+    runs = follow_all(options, found, recipes)
     rows = []
     for percent in sizes:
         theirs, ours = runs[f"paper's, {percent} %"], runs[f"ours, {percent} %"]
@@ -42,5 +43,5 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 if __name__ == "__main__":
-    options = accuracy_command(__doc__).parse_args()
+    options = accuracy_command(__doc__, kept=False).parse_args()
     publish(figures(options), options.json)

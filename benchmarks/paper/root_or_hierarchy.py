@@ -48,7 +48,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 if __name__ == "__main__":
-    parser = accuracy_command(__doc__, starts=3)
+    parser = accuracy_command(__doc__, starts=3, kept=False)
     parser.add_argument("--ours", action="store_true", help="with our settings only")
     options = parser.parse_args()
     publish(figures(options), options.json)

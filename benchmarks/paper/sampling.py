@@ -106,7 +106,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 if __name__ == "__main__":
-    parser = accuracy_command(__doc__)
+    parser = accuracy_command(__doc__, kept=False)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256], help="n (default: %(default)s)")
     parser.add_argument("--ours", action="store_true", help="with our settings in place of the paper's")
     options = parser.parse_args()

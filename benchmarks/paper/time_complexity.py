@@ -23,7 +23,7 @@ from table import Table, command, publish
 from catstream.box import Box
 from catstream.compression.tree import CoresetTree
 from catstream.detection import affine
-from catstream.detection.hog import row_length
+from catstream.detection.cells import row_length
 from catstream.detection.pyramid import Pyramid
 from catstream.evaluation.datasets import Sequence
 from catstream.training.one_class import one_class

@@ -8,7 +8,8 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection import bootstrap, extent, lessons, search
-from catstream.detection.hog import WINDOW, row_length
+from catstream.detection.cells import row_length
+from catstream.detection.hog import WINDOW
 from catstream.detection.lessons import Lesson
 from catstream.detection.motion import CentreFilter
 from catstream.detection.pyramid import Pyramid

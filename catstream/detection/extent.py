@@ -89,7 +89,7 @@ def cuts(frame: Pyramid, box: Box, own: np.ndarray, settings: Settings) -> tuple
         return [], []
     trials = [(k, box.scaled(_size(k, settings))) for k in _steps(settings.scale_count) if k]
     trials += [(k, box.scaled(*_stretch(k, settings))) for k in _steps(settings.aspect_count) if k]
-    rows = [windows.around(frame, trial, WINDOW)[0].reshape(-1) for _, trial in trials]
+    rows = [windows.around(frame, trial, WINDOW)[0].row(0, 0) for _, trial in trials]
     fits = [math.exp(-((k / settings.extent_sigma) ** 2) / 2) for k, _ in trials]
     return [own, *rows], [1.0, *fits]
 

@@ -3,7 +3,7 @@
 Each cell of 8 x 8 pixels has 31 HOG channels (18 signed and 9 unsigned
 orientations, 4 texture energies; Felzenszwalb et al. 2010), of the colour
 channel with the strongest gradient, then its mean colour in Lab.
-A window of 64 x 64 pixels is a row of 8 x 8 cells: d = 2176 numbers.
+A window of 64 x 64 pixels is 8 x 8 cells.
 
 The kernel makes one pass over the pixels: magnitude and orientation of a
 gradient come from tables, indexed by its two differences. It is compiled once
@@ -21,7 +21,7 @@ import cv2
 import numba
 import numpy as np
 
-__all__ = ["CELL", "CHANNELS", "MARGIN", "WINDOW", "grid", "row_length"]
+__all__ = ["CELL", "CHANNELS", "MARGIN", "WINDOW", "grid"]
 
 CELL = 8  #: pixels a cell is wide and high
 WINDOW = 8  #: cells a window is wide and high
@@ -33,15 +33,6 @@ _CLIP = 0.2  # a normalised bin is cut here (Dalal and Triggs 2005)
 _COLOUR_WEIGHT = 1.5
 _LAB_MIDDLE = np.array([128.0, 128.0, 128.0], np.float32)
 _LAB_SCALE = np.array([1.0, 3.0, 3.0], np.float32) * np.float32(_COLOUR_WEIGHT / 255)
-
-
-def row_length() -> int:
-    """Length d of a feature row.
-
-    >>> row_length()
-    2176
-    """
-    return WINDOW * WINDOW * CHANNELS
 
 
 def grid(image: np.ndarray) -> np.ndarray:

@@ -12,7 +12,8 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection import affine, extent, search, windows
-from catstream.detection.hog import WINDOW, row_length
+from catstream.detection.cells import COLOURS, row_length
+from catstream.detection.hog import WINDOW
 from catstream.detection.pyramid import Pyramid
 from catstream.messages import Model
 from catstream.settings import Settings
@@ -55,12 +56,19 @@ class Lesson:
             np.concatenate([self.fits, other.fits]),
         )
 
+    def seen(self, settings: Settings) -> Lesson:
+        """These, or without the histograms of colours: what no row tells of, no model weighs."""
+        if not settings.colours:
+            self.rows[:, COLOURS] = self.extents[:, COLOURS] = 0
+        return self
+
 
 def first(frame: Pyramid, box: Box, rng: np.random.Generator, settings: Settings) -> Lesson:
     """What the first frame teaches: n affine copies of the box and n windows around it, a leaf of each tree."""
-    copies = affine.copies(frame, box, settings.coreset_size, rng)
+    count, context, moved = settings.coreset_size, settings.context, settings.other_backgrounds
+    copies = affine.copies(frame, box, count, rng, context=context, moved=moved)
     lesson = Lesson.of(list(copies), 1, settings.object_weight)
-    lesson += _around(frame, box, None, settings.coreset_size, rng, settings)
+    lesson += _around(frame, box, None, count, rng, settings)
     return _with_extents(lesson, frame, box, copies[0], settings)
 
 
@@ -77,12 +85,12 @@ def far(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Lesson:
     scored = search.scored_whole(frame, box, model)
     places = windows.peaks(scored.scores, settings.far_negatives + 1, WINDOW // 2)
     rows = [scored.row(*place) for place in places if scored.box(*place).overlap(box) < 0.2]
-    return Lesson.of(rows[: settings.far_negatives], 0)
+    return Lesson.of(rows[: settings.far_negatives], 0).seen(settings)
 
 
 def _with_extents(lesson: Lesson, frame: Pyramid, box: Box, own: np.ndarray, settings: Settings) -> Lesson:
     rows, fits = extent.cuts(frame, box, own, settings)
-    return replace(lesson, extents=_array(rows), fits=np.array(fits, np.float32))
+    return replace(lesson, extents=_array(rows), fits=np.array(fits, np.float32)).seen(settings)
 
 
 def _array(rows: list[np.ndarray]) -> np.ndarray:
@@ -99,14 +107,14 @@ def _around(
         distance = down * down + across * across
         if distance:
             label = float(np.exp(-distance / (2 * settings.near_sigma**2)))
-            lesson += Lesson.of([windows.row_at(cells, _MIDDLE + down, _MIDDLE + across)], label)
+            lesson += Lesson.of([cells.row(_MIDDLE + down, _MIDDLE + across)], label)
     outside = np.ones((_CELLS - WINDOW + 1,) * 2, bool)
     outside[_MIDDLE - _NEAR : _MIDDLE + _NEAR + 1, _MIDDLE - _NEAR : _MIDDLE + _NEAR + 1] = False
     places = []
     if model is not None:
-        scores = np.where(outside, windows.respond(cells, model.weights, model.bias), -np.inf)
+        scores = np.where(outside, cells.respond(model.weights, model.bias), -np.inf)
         places = windows.peaks(scores, negatives // 2, _NEAR)
     anywhere = np.argwhere(outside)
     more = rng.choice(anywhere, negatives - len(places), replace=negatives > len(anywhere))
     places += [(row, column) for row, column in more]
-    return lesson + Lesson.of([windows.row_at(cells, *place) for place in places], 0)
+    return lesson + Lesson.of([cells.row(*place) for place in places], 0)

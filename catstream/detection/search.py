@@ -58,10 +58,10 @@ def whole(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
     return best
 
 
-def scored_around(frame: Pyramid, box: Box, cells: int, model: Model) -> Scored:
-    """Scores of all windows in `cells` x `cells` cells around a box."""
-    features, origin, step = windows.around(frame, box, cells)
-    return Scored(features, windows.respond(features, model.weights, model.bias), origin, step)
+def scored_around(frame: Pyramid, box: Box, side: int, model: Model) -> Scored:
+    """Scores of all windows in `side` x `side` cells around a box."""
+    cells, origin, step = windows.around(frame, box, side)
+    return Scored(cells, cells.respond(model.weights, model.bias), origin, step)
 
 
 def scored_whole(frame: Pyramid, box: Box, model: Model) -> Scored:
@@ -79,9 +79,9 @@ def scored_whole(frame: Pyramid, box: Box, model: Model) -> Scored:
         w, h = int(width * reach), int(height * reach)
         left, top = int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))
         frame = Pyramid(frame.image[top : top + h, left : left + w])
-    features, origin, step = windows.whole(frame, box)
+    cells, origin, step = windows.whole(frame, box)
     origin = origin[0] + left, origin[1] + top
-    return Scored(features, windows.respond(features, model.weights, model.bias), origin, step)
+    return Scored(cells, cells.respond(model.weights, model.bias), origin, step)
 
 
 def highest(scores: np.ndarray) -> tuple[int, int]:

@@ -9,29 +9,27 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 
 from catstream.box import Box
-from catstream.detection.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
+from catstream.detection.cells import Cells
+from catstream.detection.hog import CELL, MARGIN, WINDOW
 from catstream.detection.pyramid import Pyramid
 
-__all__ = ["Scored", "around", "cut", "peaks", "respond", "row_at", "vertex", "whole"]
-
-_WINDOW_PIXELS = WINDOW * CELL
+__all__ = ["Scored", "around", "cut", "peaks", "vertex", "whole"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scored:
     """Features of a part of a frame at one scale, and the score of each window in them.
 
-    cells    float32 (rows, columns, 34)
+    cells    of rows x columns
     scores   float32 (rows - 7, columns - 7), of the window whose first cell is there
     origin   where the first cell's corner lies in the frame, (x, y) in pixels
     step     pixels of the frame a cell is wide and high
     """
 
-    cells: np.ndarray
+    cells: Cells
     scores: np.ndarray
     origin: tuple[float, float]
     step: tuple[float, float]
@@ -43,7 +41,7 @@ class Scored:
 
     def row(self, row: int, column: int) -> np.ndarray:
         """Feature row of the window at (row, column), float32 (d,)."""
-        return row_at(self.cells, row, column)
+        return self.cells.row(row, column)
 
     def refined(self, row: int, column: int) -> tuple[float, float]:
         """The peak at (row, column) between the cells, by a parabola in each direction."""
@@ -53,23 +51,17 @@ class Scored:
         return row + down, column + across
 
 
-def row_at(cells: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Feature row of the window whose first cell is (row, column), float32 (d,)."""
-    return cells[row : row + WINDOW, column : column + WINDOW].reshape(-1)
-
-
-def around(frame: Pyramid, box: Box, cells: int) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+def around(frame: Pyramid, box: Box, cells: int) -> tuple[Cells, tuple[float, float], tuple[float, float]]:
     """Features of `cells` x `cells` cells around a box, at the size that makes the box a window.
 
     Returns
     -------
-    float32 (cells, cells, 34); origin and step as in `Scored`
+    the cells; origin and step as in `Scored`
     """
     step = box.w / WINDOW, box.h / WINDOW
     x, y = box.centre
     patch = cut(frame, x, y, step[0] / CELL, step[1] / CELL, (cells + 2 * MARGIN) * CELL)
-    inner = grid(patch)[MARGIN:-MARGIN, MARGIN:-MARGIN]
-    return inner, (x - cells / 2 * step[0], y - cells / 2 * step[1]), step
+    return Cells.within(patch), (x - cells / 2 * step[0], y - cells / 2 * step[1]), step
 
 
 def cut(frame: Pyramid, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
@@ -93,12 +85,12 @@ def cut(frame: Pyramid, x: float, y: float, across: float, down: float, size: in
     return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
-def whole(frame: Pyramid, box: Box) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+def whole(frame: Pyramid, box: Box) -> tuple[Cells, tuple[float, float], tuple[float, float]]:
     """Features of the whole frame, resized so that `box` is as large as a window.
 
     Returns
     -------
-    float32 (rows, columns, 34); origin and step as in `Scored`
+    the cells; origin and step as in `Scored`
     """
     width, height = frame.size
     columns = max(WINDOW, round(width / box.w * WINDOW))
@@ -107,22 +99,7 @@ def whole(frame: Pyramid, box: Box) -> tuple[np.ndarray, tuple[float, float], tu
     scale = min(width / size[0], height / size[1])
     image, wide = frame.near(scale)
     resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR)
-    return grid(resized), (0.0, 0.0), (image.shape[1] * wide / columns, image.shape[0] * wide / rows)
-
-
-def respond(cells: np.ndarray, weights: np.ndarray, bias: float) -> np.ndarray:
-    """Score of every window, float32 (rows - 7, columns - 7): one matrix product and shifted sums.
-
-    Parameters
-    ----------
-    cells : float32 (rows, columns, 34)
-    weights : float32 (d,)
-    """
-    rows, columns = cells.shape[:2]
-    parts = cells.reshape(-1, CHANNELS) @ weights.reshape(-1, CHANNELS).T
-    scores = np.full((rows - WINDOW + 1, columns - WINDOW + 1), bias, np.float32)
-    _add_shifted(parts.reshape(rows, columns, WINDOW * WINDOW), scores)
-    return scores
+    return Cells.of(resized), (0.0, 0.0), (image.shape[1] * wide / columns, image.shape[0] * wide / rows)
 
 
 def peaks(scores: np.ndarray, most: int, apart: int, least: float = -np.inf) -> list[tuple[int, int]]:
@@ -150,15 +127,3 @@ def vertex(values: np.ndarray, i: int) -> float:
     before, here, after = float(values[i - 1]), float(values[i]), float(values[i + 1])
     bend = before - 2 * here + after
     return float(np.clip((before - after) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
-
-
-@numba.njit("void(float32[:,:,::1], float32[:,::1])", cache=True, nogil=True, fastmath=True)
-def _add_shifted(parts, scores):
-    rows, columns = scores.shape
-    for row in range(rows):
-        for column in range(columns):
-            total = np.float32(0)
-            for i in range(WINDOW):
-                for j in range(WINDOW):
-                    total += parts[row + i, column + j, i * WINDOW + j]
-            scores[row, column] += total

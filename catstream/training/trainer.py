@@ -33,16 +33,15 @@ class Trainer:
         ProtocolError
             For a sample in which object and background are the same.
         """
-        mean, background_mean = sample.object.mean, sample.background.mean
-        weights = np.zeros_like(mean)
-        for direction in self._directions(sample):
-            contrast = float(direction @ (mean - background_mean))
-            if not contrast > 0:
-                raise ProtocolError(
-                    f"sample {sample.version} holds no difference between object and background: give another box"
-                )
-            weights += direction / np.float32(contrast)
-        weights /= np.float32(weights @ (mean - background_mean))
+        background_mean = sample.background.mean
+        apart = sample.object.mean - background_mean
+        # A direction in which the object scores no higher, as very few rows may give one, is worth nothing.
+        useful = [scaled for each in self._directions(sample) if (scaled := _unit_contrast(each, apart)) is not None]
+        weights = _unit_contrast(np.sum(useful, axis=0) if useful else _between(sample, self.settings), apart)
+        if weights is None:
+            raise ProtocolError(
+                f"sample {sample.version} holds no difference between object and background: give another box"
+            )
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
         extent = None
         if sample.extent is not None:
@@ -56,10 +55,20 @@ class Trainer:
         settings = self.settings
         if settings.classifier == "one-class":
             return [one_class(sample.object.rows, sample.background.mean)]
-        means = ridge.between(sample.background.rows, sample.object.mean - sample.background.mean, settings.ridge)
         if settings.classifier == "least-squares":
-            return [means]
-        return [means, ridge.fit(sample.loss.rows, settings.loss_ridge)]
+            return [_between(sample, settings)]
+        return [_between(sample, settings), ridge.fit(sample.loss.rows, settings.loss_ridge)]
+
+
+def _between(sample: Sample, settings: Settings) -> np.ndarray:
+    """Least squares of the two trees: its contrast is positive wherever the means differ."""
+    return ridge.between(sample.background.rows, sample.object.mean - sample.background.mean, settings.ridge)
+
+
+def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | None:
+    """Scaled so that the means differ by 1 along it; None where the object's is not the higher one."""
+    contrast = float(direction @ apart)
+    return direction / np.float32(contrast) if contrast > 0 else None
 
 
 @lru_cache(maxsize=1)  # the same centres come with every sample of a block

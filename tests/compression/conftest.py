@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from catstream.detection import hog
+from catstream.detection.cells import Cells
 
 ROWS = 208  #: 13 leaves of 16: levels 3, 2 and 0
 
@@ -27,15 +28,14 @@ def low_rank_rows(rng: np.random.Generator) -> np.ndarray:
 def hog_rows(rng: np.random.Generator) -> np.ndarray:
     """Real features: a textured object that drifts, turns, grows and changes light in a noisy video."""
     texture = cv2.resize(rng.integers(0, 255, (24, 24, 3), np.uint8), (240, 240), interpolation=cv2.INTER_CUBIC)
-    margin = hog.MARGIN
-    side = (hog.WINDOW + 2 * margin) * hog.CELL
+    side = (hog.WINDOW + 2 * hog.MARGIN) * hog.CELL
     rows = []
     for frame in range(ROWS):
         turn = cv2.getRotationMatrix2D((120, 120), 20 * np.sin(frame / 30), 1 + 0.2 * np.sin(frame / 50))
         turn[:, 2] += 10 * np.sin([frame / 11, frame / 17]) - 120 + side / 2
         image = cv2.warpAffine(texture, turn, (side, side)) * (0.8 + 0.2 * np.cos(frame / 40))
         image = np.clip(image + rng.normal(scale=4, size=image.shape), 0, 255).astype(np.uint8)
-        rows.append(hog.grid(image)[margin:-margin, margin:-margin].ravel())
+        rows.append(Cells.within(image).row(0, 0))
     return np.array(rows)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
+from catstream.detection.cells import COLOURS, row_length
 from catstream.detection.detector import Detector
-from catstream.detection.hog import row_length
 from catstream.errors import BoxError, ProtocolError
 from catstream.messages import Model, Motion
 from catstream.settings import Settings
@@ -44,6 +44,26 @@ def test_the_first_frame_teaches_a_leaf_of_each_tree(scene):
     assert features.rows.shape[1] == row_length()
     assert (features.labels == 1).sum() == settings.coreset_size
     assert (features.labels == 0).sum() >= settings.coreset_size
+
+
+def test_without_colours_no_row_tells_of_them_and_the_model_weighs_none(scene):
+    for colours in (True, False):
+        detector = Detector(Settings(colours=colours))
+        _, first = detector.init(scene((60, 50)), START)
+        detector.seq = 4  # the next frame is searched for hard negatives
+        _, later = detector.step(scene((62, 50)))
+        for features in (first, later):
+            assert features.rows[:, COLOURS].any() == features.extents[:, COLOURS].any() == colours
+        assert detector.model.weights[COLOURS].any() == colours
+
+
+def test_half_of_the_first_copies_are_put_on_another_background(scene):
+    one, other = (
+        Detector(Settings(other_backgrounds=share)).init(scene((60, 50)), START)[1].rows[:64] for share in (0, 0.5)
+    )
+    differ = (one != other).any(axis=1)
+    assert differ.sum() == 31
+    assert not differ[0]
 
 
 @pytest.mark.parametrize("detection", ["local", "full"])

@@ -44,7 +44,7 @@ def test_a_cut_fits_the_less_the_further_it_is_off(draw):
     settings = Settings(scale_count=5, aspect_count=3)
     image, box = draw(48, 40)
     frame = Pyramid(image)
-    own = windows.around(frame, box, WINDOW)[0].reshape(-1)
+    own = windows.around(frame, box, WINDOW)[0].row(0, 0)
     rows, fits = extent.cuts(frame, box, own, settings)
     assert rows[0] is own
     assert fits == pytest.approx([1, *np.exp([-2, -0.5, -0.5, -2]), *np.exp([-0.5, -0.5])])

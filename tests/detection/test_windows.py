@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.detection import affine, windows
-from catstream.detection.hog import CHANNELS, WINDOW, grid, row_length
+from catstream.detection import windows
+from catstream.detection.cells import Cells
+from catstream.detection.hog import WINDOW
 from catstream.detection.pyramid import Pyramid
 from catstream.detection.windows import Scored
 
@@ -41,16 +42,10 @@ def test_a_cut_far_outside_is_still_an_image(image, x):
 
 def test_cells_around_a_box_are_those_of_the_frame(image):
     cells, origin, step = windows.around(Pyramid(image), Box(64, 48, 64, 64), 12)
-    np.testing.assert_array_equal(cells, grid(image)[4:16, 6:18])
+    frames = Cells.of(image)
+    np.testing.assert_array_equal(cells.grid, frames.grid[4:16, 6:18])
+    np.testing.assert_array_equal(cells.shades, frames.shades[16:64, 24:72])
     assert (origin, step) == ((48, 32), (8, 8))
-
-
-def test_every_window_scores_weights_times_row_plus_bias(rng):
-    cells = rng.normal(size=(11, 14, CHANNELS)).astype(np.float32)
-    weights = rng.normal(size=row_length()).astype(np.float32)
-    scores = windows.respond(cells, weights, 0.5)
-    expected = [[windows.row_at(cells, row, column) @ weights + 0.5 for column in range(7)] for row in range(4)]
-    np.testing.assert_allclose(scores, expected, rtol=1e-4, atol=1e-3)
 
 
 def test_the_window_of_a_score_is_a_box_in_the_frame(image):
@@ -62,14 +57,14 @@ def test_the_window_of_a_score_is_a_box_in_the_frame(image):
 
 def test_a_whole_frame_is_resized_until_the_box_is_a_window(image):
     cells, origin, step = windows.whole(Pyramid(image), Box(10, 10, 40, 50))
-    assert cells.shape == (200 // 50 * WINDOW, 240 // 40 * WINDOW, CHANNELS)
+    assert cells.shape == (200 // 50 * WINDOW, 240 // 40 * WINDOW)
     assert (origin, step) == ((0, 0), (5, 6.25))
 
 
-def test_a_peak_lies_between_cells_where_its_neighbours_say(rng):
+def test_a_peak_lies_between_cells_where_its_neighbours_say(image):
     row, column = np.mgrid[:9, :9]
     scores = (1 - 0.01 * ((row - 4.3) ** 2 + (column - 3.8) ** 2)).astype(np.float32)
-    scored = Scored(rng.normal(size=(16, 16, CHANNELS)), scores, (0, 0), (1, 1))
+    scored = Scored(Cells.of(image[:128, :128]), scores, (0, 0), (1, 1))
     assert scored.refined(4, 4) == pytest.approx((4.3, 3.8), abs=1e-3)
 
 
@@ -85,18 +80,3 @@ def test_peaks_suppress_their_neighbours(rng):
 
 def test_peaks_stop_at_the_threshold():
     assert windows.peaks(np.eye(5, dtype=np.float32), 9, apart=1, least=0.5) == [(0, 0), (2, 2), (4, 4)]
-
-
-def test_affine_copies_are_seeded_and_the_first_is_the_box(image):
-    box = Box(64, 48, 64, 64)
-    one, two = (affine.copies(Pyramid(image), box, 5, np.random.default_rng(7)) for _ in range(2))
-    np.testing.assert_array_equal(one, two)
-    np.testing.assert_array_equal(one[0], grid(image)[6:14, 8:16].reshape(-1))
-    assert np.abs(one[1:] - one[0]).max(axis=1).min() > 0
-
-
-def test_copies_differ_more_from_elsewhere_than_from_the_box(image):
-    smooth = np.repeat(np.repeat(image[:50, :60], 4, axis=0), 4, axis=1)
-    rows = affine.copies(Pyramid(smooth), Box(64, 48, 64, 64), 8, np.random.default_rng(0))
-    elsewhere = affine.copies(Pyramid(smooth), Box(128, 100, 64, 64), 1, np.random.default_rng(0))
-    assert np.linalg.norm(rows[1:] - rows[0], axis=1).max() < np.linalg.norm(elsewhere - rows[0])

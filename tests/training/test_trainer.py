@@ -54,3 +54,11 @@ def test_an_object_like_the_background_is_refused(sample):
     same = dataclasses.replace(sample, object=sample.background)
     with pytest.raises(ProtocolError, match="give another box"):
         Trainer(Settings()).train(same)
+
+
+def test_a_direction_in_which_the_object_scores_lower_gives_way_to_the_one_between_the_means(sample):
+    """The rows of a tiny coreset may lie beyond the background, seen from the mean of all they stand for."""
+    mirrored = dataclasses.replace(sample.object, rows=2 * sample.background.mean - sample.object.rows)
+    few = dataclasses.replace(sample, object=mirrored)
+    model = Trainer(Settings(classifier="one-class")).train(few)
+    assert model.weights.tobytes() == Trainer(Settings(classifier="least-squares")).train(few).weights.tobytes()

@@ -1,0 +1,95 @@
+"""Cells: the features of an image, in a grid, and of every window in it.
+
+A window is 8 x 8 cells. Its row is their HOG and mean colour, and the histogram of its colours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+
+from catstream.detection import colours
+from catstream.detection.colours import SHADES, SIDE
+from catstream.detection.hog import CHANNELS, MARGIN, WINDOW, grid
+
+__all__ = ["COLOURS", "Cells", "row_length"]
+
+_PLACES = WINDOW * WINDOW * CHANNELS
+#: Where in a row the histogram of colours is.
+COLOURS = slice(_PLACES, _PLACES + SHADES)
+
+
+def row_length() -> int:
+    """Length d of a feature row.
+
+    >>> row_length()
+    2464
+    """
+    return _PLACES + SHADES
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cells:
+    """Features of a part of an image, cell by cell.
+
+    grid    float32 (rows, columns, 34), HOG and mean colour
+    shades  uint16 (4 * rows, 4 * columns), 4 x 4 of each cell
+    """
+
+    grid: np.ndarray
+    shades: np.ndarray
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> Cells:
+        """Cells of an image, uint8 (h, w, 3) BGR or (h, w) grey, whose sides are whole cells."""
+        if image.ndim == 2:
+            image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        return cls(grid(image), colours.shades(image))
+
+    @classmethod
+    def within(cls, image: np.ndarray) -> Cells:
+        """The same without the margin, whose features depend on what is beyond the image."""
+        cells, edge = cls.of(image), MARGIN * SIDE
+        return cls(cells.grid[MARGIN:-MARGIN, MARGIN:-MARGIN], cells.shades[edge:-edge, edge:-edge])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        rows, columns = self.grid.shape[:2]
+        return rows, columns
+
+    def row(self, row: int, column: int) -> np.ndarray:
+        """Feature row of the window whose first cell is (row, column), float32 (d,)."""
+        features = np.empty(row_length(), np.float32)
+        features[:_PLACES] = self.grid[row : row + WINDOW, column : column + WINDOW].reshape(-1)
+        colours.histogram(self.shades, row, column, features[COLOURS])
+        return features
+
+    def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
+        """Score of every window, float32 (rows - 7, columns - 7): one matrix product and shifted sums.
+
+        Parameters
+        ----------
+        weights : float32 (d,)
+        """
+        rows, columns = self.shape
+        parts = self.grid.reshape(-1, CHANNELS) @ weights[:_PLACES].reshape(-1, CHANNELS).T
+        scores = np.full((rows - WINDOW + 1, columns - WINDOW + 1), bias, np.float32)
+        _add_shifted(parts.reshape(rows, columns, WINDOW * WINDOW), scores)
+        colours.add_scores(self.shades, weights[COLOURS], scores)
+        return scores
+
+
+@numba.njit("void(float32[:,:,::1], float32[:,::1])", cache=True, nogil=True, fastmath=True)
+def _add_shifted(parts, scores):
+    rows, columns = scores.shape
+    for row in range(rows):
+        for column in range(columns):
+            total = np.float32(0)
+            for i in range(WINDOW):
+                for j in range(WINDOW):
+                    total += parts[row + i, column + j, i * WINDOW + j]
+            scores[row, column] += total

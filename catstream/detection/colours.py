@@ -1,0 +1,125 @@
+"""Colours: how much of each the middle of a window holds, wherever in it that is.
+
+HOG and the mean colour of a cell say what is where. An object that bends or turns moves both
+between the cells, but keeps its colours: 288 shades of Lab, 8 of lightness by 6 x 6 of a and b.
+A window's histogram counts them in its middle 6 x 6 cells, which are mostly object; the square
+root of each share is a feature, so that distances are Hellinger's.
+
+Four pixels are averaged to one first: a cell has 4 x 4 shades.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numba
+import numpy as np
+
+from catstream.detection.hog import CELL, WINDOW
+
+__all__ = ["SHADES", "SIDE", "add_scores", "histogram", "shades"]
+
+SIDE = CELL // 2  #: shades a cell is wide and high
+_LIGHT, _CHROMA, _CHROMA_STEP = 8, 6, 10  # levels of lightness, of a and of b; Lab units from one of these to the next
+SHADES = _LIGHT * _CHROMA * _CHROMA  #: how many are told apart
+
+_WEIGHT = 3.0  # length of a histogram as features; that of a window's HOG is about 9
+_EDGE = SIDE  # shades of a window's first cell, which is not counted
+_COUNTED = WINDOW * SIDE - 2 * _EDGE  # shades along a side of the middle
+
+
+def shades(image: np.ndarray) -> np.ndarray:
+    """The shade of every 2 x 2 pixels.
+
+    Parameters
+    ----------
+    image : uint8 (h, w, 3) BGR; h and w are even
+
+    Returns
+    -------
+    uint16 (h // 2, w // 2), below `SHADES`
+
+    >>> len(set(shades(np.array([[0, 0, 90, 90], [0, 0, 90, 90]], np.uint8)[:, :, None].repeat(3, axis=2)).ravel()))
+    2
+    """
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    halved = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    found = np.empty((height, width), np.uint16)
+    _look_up(halved, _TABLE, found)
+    return found
+
+
+def histogram(found: np.ndarray, row: int, column: int, features: np.ndarray) -> None:
+    """Features of the window whose first cell is (row, column), into float32 (SHADES,)."""
+    _histogram(found, row * SIDE + _EDGE, column * SIDE + _EDGE, _ROOTS, features)
+
+
+def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray) -> None:
+    """Add what the histogram of each window scores, in constant time a window.
+
+    Parameters
+    ----------
+    found : uint16, as `shades` gives them
+    weights : float32 (SHADES,)
+    scores : float32 (rows - 7, columns - 7), of the window whose first cell is there
+    """
+    _add_scores(found, weights, np.diff(_ROOTS), scores)
+
+
+def _table() -> np.ndarray:
+    """Shade of every BGR colour of 5 bits each, blue first."""
+    levels = np.arange(4, 256, 8, dtype=np.uint8)
+    colours = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1)
+    lab = cv2.cvtColor(colours.reshape(-1, 1, 3), cv2.COLOR_BGR2LAB).reshape(-1, 3).astype(int)
+    light = lab[:, 0] * _LIGHT // 256
+    chroma = ((lab[:, 1:] - 128) // _CHROMA_STEP + _CHROMA // 2).clip(0, _CHROMA - 1)
+    return ((light * _CHROMA + chroma[:, 0]) * _CHROMA + chroma[:, 1]).astype(np.uint16)
+
+
+_TABLE = _table()
+#: What a count adds up to as a feature.
+_ROOTS = (_WEIGHT * np.sqrt(np.arange(_COUNTED**2 + 1) / _COUNTED**2)).astype(np.float32)
+
+
+@numba.njit("void(uint8[:,:,::1], uint16[::1], uint16[:,::1])", cache=True, nogil=True)
+def _look_up(image, table, found):
+    for y in range(found.shape[0]):
+        for x in range(found.shape[1]):
+            blue, green, red = np.int32(image[y, x, 0]), np.int32(image[y, x, 1]), np.int32(image[y, x, 2])
+            found[y, x] = table[((blue >> 3) << 10) | ((green >> 3) << 5) | (red >> 3)]
+
+
+@numba.njit("void(uint16[:,:], int64, int64, float32[::1], float32[::1])", cache=True, nogil=True)
+def _histogram(found, top, left, roots, features):
+    counts = np.zeros(len(features), np.int64)
+    for y in range(top, top + _COUNTED):
+        for x in range(left, left + _COUNTED):
+            counts[found[y, x]] += 1
+    for shade in range(len(features)):
+        features[shade] = roots[counts[shade]]
+
+
+@numba.njit("void(uint16[:,:], float32[::1], float32[::1], float32[:,::1])", cache=True, nogil=True)
+def _add_scores(found, weights, steps, scores):
+    counts = np.empty(len(weights), np.int64)
+    for row in range(scores.shape[0]):
+        counts[:] = 0
+        total = 0.0
+        for y in range(row * SIDE + _EDGE, row * SIDE + _EDGE + _COUNTED):
+            for x in range(_EDGE, _EDGE + _COUNTED):
+                shade = found[y, x]
+                total += weights[shade] * steps[counts[shade]]
+                counts[shade] += 1
+        scores[row, 0] += total
+        for column in range(1, scores.shape[1]):
+            # The window moves on by a cell: its first column of shades goes, the one beside it comes.
+            left = column * SIDE
+            for y in range(row * SIDE + _EDGE, row * SIDE + _EDGE + _COUNTED):
+                for x in range(left, left + SIDE):
+                    shade = found[y, x]
+                    counts[shade] -= 1
+                    total -= weights[shade] * steps[counts[shade]]
+                for x in range(left + _COUNTED, left + _COUNTED + SIDE):
+                    shade = found[y, x]
+                    total += weights[shade] * steps[counts[shade]]
+                    counts[shade] += 1
+            scores[row, column] += total
