@@ -28,6 +28,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "distrust of a window found elsewhere": {"trust_score": _NEVER},
     "search of the whole frame": {"sure_score": _NEVER, "lost_score": _NEVER},
     "affine copies of each frame": {"copies": 0},
+    "mirrored copies": {"mirrored": 0},
     "other backgrounds behind the first copies": {"other_backgrounds": 0.0},
     "histogram of colours": {"colours": False},
     "search over scales": {"scale_count": 1},

@@ -164,6 +164,7 @@ class Settings:
     copies: Annotated[
         int, _about("Affine copies of the object a frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)
     ] = 5
+    mirrored: Annotated[int, _about("How many of them are turned left to right.", ge=0)] = 2
     other_backgrounds: Annotated[
         float,
         _about(
@@ -295,6 +296,7 @@ _PAPER = {
     "extent_prior": 0.0,
     "colours": False,
     "other_backgrounds": 0.0,
+    "mirrored": 0,
     "present_share": 0.0,
     "return_share": 0.0,
 }

@@ -3,7 +3,7 @@
 They are the training samples that the first frame can give (paper, "System
 Implementation"): n of them make the first leaf at once. The corners of a box are
 not the object, but all copies of one frame agree on them: some are put on another
-background.
+background. And what turns round shows its other side, which often is the mirrored one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,14 @@ _SOLID, _GONE = 0.8, 1.15  # where the object's ellipse begins to fade, and has;
 
 
 def copies(
-    frame: Pyramid, box: Box, count: int, rng: np.random.Generator, *, context: float = 1.0, moved: float = 0.0
+    frame: Pyramid,
+    box: Box,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    context: float = 1.0,
+    moved: float = 0.0,
+    mirrored: int = 0,
 ) -> np.ndarray:
     """Features of `count` copies of a box; the first is the box itself.
 
@@ -38,6 +45,7 @@ def copies(
     rng : where scale, shift and rotation come from
     context : size of the box as a multiple of the object's
     moved : share of them that are put on another background of the frame
+    mirrored : how many of them, the last ones, are turned left to right
 
     Returns
     -------
@@ -57,6 +65,8 @@ def copies(
             angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(_NEAREST, _FARTHEST)
             away = centre[0] + far * np.cos(angle) * box.w, centre[1] + far * np.sin(angle) * box.h
             patch = _put_on(cut(frame, *away, *pixel, _SIDE, _TURN * turn), patch, context)
+        if number >= max(count - mirrored, 1):
+            patch = cv2.flip(patch, 1)
         rows.append(Cells.within(patch).row(0, 0))
     return np.array(rows, np.float32)
 

@@ -74,7 +74,7 @@ def first(frame: Pyramid, box: Box, rng: np.random.Generator, settings: Settings
 
 def near(frame: Pyramid, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings) -> Lesson:
     """What a later frame teaches: the object, affine copies of it, near misses, background, and its extent."""
-    own = list(affine.copies(frame, box, 1 + settings.copies, rng))
+    own = list(affine.copies(frame, box, 1 + settings.copies, rng, mirrored=settings.mirrored))
     lesson = Lesson.of(own, 1, settings.object_weight / len(own))
     lesson += _around(frame, box, model, settings.near_negatives, rng, settings)
     return _with_extents(lesson, frame, box, own[0], settings)

@@ -5,7 +5,7 @@ import pytest
 
 from catstream.box import Box
 from catstream.detection import affine
-from catstream.detection.cells import Cells
+from catstream.detection.cells import COLOURS, Cells
 from catstream.detection.pyramid import Pyramid
 
 BOX = Box(64, 48, 64, 64)
@@ -55,3 +55,15 @@ def test_on_another_background_the_object_keeps_its_middle(rng):
     plain, moved = (copies(image, BOX, 2, context=1.25, moved=share)[1].copy() for share in (0.0, 1.0))
     grids = [row[: 8 * 8 * 34].reshape(8, 8, 34) for row in (plain, moved)]
     np.testing.assert_allclose(grids[0][3:5, 3:5], grids[1][3:5, 3:5], atol=1e-3)
+
+
+def test_the_last_copies_are_mirrored(image):
+    plain, some = (copies(image, BOX, 6, mirrored=count) for count in (0, 2))
+    np.testing.assert_array_equal(some[:4], plain[:4])
+    np.testing.assert_allclose(some[4:, COLOURS], plain[4:, COLOURS], atol=1e-6)
+    ours, theirs = (rows[4:, : COLOURS.start].reshape(2, 8, 8, 34)[..., 31:] for rows in (some, plain))
+    np.testing.assert_allclose(ours, theirs[:, :, ::-1], atol=1e-5)
+
+
+def test_the_box_itself_is_never_mirrored(image):
+    np.testing.assert_array_equal(copies(image, BOX, 2, mirrored=9)[0], copies(image, BOX, 1)[0])
