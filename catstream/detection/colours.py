@@ -62,7 +62,7 @@ def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray) -> No
     weights : float32 (SHADES,)
     scores : float32 (rows - 7, columns - 7), of the window whose first cell is there
     """
-    _add_scores(found, weights, np.diff(_ROOTS), scores)
+    _add_scores(found, weights, _STEPS, scores)
 
 
 def _table() -> np.ndarray:
@@ -78,6 +78,7 @@ def _table() -> np.ndarray:
 _TABLE = _table()
 #: What a count adds up to as a feature.
 _ROOTS = (_WEIGHT * np.sqrt(np.arange(_COUNTED**2 + 1) / _COUNTED**2)).astype(np.float32)
+_STEPS = np.diff(_ROOTS)  # and what one more of a shade adds
 
 
 @numba.njit("void(uint8[:,:,::1], uint16[::1], uint16[:,::1])", cache=True, nogil=True)
