@@ -99,7 +99,10 @@ def _histogram(found, top, left, roots, features):
         features[shade] = roots[counts[shade]]
 
 
-@numba.njit("void(uint16[:,:], float32[::1], float32[::1], float32[:,::1])", cache=True, nogil=True)
+_READ = numba.types.Array(numba.float32, 1, "C", readonly=True)  # weights that came over the wire cannot be written
+
+
+@numba.njit(numba.void(numba.uint16[:, :], _READ, _READ, numba.float32[:, ::1]), cache=True, nogil=True)
 def _add_scores(found, weights, steps, scores):
     counts = np.empty(len(weights), np.int64)
     for row in range(scores.shape[0]):

@@ -43,9 +43,11 @@ def test_every_colour_has_a_shade(colour):
     assert (found < SHADES).all()
 
 
-def test_scores_are_added_for_each_window(rng):
+@pytest.mark.parametrize("writeable", [True, False], ids=["learned", "received"])
+def test_scores_are_added_for_each_window(rng, writeable):
     image = np.repeat(np.repeat(rng.integers(0, 256, (24, 32, 3), np.uint8), 4, axis=0), 4, axis=1)
     weights = rng.normal(size=SHADES).astype(np.float32)
+    weights.flags.writeable = writeable
     scores = np.full((5, 9), 7, np.float32)
     colours.add_scores(colours.shades(image), weights, scores)
     expected = [[7 + of(image, row, column) @ weights for column in range(9)] for row in range(5)]
