@@ -148,7 +148,7 @@ class Recording:
         self.end: End | None = None
         tracks: set[int] = set()
         self._taken: list[tuple[int, int]] = []  # seq and place of the features that the trees hold
-        self._models: list[tuple[int, int]] = []  # how far the features were, and place
+        self._models: list[tuple[int, int]] = []  # seq of the last features it learned from, and place
         self.size = len(_HEAD)
         with self._open() as file:
             for place, _, number, data in self._records(file):
@@ -159,7 +159,7 @@ class Recording:
                             earlier.pop()
                     self._taken.append((number, place))
                 elif kind is Model:
-                    self._models.append((self._taken[-1][0] if self._taken else 0, place))
+                    self._models.append((decode(data, Model).frame + 1, place))
                 elif kind is Track:
                     tracks.add(number)
                 elif kind is End:

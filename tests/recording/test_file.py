@@ -99,6 +99,15 @@ def test_what_a_restarted_compressor_took_anew_replaces_what_it_had_taken(writte
     assert recording.missing[Features] == 0
 
 
+def test_a_model_of_features_that_were_replaced_is_none_of_the_run_even_where_it_came_once_more(written):
+    """A restarted compressor hears the last model of the trainer, which learned from what it had not stored."""
+    path = written([features(1), model(1, 0), features(2), features(3)])
+    written([model(2, 2), features(2, 0.75), features(3, 0.75), features(4)], resume=True)
+    recording = Recording(path)
+    assert [model.version for model in recording.models()] == [1]
+    assert recording.counts[Model] == 1
+
+
 def test_what_is_missing_is_counted_at_the_begin_between_and_at_the_end(written):
     recording = Recording(written([features(3), features(6), track(2), track(9), End(11, "its end")]))
     assert recording.missing == {Features: 2 + 2 + 4, Track: 1 + 6 + 1}
