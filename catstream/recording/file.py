@@ -154,12 +154,13 @@ class Recording:
             for place, _, number, data in self._records(file):
                 kind = _kind(data)
                 if kind is Features:
-                    for earlier in (self._taken, self._models):
-                        while earlier and earlier[-1][0] >= number:
-                            earlier.pop()
+                    _go_back(self._taken, number)
+                    _go_back(self._models, number)
                     self._taken.append((number, place))
-                elif kind is Model:
-                    self._models.append((decode(data, Model).frame + 1, place))
+                elif kind is Model:  # a restarted compressor may have it made once more
+                    learned = decode(data, Model).frame + 1
+                    _go_back(self._models, learned)
+                    self._models.append((learned, place))
                 elif kind is Track:
                     tracks.add(number)
                 elif kind is End:
@@ -242,6 +243,12 @@ class Recording:
             if len(data) != length or zlib.crc32(data, zlib.crc32(head[_LENGTHS.size :])) != check:
                 return
             yield place, *_FACTS.unpack_from(head, _LENGTHS.size), data
+
+
+def _go_back(places: list[tuple[int, int]], seq: int) -> None:
+    """Forget those from a `seq` on."""
+    while places and places[-1][0] >= seq:
+        places.pop()
 
 
 def _record(message: Any) -> bytes:

@@ -99,6 +99,13 @@ def test_what_a_restarted_compressor_took_anew_replaces_what_it_had_taken(writte
     assert recording.missing[Features] == 0
 
 
+def test_a_model_that_was_made_once_more_counts_once(written):
+    path = written([features(1), model(1, 0), features(2), features(3), model(2, 1)])
+    written([model(2, 1), features(3, 0.75)], resume=True)
+    recording = Recording(path)
+    assert [model.version for model in recording.models()] == [1, 2]
+
+
 def test_a_model_of_features_that_were_replaced_is_none_of_the_run_even_where_it_came_once_more(written):
     """A restarted compressor hears the last model of the trainer, which learned from what it had not stored."""
     path = written([features(1), model(1, 0), features(2), features(3)])
