@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import replace
 
 import pytest
 
@@ -49,7 +50,8 @@ def test_a_model_that_does_not_come_out_again_is_an_error(recorded, said, tmp_pa
     recording = Recording(recorded)
     with RecordingWriter(tmp_path / "other.rec", recording.run) as writer:
         for _, message in list(recording.messages())[1:]:
-            writer.write(message if not isinstance(message, Model) else Model(message.version, 0, message.weights, 0.0))
+            changed = replace(message, bias=0.0) if isinstance(message, Model) else message
+            writer.write(changed)
     code, output, errors = said("replay", tmp_path / "other.rec", "--learn")
     assert code == 1
     assert f"0 of {recording.counts[Model]}" in output
