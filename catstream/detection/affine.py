@@ -55,7 +55,7 @@ def copies(
     if count:
         change[0] = 0
     rows = []
-    (x, y) = box.centre
+    x, y = box.centre
     for number, (scale, right, down, turn) in enumerate(change):
         factor = np.exp(_SCALE * scale) / (WINDOW * CELL)
         pixel = box.w * factor, box.h * factor
