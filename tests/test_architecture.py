@@ -32,7 +32,7 @@ HOMES = {
     "numpy": ["catstream", "services"],
     "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
     "cv2": ["catstream/detection", "catstream/video", "catstream/evaluation/peers.py", "services/__main__.py"],
-    "numba": ["catstream/detection"],
+    "numba": ["catstream/detection/compiled.py"],
     "filterpy": ["catstream/training/motion_em.py"],
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
     "safetensors": ["catstream/storage.py"],

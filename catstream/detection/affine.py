@@ -17,7 +17,6 @@ from catstream.box import Box
 from catstream.detection.cells import Cells
 from catstream.detection.hog import CELL, MARGIN, WINDOW
 from catstream.detection.pyramid import Pyramid
-from catstream.detection.windows import cut
 
 __all__ = ["copies"]
 
@@ -60,11 +59,11 @@ def copies(
         factor = np.exp(_SCALE * scale) / (WINDOW * CELL)
         pixel = box.w * factor, box.h * factor
         centre = x + _SHIFT * right * box.w, y + _SHIFT * down * box.h
-        patch = cut(frame, *centre, *pixel, _SIDE, _TURN * turn)
+        patch = frame.cut(*centre, *pixel, _SIDE, _TURN * turn)
         if number and number * moved % 1 < moved:
             angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(_NEAREST, _FARTHEST)
             away = centre[0] + far * np.cos(angle) * box.w, centre[1] + far * np.sin(angle) * box.h
-            patch = _put_on(cut(frame, *away, *pixel, _SIDE, _TURN * turn), patch, context)
+            patch = _put_on(frame.cut(*away, *pixel, _SIDE, _TURN * turn), patch, context)
         if number >= max(count - mirrored, 1):
             patch = cv2.flip(patch, 1)
         rows.append(Cells.within(patch).row(0, 0))

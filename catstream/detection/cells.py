@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
-import numba
 import numpy as np
 
 from catstream.detection import colours
-from catstream.detection.colours import SHADES, SIDE
-from catstream.detection.hog import CHANNELS, MARGIN, WINDOW, grid
+from catstream.detection.colours import SHADES
+from catstream.detection.compiled import kernel
+from catstream.detection.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
 
 __all__ = ["COLOURS", "Cells", "row_length"]
 
@@ -44,16 +43,14 @@ class Cells:
 
     @classmethod
     def of(cls, image: np.ndarray) -> Cells:
-        """Cells of an image, uint8 (h, w, 3) BGR or (h, w) grey, whose sides are whole cells."""
-        if image.ndim == 2:
-            image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells."""
         return cls(grid(image), colours.shades(image))
 
     @classmethod
     def within(cls, image: np.ndarray) -> Cells:
         """The same without the margin, whose features depend on what is beyond the image."""
-        cells, edge = cls.of(image), MARGIN * SIDE
-        return cls(cells.grid[MARGIN:-MARGIN, MARGIN:-MARGIN], cells.shades[edge:-edge, edge:-edge])
+        edge = MARGIN * CELL
+        return cls(grid(image, MARGIN), colours.shades(image[edge:-edge, edge:-edge]))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -83,7 +80,7 @@ class Cells:
         return scores
 
 
-@numba.njit("void(float32[:,:,::1], float32[:,::1])", cache=True, nogil=True, fastmath=True)
+@kernel("void(float32[:,:,::1], float32[:,::1])")
 def _add_shifted(parts, scores):
     rows, columns = scores.shape
     for row in range(rows):

@@ -11,9 +11,9 @@ Four pixels are averaged to one first: a cell has 4 x 4 shades.
 from __future__ import annotations
 
 import cv2
-import numba
 import numpy as np
 
+from catstream.detection.compiled import kernel
 from catstream.detection.hog import CELL, WINDOW
 
 __all__ = ["SHADES", "SIDE", "add_scores", "histogram", "shades"]
@@ -41,10 +41,8 @@ def shades(image: np.ndarray) -> np.ndarray:
     >>> len(set(shades(np.array([[0, 0, 90, 90], [0, 0, 90, 90]], np.uint8)[:, :, None].repeat(3, axis=2)).ravel()))
     2
     """
-    height, width = image.shape[0] // 2, image.shape[1] // 2
-    halved = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    found = np.empty((height, width), np.uint16)
-    _look_up(halved, _TABLE, found)
+    found = np.empty((image.shape[0] // 2, image.shape[1] // 2), np.uint16)
+    _look_up(image, _TABLE, found)
     return found
 
 
@@ -62,7 +60,8 @@ def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray) -> No
     weights : float32 (SHADES,)
     scores : float32 (rows - 7, columns - 7), of the window whose first cell is there
     """
-    _add_scores(found, weights, _STEPS, scores)
+    # Weights that came over the wire cannot be written, and a kernel takes none of those.
+    _add_scores(found, np.require(weights, requirements="W"), _STEPS, scores)
 
 
 def _table() -> np.ndarray:
@@ -81,15 +80,20 @@ _ROOTS = (_WEIGHT * np.sqrt(np.arange(_COUNTED**2 + 1) / _COUNTED**2)).astype(np
 _STEPS = np.diff(_ROOTS)  # and what one more of a shade adds
 
 
-@numba.njit("void(uint8[:,:,::1], uint16[::1], uint16[:,::1])", cache=True, nogil=True)
+@kernel("void(uint8[:,:,:], uint16[::1], uint16[:,::1])")
 def _look_up(image, table, found):
     for y in range(found.shape[0]):
         for x in range(found.shape[1]):
-            blue, green, red = np.int32(image[y, x, 0]), np.int32(image[y, x, 1]), np.int32(image[y, x, 2])
-            found[y, x] = table[((blue >> 3) << 10) | ((green >> 3) << 5) | (red >> 3)]
+            place = 0
+            for channel in range(3):
+                above = np.int64(image[2 * y, 2 * x, channel]) + image[2 * y, 2 * x + 1, channel]
+                below = np.int64(image[2 * y + 1, 2 * x, channel]) + image[2 * y + 1, 2 * x + 1, channel]
+                mean = (above + below + 2) >> 2
+                place = place << 5 | mean >> 3
+            found[y, x] = table[place]
 
 
-@numba.njit("void(uint16[:,:], int64, int64, float32[::1], float32[::1])", cache=True, nogil=True)
+@kernel("void(uint16[:,::1], int64, int64, float32[::1], float32[::1])")
 def _histogram(found, top, left, roots, features):
     counts = np.zeros(len(features), np.int64)
     for y in range(top, top + _COUNTED):
@@ -99,10 +103,7 @@ def _histogram(found, top, left, roots, features):
         features[shade] = roots[counts[shade]]
 
 
-_READ = numba.types.Array(numba.float32, 1, "C", readonly=True)  # weights that came over the wire cannot be written
-
-
-@numba.njit(numba.void(numba.uint16[:, :], _READ, _READ, numba.float32[:, ::1]), cache=True, nogil=True)
+@kernel("void(uint16[:,::1], float32[::1], float32[::1], float32[:,::1])")
 def _add_scores(found, weights, steps, scores):
     counts = np.empty(len(weights), np.int64)
     for row in range(scores.shape[0]):

@@ -80,7 +80,7 @@ class Detector:
             For a box that is not in the frame, has no area, is not a number, or looks like what is around it.
             Nothing is forgotten then.
         """
-        frame = Pyramid(image)
+        frame = Pyramid.of(image)
         # The window is wider than the object: the edge of an object tells most about where it is.
         box = Box(*map(float, box)).inside(*frame.size)
         window, scm = box.scaled(self.settings.context), None
@@ -129,7 +129,7 @@ class Detector:
         BoxError
             As `init` does.
         """
-        frame = Pyramid(image)
+        frame = Pyramid.of(image)
         self._box = self._sure_box = Box(*map(float, box)).inside(*frame.size).scaled(self.settings.context)
         self.seq, self.state = self.seq + 1, "present"
         self._elsewhere, self._first_box = False, self._first_box or self._box
@@ -191,7 +191,7 @@ class Detector:
         self.seq += 1
         if self._centre is not None:
             self._box = self._box.centred(*self._centre.predict())
-        frame = Pyramid(image)
+        frame = Pyramid.of(image)
         if self._scm is not None:
             found = self._scm.step(image)  # it has no word for absent
             self._box = found.box.scaled(settings.context).held_in(*frame.size)

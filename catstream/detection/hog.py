@@ -5,21 +5,16 @@ orientations, 4 texture energies; Felzenszwalb et al. 2010), of the colour
 channel with the strongest gradient, then its mean colour in Lab.
 A window of 64 x 64 pixels is 8 x 8 cells.
 
-The kernel makes one pass over the pixels: magnitude and orientation of a
-gradient come from tables, indexed by its two differences. It is compiled once
-and kept in a cache folder, so that a second start needs no compiler.
+The kernel goes line by line: what a line's pixels do is written so that the
+compiler does eight of them at once, and only counting them is one by one.
 """
 
 from __future__ import annotations
 
-import getpass
-import os
-import tempfile
-from pathlib import Path
-
 import cv2
-import numba
 import numpy as np
+
+from catstream.detection.compiled import kernel
 
 __all__ = ["CELL", "CHANNELS", "MARGIN", "WINDOW", "grid"]
 
@@ -29,13 +24,21 @@ CHANNELS = 34  #: numbers a cell: 31 HOG, 3 colour
 MARGIN = 2  #: cells around a crop beyond which no pixel changes a feature
 
 _ORIENTATIONS = 9
-_CLIP = 0.2  # a normalised bin is cut here (Dalal and Triggs 2005)
+_SIGNED = 2 * _ORIENTATIONS
+_CLIP = np.float32(0.2)  # a normalised bin is cut here (Dalal and Triggs 2005)
+_TEXTURE = np.float32(0.2357)  # 1 / sqrt(18), as published
 _COLOUR_WEIGHT = 1.5
 _LAB_MIDDLE = np.array([128.0, 128.0, 128.0], np.float32)
 _LAB_SCALE = np.array([1.0, 3.0, 3.0], np.float32) * np.float32(_COLOUR_WEIGHT / 255)
+#: Orientations are 20 degrees apart: the tangents of where one ends and the next begins, from 0 to 90.
+_TAN_10, _TAN_30, _TAN_50, _TAN_70 = np.tan(np.deg2rad([10, 30, 50, 70])).astype(np.float32)
+#: For each pixel of a cell: its share in the cell itself; the rest goes to the neighbour on its side.
+_SHARES = (1 - np.abs((np.arange(CELL) + 0.5) / CELL - 0.5)).astype(np.float32)
+
+float32 = np.float32
 
 
-def grid(image: np.ndarray) -> np.ndarray:
+def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
     """Features of every whole cell of an image.
 
     A cell's features depend on pixels up to `MARGIN` cells away: the grid of a
@@ -43,136 +46,165 @@ def grid(image: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    image : uint8 (h, w, 3) BGR, or (h, w) grey
+    image : uint8 (h, w, 3) BGR
+    margin : cells along each edge that are left out
 
     Returns
     -------
-    float32 (h // 8, w // 8, 34)
+    float32 (h // 8 - 2 margin, w // 8 - 2 margin, 34)
 
     >>> grid(np.zeros((64, 96, 3), np.uint8)).shape
     (8, 12, 34)
     """
-    if image.ndim == 2:
-        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     rows, columns = image.shape[0] // CELL, image.shape[1] // CELL
-    image = np.ascontiguousarray(image[: rows * CELL, : columns * CELL])
-    cells = np.empty((rows, columns, CHANNELS), np.float32)
+    histogram = np.zeros((rows + 2, (columns + 2) * _SIGNED), np.float32)
+    colour = np.empty((rows, columns, 3), np.uint8)
+    cells = np.empty((max(rows - 2 * margin, 0), max(columns - 2 * margin, 0), CHANNELS), np.float32)
     if cells.size:
-        _hog(image, _MAGNITUDE, _ORIENTATION, _SHARES, cells)
+        _count(*cv2.split(image), _SHARES, histogram, colour)
+        _normalise(histogram, margin, cells)
         # The mean colour, converted, costs a tenth of the converted colours' mean and differs by little.
-        colour = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA).reshape(rows, columns, 3)
-        cells[:, :, 31:] = (cv2.cvtColor(colour, cv2.COLOR_BGR2LAB) - _LAB_MIDDLE) * _LAB_SCALE
+        lab = cv2.cvtColor(colour, cv2.COLOR_BGR2LAB)[margin : rows - margin, margin : columns - margin]
+        cells[:, :, 31:] = (lab - _LAB_MIDDLE) * _LAB_SCALE
     return cells
 
 
-def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Magnitude and signed orientation (0 ... 17) of every pair of differences, dy first."""
-    difference = np.arange(-255, 256, dtype=np.float32)
-    dy, dx = np.meshgrid(difference, difference, indexing="ij")
-    turn = np.arctan2(dy, dx) / (2 * np.pi)
-    orientation = np.rint(turn * 2 * _ORIENTATIONS).astype(np.int64) % (2 * _ORIENTATIONS)
-    return np.hypot(dy, dx), orientation.astype(np.uint8)
+@kernel("void(uint8[::1], float32[::1])")
+def _read(row, line):
+    """One row of a channel, each pixel at the edge twice."""
+    width = len(row)
+    for x in range(width):
+        line[x + 1] = row[x]
+    line[0], line[width + 1] = row[0], row[width - 1]
 
 
-def _cache_folder() -> str:
-    """Where compiled kernels are kept: beside the code only if that can be written."""
-    beside = Path(__file__).parent
-    if os.access(beside, os.W_OK):
-        return str(beside / "__pycache__")
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
-    for folder in (Path(home) / "catstream", Path(tempfile.gettempdir()) / f"catstream-{getpass.getuser()}"):
-        try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        except OSError:
+@kernel("void(float32[:,::1], float32[:,::1], float32[:,::1], float32[::1], float32[::1], float32[::1])")
+def _gradients(above, here, below, across, down, magnitude):
+    """The strongest channel's gradient at each pixel of a row."""
+    blue, green, red = here[0], here[1], here[2]
+    blue_above, green_above, red_above = above[0], above[1], above[2]
+    blue_below, green_below, red_below = below[0], below[1], below[2]
+    for x in range(len(magnitude)):
+        dx, dy = blue[x + 2] - blue[x], blue_below[x + 1] - blue_above[x + 1]
+        most = dx * dx + dy * dy
+        other_x, other_y = green[x + 2] - green[x], green_below[x + 1] - green_above[x + 1]
+        strength = other_x * other_x + other_y * other_y
+        if strength > most:
+            most, dx, dy = strength, other_x, other_y
+        other_x, other_y = red[x + 2] - red[x], red_below[x + 1] - red_above[x + 1]
+        strength = other_x * other_x + other_y * other_y
+        if strength > most:
+            most, dx, dy = strength, other_x, other_y
+        across[x], down[x] = dx, dy
+        magnitude[x] = np.sqrt(most)
+
+
+@kernel("void(float32[::1], float32[::1], uint8[::1])")
+def _orientations(across, down, orientation):
+    """Which of 18 directions, 0 ... 17, each gradient points to."""
+    for x in range(len(orientation)):
+        dx, dy = across[x], down[x]
+        flat, steep = abs(dx), abs(dy)
+        o = float32(steep > flat * _TAN_10) + float32(steep > flat * _TAN_30)
+        o += float32(steep > flat * _TAN_50) + float32(steep > flat * _TAN_70)
+        o = float32(_ORIENTATIONS) - o if dx < float32(0) else o
+        o = float32(_SIGNED) - o if dy < float32(0) else o
+        orientation[x] = np.uint8(float32(0) if o == float32(_SIGNED) else o)
+
+
+@kernel("void(uint8[:,::1], uint8[:,::1], uint8[:,::1], float32[::1], float32[:,::1], uint8[:,:,::1])")
+def _count(blue, green, red, shares, histogram, colour):
+    """Histograms of the cells, with one cell more on every side, which takes what falls outside; and mean colours."""
+    rows, columns = colour.shape[:2]
+    height, width = rows * CELL, columns * CELL
+    lines = np.empty((3, 3, width + 2), np.float32)  # three channels of the rows above, here and below, in turns
+    sums = np.zeros((3, width), np.float32)
+    across, down = np.empty(width, np.float32), np.empty(width, np.float32)
+    magnitude = np.empty(width, np.float32)
+    orientation = np.empty(width, np.uint8)
+    # Neighbours often have the same orientation, and adding to what was just added to is slow: they take turns.
+    even, odd = np.empty(histogram.shape[1], np.float32), np.empty(histogram.shape[1], np.float32)
+    for y in range(-2, height):
+        below, at = lines[(y + 1) % 3], min(max(y + 1, 0), height - 1)
+        _read(blue[at, :width], below[0])
+        _read(green[at, :width], below[1])
+        _read(red[at, :width], below[2])
+        if y < 0:
             continue
-        if os.access(folder, os.W_OK):
-            return str(folder)
-    return str(beside / "__pycache__")
+        here = lines[y % 3]
+        _gradients(lines[(y - 1) % 3], here, below, across, down, magnitude)
+        _orientations(across, down, orientation)
+        for i in range(len(even)):
+            even[i] = odd[i] = 0
+        for column in range(columns):
+            for i in range(CELL):
+                x = column * CELL + i
+                own = (column + 1) * _SIGNED
+                other = own - _SIGNED if i < CELL // 2 else own + _SIGNED
+                near = magnitude[x] * shares[i]
+                line = odd if i % 2 else even
+                line[own + orientation[x]] += near
+                line[other + orientation[x]] += magnitude[x] - near
+        share = shares[y % CELL]
+        row = histogram[y // CELL + 1]
+        other_row = histogram[y // CELL if y % CELL < CELL // 2 else y // CELL + 2]
+        for i in range(len(row)):
+            row[i] += share * (even[i] + odd[i])
+            other_row[i] += (float32(1) - share) * (even[i] + odd[i])
+        for channel in range(3):
+            for x in range(width):
+                sums[channel, x] += here[channel, x + 1]
+        if y % CELL == CELL - 1:
+            for column in range(columns):
+                for channel in range(3):
+                    total = float32(0)
+                    for x in range(column * CELL, (column + 1) * CELL):
+                        total += sums[channel, x]
+                        sums[channel, x] = 0
+                    colour[y // CELL, column, channel] = np.uint8(total / float32(CELL * CELL) + float32(0.5))
 
 
-if not os.environ.get("NUMBA_CACHE_DIR"):
-    numba.config.CACHE_DIR = _cache_folder()  # type: ignore[attr-defined]
-
-_MAGNITUDE, _ORIENTATION = _tables()
-#: For each pixel of a cell: its share in the cell itself; the rest goes to the neighbour on its side.
-_SHARES = (1 - np.abs((np.arange(CELL) + 0.5) / CELL - 0.5)).astype(np.float32)
-
-
-@numba.njit(
-    "void(uint8[:,:,::1], float32[:,::1], uint8[:,::1], float32[::1], float32[:,:,::1])",
-    cache=True,
-    nogil=True,
-    fastmath=True,
-)
-def _hog(image, magnitudes, orientations, shares, cells):
-    height, width = image.shape[:2]
-    rows, columns = height // CELL, width // CELL
-    # One cell more on every side takes the shares that fall outside.
-    histogram = np.zeros((rows + 2, columns + 2, 2 * _ORIENTATIONS), np.float32)
-    for y in range(height):
-        above, below = max(y - 1, 0), min(y + 1, height - 1)
-        row = y // CELL + 1
-        other_row = row - 1 if y % CELL < CELL // 2 else row + 1
-        share_y = shares[y % CELL]
-        for x in range(width):
-            left, right = max(x - 1, 0), min(x + 1, width - 1)
-            best_x = np.int32(0)
-            best_y = np.int32(0)
-            best = np.int32(-1)
-            for channel in range(3):
-                dx = np.int32(image[y, right, channel]) - np.int32(image[y, left, channel])
-                dy = np.int32(image[below, x, channel]) - np.int32(image[above, x, channel])
-                strength = dx * dx + dy * dy
-                if strength > best:
-                    best, best_x, best_y = strength, dx, dy
-            magnitude = magnitudes[best_y + 255, best_x + 255]
-            orientation = orientations[best_y + 255, best_x + 255]
-            column = x // CELL + 1
-            other_column = column - 1 if x % CELL < CELL // 2 else column + 1
-            share_x = shares[x % CELL]
-            near, far = magnitude * share_y, magnitude * (np.float32(1) - share_y)
-            histogram[row, column, orientation] += near * share_x
-            histogram[row, other_column, orientation] += near * (np.float32(1) - share_x)
-            histogram[other_row, column, orientation] += far * share_x
-            histogram[other_row, other_column, orientation] += far * (np.float32(1) - share_x)
-
+@kernel("void(float32[:,::1], int64, float32[:,:,::1])")
+def _normalise(histogram, margin, cells):
+    """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in."""
+    rows, columns = histogram.shape[0] - 2, histogram.shape[1] // _SIGNED - 2
     energy = np.empty((rows, columns), np.float32)
     for row in range(rows):
         for column in range(columns):
-            total = np.float32(0)
+            bins = histogram[row + 1, (column + 1) * _SIGNED :]
+            total = float32(0)
             for o in range(_ORIENTATIONS):
-                both = histogram[row + 1, column + 1, o] + histogram[row + 1, column + 1, o + _ORIENTATIONS]
+                both = bins[o] + bins[o + _ORIENTATIONS]
                 total += both * both
             energy[row, column] = total
 
-    clip = np.float32(_CLIP)
-    for row in range(rows):
+    half, small = float32(0.5), float32(1e-4)
+    for row in range(margin, rows - margin):
         up, down = max(row - 1, 0), min(row + 1, rows - 1)
-        for column in range(columns):
+        for column in range(margin, columns - margin):
             left, right = max(column - 1, 0), min(column + 1, columns - 1)
-            side_up = energy[up, column] + energy[row, column]
-            side_down = energy[down, column] + energy[row, column]
-            small = np.float32(1e-4)
-            a = np.float32(1) / np.sqrt(side_up + energy[up, left] + energy[row, left] + small)
-            b = np.float32(1) / np.sqrt(side_up + energy[up, right] + energy[row, right] + small)
-            c = np.float32(1) / np.sqrt(side_down + energy[down, left] + energy[row, left] + small)
-            d = np.float32(1) / np.sqrt(side_down + energy[down, right] + energy[row, right] + small)
-            texture_a = texture_b = texture_c = texture_d = np.float32(0)
-            for o in range(2 * _ORIENTATIONS):
-                value = histogram[row + 1, column + 1, o]
-                in_a, in_b = min(value * a, clip), min(value * b, clip)
-                in_c, in_d = min(value * c, clip), min(value * d, clip)
-                cells[row, column, o] = np.float32(0.5) * (in_a + in_b + in_c + in_d)
+            above = energy[up, column] + energy[row, column]
+            below = energy[down, column] + energy[row, column]
+            a = float32(1) / np.sqrt(above + energy[up, left] + energy[row, left] + small)
+            b = float32(1) / np.sqrt(above + energy[up, right] + energy[row, right] + small)
+            c = float32(1) / np.sqrt(below + energy[down, left] + energy[row, left] + small)
+            d = float32(1) / np.sqrt(below + energy[down, right] + energy[row, right] + small)
+            bins = histogram[row + 1, (column + 1) * _SIGNED :]
+            features = cells[row - margin, column - margin]
+            texture_a = texture_b = texture_c = texture_d = float32(0)
+            for o in range(_SIGNED):
+                in_a, in_b = min(bins[o] * a, _CLIP), min(bins[o] * b, _CLIP)
+                in_c, in_d = min(bins[o] * c, _CLIP), min(bins[o] * d, _CLIP)
+                features[o] = half * (in_a + in_b + in_c + in_d)
                 texture_a += in_a
                 texture_b += in_b
                 texture_c += in_c
                 texture_d += in_d
             for o in range(_ORIENTATIONS):
-                value = histogram[row + 1, column + 1, o] + histogram[row + 1, column + 1, o + _ORIENTATIONS]
-                total = min(value * a, clip) + min(value * b, clip) + min(value * c, clip) + min(value * d, clip)
-                cells[row, column, 2 * _ORIENTATIONS + o] = np.float32(0.5) * total
-            weight = np.float32(0.2357)  # 1 / sqrt(18), as published
-            cells[row, column, 27] = weight * texture_a
-            cells[row, column, 28] = weight * texture_b
-            cells[row, column, 29] = weight * texture_c
-            cells[row, column, 30] = weight * texture_d
+                both = bins[o] + bins[o + _ORIENTATIONS]
+                total = min(both * a, _CLIP) + min(both * b, _CLIP) + min(both * c, _CLIP) + min(both * d, _CLIP)
+                features[_SIGNED + o] = half * total
+            features[27] = _TEXTURE * texture_a
+            features[28] = _TEXTURE * texture_b
+            features[29] = _TEXTURE * texture_c
+            features[30] = _TEXTURE * texture_d

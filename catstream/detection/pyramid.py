@@ -1,9 +1,11 @@
-"""The pyramid of a frame: windows of a large object are cut from a smaller copy of it, which they share."""
+"""The pyramid of a frame: what is cut from it for a large object is cut from a smaller copy, which all cuts share."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
+
+from catstream.detection.compiled import kernel
 
 __all__ = ["Pyramid"]
 
@@ -13,12 +15,17 @@ class Pyramid:
 
     Parameters
     ----------
-    image : uint8 (h, w, 3) or (h, w)
+    image : uint8 (h, w, 3) BGR, or (h, w) grey, which cuts are then, too
     """
 
     def __init__(self, image: np.ndarray) -> None:
-        self.image = image
-        self._halves = [image]
+        self.image = np.ascontiguousarray(image)
+        self._halves = [self.image]
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> Pyramid:
+        """In colour, of a frame that may be grey."""
+        return cls(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -42,8 +49,66 @@ class Pyramid:
                 self._halves.append(_half(self._halves[-1]))
         return self._halves[level], 1 << level
 
+    def cut(self, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
+        """A square of `size` pixels, centred at (x, y); beyond the edge the last pixel is repeated.
+
+        Parameters
+        ----------
+        across, down : pixels of the frame a pixel of the cut is wide and high
+        turn : radians by which the cut is rotated in the frame
+
+        Returns
+        -------
+        uint8 (size, size, 3) or (size, size), as the frame
+        """
+        image, wide = self.near(min(across, down))
+        x, y, across, down = x / wide - 0.5, y / wide - 0.5, across / wide, down / wide
+        middle = (size - 1) / 2
+        if not turn:
+            found = np.empty((size, size, *image.shape[2:]), np.uint8)
+            corner = x - middle * across, y - middle * down
+            _sample(image.reshape(*image.shape[:2], -1), *corner, across, down, found.reshape(size, size, -1))
+            return found
+        cos, sin = np.cos(turn), np.sin(turn)
+        matrix = np.array([[across * cos, -down * sin, x], [across * sin, down * cos, y]])
+        matrix[:, 2] -= matrix[:, :2] @ np.full(2, middle)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
 
 def _half(image: np.ndarray) -> np.ndarray:
     """The mean of each 2 x 2 pixels."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     return cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+
+
+@kernel("void(uint8[:,:,::1], float64, float64, float64, float64, uint8[:,:,::1])")
+def _sample(image, left, top, across, down, found):
+    """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row."""
+    height, width, channels = image.shape
+    rows, columns = found.shape[0], found.shape[1] * channels
+    begin = min(max(int(np.floor(left)), 0), width - 1)
+    end = min(max(int(np.floor(left + (found.shape[1] - 1) * across)) + 2, begin + 1), width)
+    # Of each number of a row: where in the line the two pixels are that it lies between, and the second one's share.
+    first, second = np.empty(columns, np.uint32), np.empty(columns, np.uint32)
+    share = np.empty(columns, np.float32)
+    for i in range(columns):
+        x, channel = left + i // channels * across, i % channels
+        pixel = int(np.floor(x))
+        first[i] = (min(max(pixel, begin), end - 1) - begin) * channels + channel
+        second[i] = (min(max(pixel + 1, begin), end - 1) - begin) * channels + channel
+        share[i] = x - np.floor(x)
+    line = np.empty((end - begin) * channels, np.float32)
+    source, target = image.reshape(height, width * channels), found.reshape(rows, columns)
+    for row in range(rows):
+        y = top + row * down
+        pixel = int(np.floor(y))
+        above = source[min(max(pixel, 0), height - 1), begin * channels : end * channels]
+        below = source[min(max(pixel + 1, 0), height - 1), begin * channels : end * channels]
+        part = np.float32(y - np.floor(y))
+        for i in range(len(line)):
+            value = np.float32(above[i])
+            line[i] = value + part * (np.float32(below[i]) - value) + np.float32(0.5)  # half, to round
+        for i in range(columns):
+            value = line[first[i]]
+            target[row, i] = np.uint8(value + share[i] * (line[second[i]] - value))

@@ -16,14 +16,13 @@ import math
 import warnings
 
 import cv2
-import numba
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from catstream.box import Box
+from catstream.detection.compiled import kernel
 from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
-from catstream.detection.windows import cut
 
 __all__ = ["SparseCollaborativeModel"]
 
@@ -115,7 +114,7 @@ class SparseCollaborativeModel:
         across = self._first.w / _SIDE * np.exp(states[:, 2] + states[:, 3])
         down = self._first.h / _SIDE * np.exp(states[:, 2] - states[:, 3])
         places = zip(states[:, 0], states[:, 1], across, down, states[:, 4], strict=True)
-        return np.array([cut(grey, x, y, w, h, _SIDE, turn) for x, y, w, h, turn in places])
+        return np.array([grey.cut(x, y, w, h, _SIDE, turn) for x, y, w, h, turn in places])
 
 
 class _Discriminative:
@@ -224,7 +223,7 @@ def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
     return codes
 
 
-@numba.njit("void(float64[:,::1], float64[:,::1], float32[:,::1])", cache=True, nogil=True)
+@kernel("void(float64[:,::1], float64[:,::1], float32[:,::1])")
 def _solve(gains, gram, codes):
     """Active sets (Lawson and Hanson): the atom that gains most comes in, those that turn negative go.
 

@@ -16,7 +16,7 @@ from catstream.detection.cells import Cells
 from catstream.detection.hog import CELL, MARGIN, WINDOW
 from catstream.detection.pyramid import Pyramid
 
-__all__ = ["Scored", "around", "cut", "peaks", "vertex", "whole"]
+__all__ = ["Scored", "around", "peaks", "vertex", "whole"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,29 +60,8 @@ def around(frame: Pyramid, box: Box, cells: int) -> tuple[Cells, tuple[float, fl
     """
     step = box.w / WINDOW, box.h / WINDOW
     x, y = box.centre
-    patch = cut(frame, x, y, step[0] / CELL, step[1] / CELL, (cells + 2 * MARGIN) * CELL)
+    patch = frame.cut(x, y, step[0] / CELL, step[1] / CELL, (cells + 2 * MARGIN) * CELL)
     return Cells.within(patch), (x - cells / 2 * step[0], y - cells / 2 * step[1]), step
-
-
-def cut(frame: Pyramid, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
-    """A square of `size` pixels cut from a frame, centred at (x, y); beyond the edge the last pixel is repeated.
-
-    Parameters
-    ----------
-    across, down : pixels of the frame a pixel of the cut is wide and high
-    turn : radians by which the cut is rotated in the frame
-
-    Returns
-    -------
-    uint8 (size, size, 3) or (size, size), as the frame
-    """
-    image, wide = frame.near(min(across, down))
-    x, y, across, down = x / wide, y / wide, across / wide, down / wide
-    cos, sin = np.cos(turn), np.sin(turn)
-    matrix = np.array([[across * cos, -down * sin, 0.0], [across * sin, down * cos, 0.0]])
-    matrix[:, 2] = np.array([x, y]) - 0.5 - matrix[:, :2] @ np.full(2, (size - 1) / 2)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
 def whole(frame: Pyramid, box: Box) -> tuple[Cells, tuple[float, float], tuple[float, float]]:

@@ -17,7 +17,7 @@ def image(rng):
 
 
 def copies(image, box, count, seed=0, **how):
-    return affine.copies(Pyramid(image), box, count, np.random.default_rng(seed), **how)
+    return affine.copies(Pyramid.of(image), box, count, np.random.default_rng(seed), **how)
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.5])

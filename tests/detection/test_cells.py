@@ -26,12 +26,6 @@ def test_a_row_is_the_windows_cells_and_then_its_colours(cells):
     assert np.linalg.norm(row[COLOURS]) == pytest.approx(3, abs=1e-5)
 
 
-def test_a_grey_image_has_the_cells_of_its_three_equal_channels(rng):
-    grey = rng.integers(0, 256, (64, 80), np.uint8)
-    ours, theirs = Cells.of(grey), Cells.of(np.repeat(grey[:, :, None], 3, axis=2))
-    np.testing.assert_array_equal(ours.row(0, 1), theirs.row(0, 1))
-
-
 def test_cells_within_a_margin_are_those_of_the_larger_image(rng):
     image = rng.integers(0, 256, (128, 160, 3), np.uint8)
     whole, inner = Cells.of(image), Cells.within(image[16:112, 24:120])

@@ -1,9 +1,15 @@
 """The pyramid of a frame."""
 
+import cv2
 import numpy as np
 import pytest
 
 from catstream.detection.pyramid import Pyramid
+
+
+@pytest.fixture
+def image(rng):
+    return rng.integers(0, 256, (200, 240, 3), np.uint8)
 
 
 @pytest.mark.parametrize(("scale", "wide"), [(0.3, 1), (1.99, 1), (2.0, 2), (3.9, 2), (4.0, 4), (9.0, 8)])
@@ -31,3 +37,46 @@ def test_a_tiny_frame_is_never_halved_away(rng, shape):
     image, wide = Pyramid(rng.integers(0, 256, shape, np.uint8)).near(1000)
     assert min(image.shape) == 1
     assert wide <= max(shape)
+
+
+def test_a_grey_frame_in_colour_has_three_equal_channels(image):
+    grey = image[:, :, 0]
+    np.testing.assert_array_equal(Pyramid.of(grey).image, np.repeat(grey[:, :, None], 3, axis=2))
+    assert Pyramid.of(image).image is image
+
+
+def test_a_cut_at_its_own_scale_is_a_slice(image):
+    np.testing.assert_array_equal(Pyramid(image).cut(100, 80, 1, 1, 64), image[48:112, 68:132])
+
+
+def test_a_cut_beyond_the_edge_repeats_the_last_pixel(image):
+    patch = Pyramid(image).cut(0, 100, 1, 1, 64)
+    np.testing.assert_array_equal(patch[:, :32], np.repeat(patch[:, 32:33], 32, axis=1))
+
+
+@pytest.mark.parametrize("zoom", [0.5, 1.7, 3.0, 7.5])
+def test_a_cut_shows_the_same_place_at_every_scale(zoom):
+    ramp = np.add.outer(np.arange(600), np.arange(800)).astype(np.float32)
+    image = (ramp / ramp.max() * 255).astype(np.uint8)
+    patch = Pyramid(image).cut(400, 300, zoom, zoom, 64).astype(float)
+    expected = (700 + np.add.outer(np.arange(64) - 31.5, np.arange(64) - 31.5) * zoom - 1) / ramp.max() * 255
+    inside = (expected > 3) & (expected < 250)
+    assert np.abs(patch - expected)[inside].max() < 2.5
+
+
+@pytest.mark.parametrize("x", [-500.0, 0.0, 239.0, 5000.0])
+def test_a_cut_far_outside_is_still_an_image(image, x):
+    assert Pyramid(image).cut(x, x, 4.2, 3.1, 96).shape == (96, 96, 3)
+
+
+@pytest.mark.parametrize("turn", [0, 1e-12], ids=["straight", "turned"])
+@pytest.mark.parametrize("grey", [False, True], ids=["colour", "grey"])
+@pytest.mark.parametrize(("x", "y"), [(100.3, 80.9), (2.2, 199.6), (-70, 301.7)], ids=["inside", "edge", "beyond"])
+def test_a_cut_lies_between_the_pixels(image, x, y, grey, turn):
+    image = cv2.GaussianBlur(image[:, :, 0] if grey else image, (0, 0), 1)
+    patch = Pyramid(image).cut(x, y, 0.7, 1.3, 48, turn)
+    columns, rows = (at - 0.5 + (np.arange(48) - 23.5) * step for at, step in ((x, 0.7), (y, 1.3)))
+    where = np.broadcast_arrays(columns[None], rows[:, None])
+    expected = cv2.remap(image.astype(np.float32), *np.float32(where), cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    assert np.abs(patch - expected).max() < 3, "OpenCV knows 32 places between two pixels"
+    assert np.abs(patch - expected).mean() < 0.5

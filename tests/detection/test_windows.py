@@ -16,30 +16,6 @@ def image(rng):
     return rng.integers(0, 256, (200, 240, 3), np.uint8)
 
 
-def test_a_cut_at_its_own_scale_is_a_slice(image):
-    np.testing.assert_array_equal(windows.cut(Pyramid(image), 100, 80, 1, 1, 64), image[48:112, 68:132])
-
-
-def test_a_cut_beyond_the_edge_repeats_the_last_pixel(image):
-    patch = windows.cut(Pyramid(image), 0, 100, 1, 1, 64)
-    np.testing.assert_array_equal(patch[:, :32], np.repeat(patch[:, 32:33], 32, axis=1))
-
-
-@pytest.mark.parametrize("zoom", [0.5, 1.7, 3.0, 7.5])
-def test_a_cut_shows_the_same_place_at_every_scale(zoom):
-    ramp = np.add.outer(np.arange(600), np.arange(800)).astype(np.float32)
-    image = (ramp / ramp.max() * 255).astype(np.uint8)
-    patch = windows.cut(Pyramid(image), 400, 300, zoom, zoom, 64).astype(float)
-    expected = (700 + np.add.outer(np.arange(64) - 31.5, np.arange(64) - 31.5) * zoom - 1) / ramp.max() * 255
-    inside = (expected > 3) & (expected < 250)
-    assert np.abs(patch - expected)[inside].max() < 2.5
-
-
-@pytest.mark.parametrize("x", [-500.0, 0.0, 239.0, 5000.0])
-def test_a_cut_far_outside_is_still_an_image(image, x):
-    assert windows.cut(Pyramid(image), x, x, 4.2, 3.1, 96).shape == (96, 96, 3)
-
-
 def test_cells_around_a_box_are_those_of_the_frame(image):
     cells, origin, step = windows.around(Pyramid(image), Box(64, 48, 64, 64), 12)
     frames = Cells.of(image)
