@@ -155,7 +155,7 @@ class Settings:
     ] = 0.65
     sure_score: Annotated[float, _about("Score below which the whole frame is searched now and then.")] = 0.55
     lost_score: Annotated[float, _about("Score below which the whole frame is searched in every frame.")] = 0.3
-    jump_margin: Annotated[float, _about("Score by which a window elsewhere must be better than the one near.")] = 0.1
+    jump_margin: Annotated[float, _about("Score by which a window elsewhere must be better than the one near.")] = 0.4
     trust_score: Annotated[
         float, _about("Score from which on a window found elsewhere teaches, and the whole frame is searched no more.")
     ] = 0.75
