@@ -36,8 +36,8 @@ class Lesson:
     fits: np.ndarray
 
     @classmethod
-    def of(cls, rows: list[np.ndarray], label: float, weight: float = 1.0) -> Lesson:
-        """Rows of one kind."""
+    def of(cls, rows: list[np.ndarray], label: float | list[float], weight: float = 1.0) -> Lesson:
+        """Rows of one weight, with one label or each its own."""
         k = len(rows)
         none = np.empty(0, np.float32)
         return cls(_array(rows), np.full(k, label, np.float32), np.full(k, weight, np.float32), _array([]), none)
@@ -102,12 +102,12 @@ def _around(
 ) -> Lesson:
     """Near misses, and background: with a model half of it the highest scoring windows, the rest anywhere."""
     cells, _, _ = windows.around(frame, box, _CELLS)
-    lesson = Lesson.none()
+    misses, labels = [], []
     for down, across in rng.integers(-_NEAR, _NEAR + 1, size=(settings.near_misses, 2)):
         distance = down * down + across * across
         if distance:
-            label = float(np.exp(-distance / (2 * settings.near_sigma**2)))
-            lesson += Lesson.of([cells.row(_MIDDLE + down, _MIDDLE + across)], label)
+            misses.append(cells.row(_MIDDLE + down, _MIDDLE + across))
+            labels.append(float(np.exp(-distance / (2 * settings.near_sigma**2))))
     outside = np.ones((_CELLS - WINDOW + 1,) * 2, bool)
     outside[_MIDDLE - _NEAR : _MIDDLE + _NEAR + 1, _MIDDLE - _NEAR : _MIDDLE + _NEAR + 1] = False
     places = []
@@ -117,4 +117,4 @@ def _around(
     anywhere = np.argwhere(outside)
     more = rng.choice(anywhere, negatives - len(places), replace=negatives > len(anywhere))
     places += [(row, column) for row, column in more]
-    return lesson + Lesson.of([cells.row(*place) for place in places], 0)
+    return Lesson.of(misses, labels) + Lesson.of([cells.row(*place) for place in places], 0)
