@@ -25,6 +25,7 @@ $(READY): requirements.lock pyproject.toml
 	test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	$(BIN)/python -c 'import catstream.detection.detector'  # compiles the kernels: the first start need not
 	@touch $@
 
 demo: $(READY)  ## render a video, follow the object in it, say how well that went

@@ -14,6 +14,7 @@ import psutil
 
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
+from catstream.video.source import WHOLE
 
 __all__ = ["Journey", "draw", "travel"]
 
@@ -58,10 +59,10 @@ class Journey:
         return frames[1:], np.diff(seconds) / np.diff(frames) * 1000
 
 
-def travel(source: str, box: Sequence[float], settings: Settings, watch: int = 250) -> Journey:
-    """Run a pipeline to the end of its source; look at the processes each `watch` frames."""
+def travel(source: str, box: Sequence[float], settings: Settings, watch: int = 250, part: slice = WHOLE) -> Journey:
+    """Run a pipeline to the end of its source, or a part of it; look at the processes each `watch` frames."""
     journey, begin = Journey(), perf_counter()
-    with Pipeline(source, box, settings) as pipeline:
+    with Pipeline(source, box, settings, part=part) as pipeline:
         for track in pipeline:
             journey.moments.append(perf_counter() - begin)
             journey.boxes.append(track.box or (np.nan,) * 4)

@@ -95,7 +95,9 @@ def _look_up(image, table, found):
 
 @kernel("void(uint16[:,::1], int64, int64, float32[::1], float32[::1])")
 def _histogram(found, top, left, roots, features):
-    counts = np.zeros(len(features), np.int64)
+    counts = np.empty(len(features), np.int64)
+    for shade in range(len(counts)):
+        counts[shade] = 0
     for y in range(top, top + _COUNTED):
         for x in range(left, left + _COUNTED):
             counts[found[y, x]] += 1
@@ -107,7 +109,8 @@ def _histogram(found, top, left, roots, features):
 def _add_scores(found, weights, steps, scores):
     counts = np.empty(len(weights), np.int64)
     for row in range(scores.shape[0]):
-        counts[:] = 0
+        for shade in range(len(counts)):
+            counts[shade] = 0
         total = 0.0
         for y in range(row * SIDE + _EDGE, row * SIDE + _EDGE + _COUNTED):
             for x in range(_EDGE, _EDGE + _COUNTED):

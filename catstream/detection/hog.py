@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy import float32
 
 from catstream.detection.compiled import kernel
 
@@ -34,8 +35,6 @@ _LAB_SCALE = np.array([1.0, 3.0, 3.0], np.float32) * np.float32(_COLOUR_WEIGHT /
 _TAN_10, _TAN_30, _TAN_50, _TAN_70 = np.tan(np.deg2rad([10, 30, 50, 70])).astype(np.float32)
 #: For each pixel of a cell: its share in the cell itself; the rest goes to the neighbour on its side.
 _SHARES = (1 - np.abs((np.arange(CELL) + 0.5) / CELL - 0.5)).astype(np.float32)
-
-float32 = np.float32
 
 
 def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
@@ -61,8 +60,11 @@ def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
     colour = np.empty((rows, columns, 3), np.uint8)
     cells = np.empty((max(rows - 2 * margin, 0), max(columns - 2 * margin, 0), CHANNELS), np.float32)
     if cells.size:
-        _count(*cv2.split(image), _SHARES, histogram, colour)
+        channels = cv2.split(image)
+        _count(*channels, _SHARES, histogram)
         _normalise(histogram, margin, cells)
+        for i, channel in enumerate(channels):
+            _average(channel, colour[:, :, i])
         # The mean colour, converted, costs a tenth of the converted colours' mean and differs by little.
         lab = cv2.cvtColor(colour, cv2.COLOR_BGR2LAB)[margin : rows - margin, margin : columns - margin]
         cells[:, :, 31:] = (lab - _LAB_MIDDLE) * _LAB_SCALE
@@ -112,13 +114,12 @@ def _orientations(across, down, orientation):
         orientation[x] = np.uint8(float32(0) if o == float32(_SIGNED) else o)
 
 
-@kernel("void(uint8[:,::1], uint8[:,::1], uint8[:,::1], float32[::1], float32[:,::1], uint8[:,:,::1])")
-def _count(blue, green, red, shares, histogram, colour):
-    """Histograms of the cells, with one cell more on every side, which takes what falls outside; and mean colours."""
-    rows, columns = colour.shape[:2]
-    height, width = rows * CELL, columns * CELL
+@kernel("void(uint8[:,::1], uint8[:,::1], uint8[:,::1], float32[::1], float32[:,::1])")
+def _count(blue, green, red, shares, histogram):
+    """Histograms of the cells, with one cell more on every side, which takes what falls outside."""
+    columns = histogram.shape[1] // _SIGNED - 2
+    height, width = (histogram.shape[0] - 2) * CELL, columns * CELL
     lines = np.empty((3, 3, width + 2), np.float32)  # three channels of the rows above, here and below, in turns
-    sums = np.zeros((3, width), np.float32)
     across, down = np.empty(width, np.float32), np.empty(width, np.float32)
     magnitude = np.empty(width, np.float32)
     orientation = np.empty(width, np.uint8)
@@ -151,17 +152,18 @@ def _count(blue, green, red, shares, histogram, colour):
         for i in range(len(row)):
             row[i] += share * (even[i] + odd[i])
             other_row[i] += (float32(1) - share) * (even[i] + odd[i])
-        for channel in range(3):
-            for x in range(width):
-                sums[channel, x] += here[channel, x + 1]
-        if y % CELL == CELL - 1:
-            for column in range(columns):
-                for channel in range(3):
-                    total = float32(0)
-                    for x in range(column * CELL, (column + 1) * CELL):
-                        total += sums[channel, x]
-                        sums[channel, x] = 0
-                    colour[y // CELL, column, channel] = np.uint8(total / float32(CELL * CELL) + float32(0.5))
+
+
+@kernel("void(uint8[:,::1], uint8[:,:])")
+def _average(channel, means):
+    """The mean of each cell's pixels."""
+    for row in range(means.shape[0]):
+        for column in range(means.shape[1]):
+            total = CELL * CELL // 2  # half, to round
+            for y in range(row * CELL, (row + 1) * CELL):
+                for x in range(column * CELL, (column + 1) * CELL):
+                    total += channel[y, x]
+            means[row, column] = total // (CELL * CELL)
 
 
 @kernel("void(float32[:,::1], int64, float32[:,:,::1])")

@@ -67,7 +67,8 @@ class Pyramid:
         if not turn:
             found = np.empty((size, size, *image.shape[2:]), np.uint8)
             corner = x - middle * across, y - middle * down
-            _sample(image.reshape(*image.shape[:2], -1), *corner, across, down, found.reshape(size, size, -1))
+            channels = found.size // size**2
+            _sample(image.reshape(len(image), -1), channels, *corner, across, down, found.reshape(size, -1))
             return found
         cos, sin = np.cos(turn), np.sin(turn)
         matrix = np.array([[across * cos, -down * sin, x], [across * sin, down * cos, y]])
@@ -82,13 +83,13 @@ def _half(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
 
 
-@kernel("void(uint8[:,:,::1], float64, float64, float64, float64, uint8[:,:,::1])")
-def _sample(image, left, top, across, down, found):
+@kernel("void(uint8[:,::1], int64, float64, float64, float64, float64, uint8[:,::1])")
+def _sample(image, channels, left, top, across, down, found):
     """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row."""
-    height, width, channels = image.shape
-    rows, columns = found.shape[0], found.shape[1] * channels
+    rows, columns = found.shape
+    height, width = image.shape[0], image.shape[1] // channels
     begin = min(max(int(np.floor(left)), 0), width - 1)
-    end = min(max(int(np.floor(left + (found.shape[1] - 1) * across)) + 2, begin + 1), width)
+    end = min(max(int(np.floor(left + (columns // channels - 1) * across)) + 2, begin + 1), width)
     # Of each number of a row: where in the line the two pixels are that it lies between, and the second one's share.
     first, second = np.empty(columns, np.uint32), np.empty(columns, np.uint32)
     share = np.empty(columns, np.float32)
@@ -99,16 +100,15 @@ def _sample(image, left, top, across, down, found):
         second[i] = (min(max(pixel + 1, begin), end - 1) - begin) * channels + channel
         share[i] = x - np.floor(x)
     line = np.empty((end - begin) * channels, np.float32)
-    source, target = image.reshape(height, width * channels), found.reshape(rows, columns)
     for row in range(rows):
         y = top + row * down
         pixel = int(np.floor(y))
-        above = source[min(max(pixel, 0), height - 1), begin * channels : end * channels]
-        below = source[min(max(pixel + 1, 0), height - 1), begin * channels : end * channels]
+        above = image[min(max(pixel, 0), height - 1), begin * channels : end * channels]
+        below = image[min(max(pixel + 1, 0), height - 1), begin * channels : end * channels]
         part = np.float32(y - np.floor(y))
         for i in range(len(line)):
             value = np.float32(above[i])
             line[i] = value + part * (np.float32(below[i]) - value) + np.float32(0.5)  # half, to round
         for i in range(columns):
             value = line[first[i]]
-            target[row, i] = np.uint8(value + share[i] * (line[second[i]] - value))
+            found[row, i] = np.uint8(value + share[i] * (line[second[i]] - value))
