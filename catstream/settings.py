@@ -299,6 +299,7 @@ _PAPER = {
     "mirrored": 0,
     "present_share": 0.0,
     "return_share": 0.0,
+    "trust_score": 0.0,
 }
 
 #: What the paper set, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.

@@ -226,13 +226,17 @@ class Detector:
 
     def _find(self, frame: Pyramid) -> Found:
         settings = self.settings
+        surely = self._sure_box.centred(*self._box.centre)  # as large as it surely was
         if settings.detection == "full":
-            return self._fitted(frame, search.whole(frame, self._box, self.model, settings))
+            doubtful = self._elsewhere or self.state == "absent"
+            found = self._fitted(frame, search.whole(frame, surely if doubtful else self._box, self.model, settings))
+            self._elsewhere |= not found.box.overlap(self._box)
+            return found
         found = self._fitted(frame, search.local(frame, self._box, self.model, settings))
         lost = found.score < settings.lost_score
         unsure = found.score < settings.sure_score or self._elsewhere
         if lost or (unsure and self.seq % settings.whole_frames == 0):
-            other = search.whole(frame, self._sure_box.centred(*self._box.centre), self.model, settings)
+            other = search.whole(frame, surely, self.model, settings)
             if other.score > settings.return_score and other.score > found.score + settings.jump_margin:
                 other = self._fitted(frame, search.local(frame, other.box, self.model, settings))
                 if other.score > found.score:

@@ -108,9 +108,10 @@ def test_an_object_that_comes_back_elsewhere_is_found_in_the_whole_frame(scene):
     assert track.box.overlap(Box(250, 180, 48, 40)) > 0.6
 
 
+@pytest.mark.parametrize("detection", ["local", "full"])
 @pytest.mark.parametrize(("trust", "teaches"), [(0.0, True), (10.0, False)])
-def test_what_is_found_elsewhere_teaches_only_once_it_is_trusted(scene, trust, teaches):
-    detector = started(scene, trust_score=trust)
+def test_what_is_found_elsewhere_teaches_only_once_it_is_trusted(scene, trust, teaches, detection):
+    detector = started(scene, trust_score=trust, detection=detection)
     detector.step(scene())
     _, features = detector.step(scene((250, 180)))
     assert features.box.overlap(Box(250, 180, 48, 40)) > 0.6
