@@ -162,6 +162,8 @@ class Broadcast:
 class _Viewer(BaseHTTPRequestHandler):
     """One connection."""
 
+    disable_nagle_algorithm = True  # or the end of a frame waits for a delayed acknowledgement: 40 ms
+
     def __init__(self, broadcast: Broadcast, *arguments: Any) -> None:
         self._broadcast = broadcast
         super().__init__(*arguments)
