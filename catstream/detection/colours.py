@@ -18,7 +18,7 @@ from catstream.detection.hog import CELL, WINDOW
 
 __all__ = ["SHADES", "add_scores", "histogram", "shades"]
 
-_SIDE = CELL // 2  #: shades a cell is wide and high
+_SIDE = CELL // 2  # shades a cell is wide and high
 _LIGHT, _CHROMA, _CHROMA_STEP = 8, 6, 10  # levels of lightness, of a and of b; Lab units from one of these to the next
 SHADES = _LIGHT * _CHROMA * _CHROMA  #: how many are told apart
 
