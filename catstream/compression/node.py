@@ -15,30 +15,36 @@ __all__ = ["Node"]
 class Node:
     """A coreset of `count` consecutive rows.
 
-    level    how often it was merged: 0 for a leaf; it stands for n * 2**level rows
-    rows     float32 (n, d), strongest direction first, orthogonal
-    count    rows it stands for
-    sum      float64 (d,), their exact sum
-    dropped  c of the paper: energy lost in all reductions below it, ||A||^2 = ||C||^2 + c
+    level   how often it was merged: 0 for a leaf; it stands for n * 2**level rows
+    rows    float32 (n, d): of a leaf as they came, else orthogonal, strongest direction first
+    count   rows it stands for
+    sum     float64 (d,), their exact sum
+    energy  ||A||^2 of all of them
     """
 
     level: int
     rows: np.ndarray
     count: int
     sum: np.ndarray
-    dropped: float
+    energy: float
 
     @classmethod
     def leaf(cls, rows: np.ndarray) -> Node:
-        """A node of level 0: the rows themselves, turned so that the strongest direction comes first."""
-        total = rows.sum(axis=0, dtype=np.float64)
-        turned = reduce(rows, len(rows), towards=total)
-        return cls(0, turned, len(rows), total, energy(rows) - energy(turned))
+        """A node of level 0: the rows themselves."""
+        return cls(0, rows, len(rows), rows.sum(axis=0, dtype=np.float64), energy(rows))
+
+    @property
+    def dropped(self) -> float:
+        """c of the paper: what all reductions below it lost, ||A||^2 = ||C||^2 + c."""
+        return self.energy - energy(self.rows)
+
+    def strongest(self, size: int) -> np.ndarray:
+        """Its `size` strongest directions, float32 (size, d)."""
+        # Most leaves are merged before anyone asks, which saves turning them.
+        return self.rows[:size] if self.level else reduce(self.rows, size, towards=self.sum)
 
     def merged(self, newer: Node) -> Node:
         """One node, a level up, for the rows of two of the same level."""
-        both = np.vstack([self.rows, newer.rows])
         total = self.sum + newer.sum
-        rows = reduce(both, len(self.rows), towards=total)
-        dropped = self.dropped + newer.dropped + energy(both) - energy(rows)
-        return Node(self.level + 1, rows, self.count + newer.count, total, dropped)
+        rows = reduce(np.vstack([self.rows, newer.rows]), len(self.rows), towards=total)
+        return Node(self.level + 1, rows, self.count + newer.count, total, self.energy + newer.energy)

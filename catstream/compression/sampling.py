@@ -44,10 +44,10 @@ def sample(nodes: Sequence[Node], size: int) -> np.ndarray:
     top = nodes[0].level
     parts = []
     for node in nodes:
-        rows = node.rows[: share(node.level, top, size)]
-        if not len(rows):
+        count = share(node.level, top, size)
+        if not count:
             break
-        parts.append(spread(rows) * np.float32(np.sqrt(len(rows) / node.count)))
+        parts.append(spread(node.strongest(count)) * np.float32(np.sqrt(count / node.count)))
     return np.vstack(parts)
 
 

@@ -68,9 +68,7 @@ class CoresetTree:
         kept = reduce(heavy, size, towards=summary.mean)
         rows = np.zeros((size, heavy.shape[1]), np.float32)
         rows[: len(kept)] = kept
-        tree.nodes.append(
-            Node(level, rows, count, summary.mean.astype(np.float64) * count, energy(heavy) - energy(kept))
-        )
+        tree.nodes.append(Node(level, rows, count, summary.mean.astype(np.float64) * count, energy(heavy)))
         tree.pending = np.empty((0, heavy.shape[1]), np.float32)
         return tree
 
@@ -115,7 +113,7 @@ class CoresetTree:
             return
         waiting = np.vstack([self.pending, rows]) if len(self.pending) else rows
         while len(waiting) >= self.size:
-            self._push(Node.leaf(waiting[: self.size]))
+            self._push(Node.leaf(waiting[: self.size].copy()))
             waiting = waiting[self.size :]
         self.pending = waiting.copy()
 
@@ -178,7 +176,7 @@ class CoresetTree:
         for i, node in enumerate(self.nodes):
             arrays[f"rows.{i}"] = node.rows
             arrays[f"sum.{i}"] = node.sum
-        nodes = [[node.level, node.count, node.dropped.hex()] for node in self.nodes]
+        nodes = [{"level": node.level, "count": node.count, "energy": node.energy.hex()} for node in self.nodes]
         return arrays, {"size": self.size, "nodes": nodes}
 
     @classmethod
@@ -186,10 +184,9 @@ class CoresetTree:
         """The tree whose `state` this is; ProtocolError where it is not one."""
         try:
             tree = cls(int(facts["size"]))  # type: ignore[call-overload]
-            nodes: list[tuple[int, int, str]] = facts["nodes"]  # type: ignore[assignment]
-            for i, (level, count, dropped) in enumerate(nodes):
-                rows, total = arrays[f"rows.{i}"], arrays[f"sum.{i}"]
-                tree.nodes.append(Node(int(level), rows, int(count), total, float.fromhex(dropped)))
+            for i, node in enumerate(facts["nodes"]):  # type: ignore[arg-type, var-annotated]
+                rows, total, whole = arrays[f"rows.{i}"], arrays[f"sum.{i}"], float.fromhex(node["energy"])
+                tree.nodes.append(Node(int(node["level"]), rows, int(node["count"]), total, whole))
             tree.pending = arrays["pending"]
             tree._check()
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -227,5 +224,5 @@ class CoresetTree:
                 raise ValueError(f"a node of {node.rows.dtype} {node.rows.shape}")
             if not 0 <= node.level < _LEVELS or node.count != self.size << node.level:
                 raise ValueError(f"a node of level {node.level} and {node.count} rows")
-            if not (np.isfinite(node.rows).all() and np.isfinite(node.sum).all() and np.isfinite(node.dropped)):
+            if not (np.isfinite(node.rows).all() and np.isfinite(node.sum).all() and np.isfinite(node.energy)):
                 raise ValueError(f"a node of level {node.level} with numbers that are not finite")

@@ -29,13 +29,14 @@ def test_a_sample_has_at_most_2n_rows(count, size):
     assert len(summary.rows) >= size or count < size
 
 
-def test_a_node_gives_its_first_n_rows_times_2_to_the_level_below_the_top(stream):
+def test_a_node_gives_its_strongest_n_rows_times_2_to_the_level_below_the_top(stream):
     tree = grown(stream)
     rows, start = sample(tree.nodes, SIZE), 0
     assert [node.level for node in tree.nodes] == [3, 2, 0]
     for node, taken in zip(tree.nodes, [16, 8, 2], strict=True):
         part = rows[start : start + taken].astype(np.float64)
-        first = node.rows[:taken].astype(np.float64) * np.sqrt(taken / node.count)
+        _, strengths, directions = np.linalg.svd(node.rows.astype(np.float64), full_matrices=False)
+        first = (strengths[:, None] * directions)[:taken] * np.sqrt(taken / node.count)
         # Equal up to a left rotation: the same distances to every subspace.
         assert_allclose(part.T @ part, first.T @ first, atol=1e-5 * np.sum(first**2))
         start += taken
