@@ -33,7 +33,6 @@ HOMES = {
     "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
     "cv2": ["catstream/detection", "catstream/video", "catstream/evaluation/peers.py", "services/__main__.py"],
     "numba": ["catstream/detection/compiled.py"],
-    "filterpy": ["catstream/training/motion_em.py"],
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
     "safetensors": ["catstream/storage.py"],
     "pyarrow": ["catstream/sinks/parquet.py"],
@@ -53,7 +52,7 @@ HOMES = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"sklearn", "filterpy", "av", "scipy", "pyarrow", "supervision"}
+SLOW = {"sklearn", "av", "scipy", "pyarrow", "supervision"}
 
 #: What a stage does not touch: it could run on a desert island.
 MAINLAND = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

@@ -69,17 +69,28 @@ def _start(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray, Motion]:
 def _smooth(
     centres: np.ndarray, mean: np.ndarray, covariance: np.ndarray, motion: Motion
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Expectation: states (m, 4) given all centres, their covariances (m, 4, 4), and those of each with the next."""
-    from filterpy.kalman import KalmanFilter  # a second to import: only who learns pays
+    """Expectation: states (m, 4) given all centres, their covariances (m, 4, 4), and those of each with the next.
 
-    kalman = KalmanFilter(dim_x=4, dim_z=2)
-    kalman.x, kalman.P, kalman.F, kalman.H = mean, covariance, _TRANSITION, _OBSERVED
-    kalman.Q, kalman.R = motion.process, motion.observation
-    measured = [centre if np.isfinite(centre).all() else None for centre in centres]
-    # Update first: the starting state is that of the first frame, not of the one before it.
-    states, covariances, _, _ = kalman.batch_filter(measured, update_first=True)
-    states, covariances, gains, _ = kalman.rts_smoother(states, covariances)
-    return states, covariances, covariances[1:] @ gains[:-1].transpose(0, 2, 1)
+    A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
+    """
+    states, covariances = np.empty((len(centres), 4)), np.empty((len(centres), 4, 4))
+    for i, centre in enumerate(centres):
+        if i:
+            mean, covariance = _TRANSITION @ mean, _TRANSITION @ covariance @ _TRANSITION.T + motion.process
+        if np.isfinite(centre).all():
+            shared = covariance @ _OBSERVED.T
+            gain = shared @ np.linalg.inv(_OBSERVED @ shared + motion.observation)
+            mean = mean + gain @ (centre - _OBSERVED @ mean)
+            left = np.eye(4) - gain @ _OBSERVED
+            # Joseph's form: it stays symmetric and positive.
+            covariance = left @ covariance @ left.T + gain @ motion.observation @ gain.T
+        states[i], covariances[i] = mean, covariance
+    predicted = _TRANSITION @ covariances[:-1] @ _TRANSITION.T + motion.process
+    gains = covariances[:-1] @ _TRANSITION.T @ np.linalg.inv(predicted)
+    for i in reversed(range(len(gains))):
+        states[i] += gains[i] @ (states[i + 1] - _TRANSITION @ states[i])
+        covariances[i] += gains[i] @ (covariances[i + 1] - predicted[i]) @ gains[i].T
+    return states, covariances, covariances[1:] @ gains.transpose(0, 2, 1)
 
 
 def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lagged: np.ndarray) -> Motion:
