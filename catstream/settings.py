@@ -80,7 +80,13 @@ class Settings:
     coreset_share: Annotated[
         float, _about("n as a share of the video's frames, as the paper sets it (0: coreset_size holds).", ge=0, le=0.5)
     ] = 0.0
-    train_frames: Annotated[int, _about("Frames at least between two samples that the trainer learns from.", ge=1)] = 5
+    train_frames: Annotated[
+        int,
+        _about(
+            "Frames between two samples that the trainer learns from; fewer where the trees grew by an eighth.",
+            ge=1,
+        ),
+    ] = 5
 
     bootstrap: Annotated[
         Literal["copies", "scm"],
@@ -114,11 +120,12 @@ class Settings:
     colours: Annotated[bool, _about("Learn which colours the object has, wherever in it they are.")] = True
     context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
     search_area: Annotated[float, _about("Side of the local search as a multiple of the window's.", ge=1.5, le=6)] = 2.5
-    scale_count: Annotated[int, _about("Sizes that a search tries, an odd number.", ge=1, le=15)] = 7
+    scale_count: Annotated[int, _about("Sizes that a search may try, an odd number.", ge=1, le=15)] = 7
     scale_step: Annotated[float, _about("Change of size from one to the next.", gt=0, le=0.5)] = 0.04
     scale_rate: Annotated[float, _about("Share of a change of size that is followed at once.", ge=0, le=1)] = 0.7
     aspect_count: Annotated[
-        int, _about("Ratios of width to height that a search tries, an odd number (1: it never changes).", ge=1, le=15)
+        int,
+        _about("Ratios of width to height that a search may try, an odd number (1: it never changes).", ge=1, le=15),
     ] = 5
     aspect_step: Annotated[float, _about("Change of this ratio from one to the next.", gt=0, le=0.5)] = 0.08
     aspect_rate: Annotated[float, _about("Share of a change of this ratio that is followed at once.", ge=0, le=1)] = 0.2
@@ -140,6 +147,7 @@ class Settings:
     extent_sigma: Annotated[
         float, _about("Steps of size or ratio at which a window fits exp(-1/2) as well as the right one.", gt=0)
     ] = 1.0
+    extent_frames: Annotated[int, _about("Frames from one lesson of size and ratio to the next.", ge=1)] = 2
     distance_penalty: Annotated[
         float, _about("Score that a window's width of distance costs in the local search.", ge=0)
     ] = 0.1
@@ -163,8 +171,8 @@ class Settings:
     teach_score: Annotated[float, _about("Score below which a frame teaches nothing.")] = 0.4
     copies: Annotated[
         int, _about("Affine copies of the object a frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)
-    ] = 5
-    mirrored: Annotated[int, _about("How many of them are turned left to right.", ge=0)] = 2
+    ] = 3
+    mirrored: Annotated[int, _about("How many of them are turned left to right.", ge=0)] = 1
     other_backgrounds: Annotated[
         float,
         _about(
@@ -176,7 +184,7 @@ class Settings:
     ] = 0.9
     object_weight: Annotated[
         float, _about("Ordinary rows that the object's row of a frame counts for in the loss tree.", gt=0)
-    ] = 4.0
+    ] = 8.0
     near_misses: Annotated[int, _about("Windows a frame that lie beside the object.", ge=0)] = 12
     near_sigma: Annotated[
         float, _about("Distance, in cells, at which a near miss is worth exp(-1/2) of the object.", gt=0)

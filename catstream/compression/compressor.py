@@ -22,6 +22,7 @@ from catstream.settings import Settings
 
 __all__ = ["Compressor"]
 
+_GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between
 _TREES = ("object", "background", "loss", "extent")
 
 
@@ -215,12 +216,12 @@ class Compressor:
             self._path = []
 
     def _due(self) -> bool:
-        """Trees that can teach, a leaf more than last time, and not right after the last sample."""
+        """Trees that can teach, and a leaf more than last time: at once while they are small, else not too soon."""
         if not (self.trees["object"].nodes and self.trees["background"].nodes and self.trees["loss"].nodes):
             return False
-        last = self.last_sample
-        waited = last is None or not self._sampled_leaves or self.frame - last.frame >= self.settings.train_frames
-        return waited and self.leaves > self._sampled_leaves
+        leaves, last = self.leaves, self.last_sample
+        waited = last is not None and self.frame - last.frame >= self.settings.train_frames
+        return leaves > self._sampled_leaves and (waited or leaves >= _GROWTH * self._sampled_leaves)
 
     def _sample(self) -> Sample:
         self._sampled_leaves = self.leaves

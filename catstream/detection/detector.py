@@ -89,6 +89,7 @@ class Detector:
 
             scm = SparseCollaborativeModel(image, box, self._random())
             lesson = lessons.near(frame, window, None, self._random(), self.settings)
+            lesson = lessons.with_extents(lesson, frame, window, self.settings)
         else:
             lesson = lessons.first(frame, window, self._random(), self.settings)
         model = bootstrap.stand_in(lesson, self.settings)
@@ -138,6 +139,7 @@ class Detector:
             self._centre.update(self._box.centre)
         score = float(search.scored_around(frame, self._box, WINDOW, self.model).scores[0, 0])
         lesson = lessons.near(frame, self._box, self.model, self._random(), self.settings)
+        lesson = lessons.with_extents(lesson, frame, self._box, self.settings)
         return self._answer(time, score, lesson)
 
     def miss(self, time: float = 0.0) -> tuple[Track, Features]:
@@ -258,6 +260,8 @@ class Detector:
         if score < settings.teach_score or self._elsewhere:
             return Lesson.none()
         lesson = lessons.near(frame, self._box, self.model, self._random(), settings)
+        if self.seq % settings.extent_frames == 0:
+            lesson = lessons.with_extents(lesson, frame, self._box, settings)
         if score > settings.mine_score and self.seq % settings.mine_frames == 0:
             lesson += lessons.far(frame, self._box, self.model, settings)
         return lesson

@@ -7,6 +7,7 @@ one learns how well a window fits from the object cut as it is, and cut badly.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -31,32 +32,51 @@ def fitted(frame: Pyramid, box: Box, first: Box, model: Model, settings: Setting
     ----------
     first : the window of the first frame, whose extent is likelier than others
     """
-    sizes = _steps(settings.scale_count)
-    tried = [search.scored_around(frame, box.scaled(_size(k, settings)), _FINE_CELLS, model) for k in sizes]
-    places = [search.highest(scored.scores) for scored in tried]
-    scores = np.array([scored.scores[place] for scored, place in zip(tried, places, strict=True)])
     now = math.log(box.area / first.area) / 2
-    values = scores - _cost(np.array(sizes) * math.log(1 + settings.scale_step), now, settings)
-    if model.extent is not None:
-        values += settings.extent_weight * np.array([scored.row(1, 1) @ model.extent for scored in tried])
-    i = int(values.argmax())
-    between = _size(windows.vertex(values, i), settings)
-    found = Found(float(scores[i]), tried[i].box(*tried[i].refined(*places[i])).scaled(between))
-    return found if model.extent is None else _widened(frame, found, first, model, settings)
+    found: dict[int, Found] = {}
+
+    def value(step: int) -> float:
+        scored = search.scored_around(frame, box.scaled(_size(step, settings)), _FINE_CELLS, model)
+        place = search.highest(scored.scores)
+        score = float(scored.scores[place])
+        found[step] = Found(score, scored.box(*scored.refined(*place)))
+        fit = 0.0 if model.extent is None else settings.extent_weight * float(scored.row(1, 1) @ model.extent)
+        return score + fit - _cost(step * math.log(1 + settings.scale_step), now, settings)
+
+    step, beside = _climbed(value, settings.scale_count // 2)
+    best = Found(found[step].score, found[step].box.scaled(_size(beside, settings)))
+    return best if model.extent is None else _widened(frame, best, first, model, settings)
 
 
 def _widened(frame: Pyramid, found: Found, first: Box, model: Model, settings: Settings) -> Found:
     """The same place, size and score, at the best aspect."""
-    aspects = _steps(settings.aspect_count)
-    boxes = [found.box.scaled(*_stretch(k, settings)) for k in aspects]
-    tried = [search.scored_around(frame, box, WINDOW, model) for box in boxes]
-    values = np.array(
-        [scored.scores[0, 0] + settings.extent_weight * (scored.row(0, 0) @ model.extent) for scored in tried]
-    )
     now = math.log(found.box.w / found.box.h * first.h / first.w)
-    values -= _cost(np.array(aspects) * math.log(1 + settings.aspect_step), now, settings)
-    i = int(values.argmax())
-    return Found(found.score, found.box.scaled(*_stretch(aspects[i] + windows.vertex(values, i), settings)))
+
+    def value(step: int) -> float:
+        scored = search.scored_around(frame, found.box.scaled(*_stretch(step, settings)), WINDOW, model)
+        fit = settings.extent_weight * float(scored.row(0, 0) @ model.extent)
+        return float(scored.scores[0, 0]) + fit - _cost(step * math.log(1 + settings.aspect_step), now, settings)
+
+    step, beside = _climbed(value, settings.aspect_count // 2)
+    return Found(found.score, found.box.scaled(*_stretch(step + beside, settings)))
+
+
+def _climbed(value: Callable[[int], float], most: int) -> tuple[int, float]:
+    """The best step: from 0 up or down for as long as the value rises, at most so far either way.
+
+    Returns
+    -------
+    the step, and how far beside it the top of the parabola through its neighbours lies
+    """
+    values = {step: value(step) for step in range(-min(most, 1), min(most, 1) + 1)}
+    best = way = max(values, key=values.__getitem__)
+    while way and abs(best) < most:
+        values[best + way] = value(best + way)
+        if values[best + way] <= values[best]:
+            break
+        best += way
+    around = np.array([values.get(step, -np.inf) for step in (best - 1, best, best + 1)])
+    return best, windows.vertex(around, 1) if np.isfinite(around).all() else 0.0
 
 
 def followed(before: Box, found: Found, settings: Settings) -> Box:
@@ -94,9 +114,9 @@ def cuts(frame: Pyramid, box: Box, own: np.ndarray, settings: Settings) -> tuple
     return [own, *rows], [1.0, *fits]
 
 
-def _cost(changes: np.ndarray, now: float, settings: Settings) -> np.ndarray:
-    """What changes of a logarithm cost, where it is off by `now` already."""
-    return settings.extent_penalty * np.abs(changes) + settings.extent_prior * (changes + now) ** 2
+def _cost(change: float, now: float, settings: Settings) -> float:
+    """What a change of a logarithm costs, where it is off by `now` already."""
+    return settings.extent_penalty * abs(change) + settings.extent_prior * (change + now) ** 2
 
 
 def _steps(count: int) -> range:

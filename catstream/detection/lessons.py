@@ -18,7 +18,7 @@ from catstream.detection.pyramid import Pyramid
 from catstream.messages import Model
 from catstream.settings import Settings
 
-__all__ = ["Lesson", "far", "first", "near"]
+__all__ = ["Lesson", "far", "first", "near", "with_extents"]
 
 _NEAR = 2  # cells around the object whose windows are near misses, not background
 _CELLS = 20  # cells around the object that background is taken from
@@ -69,15 +69,14 @@ def first(frame: Pyramid, box: Box, rng: np.random.Generator, settings: Settings
     copies = affine.copies(frame, box, count, rng, context=context, moved=moved)
     lesson = Lesson.of(list(copies), 1, settings.object_weight)
     lesson += _around(frame, box, None, count, rng, settings)
-    return _with_extents(lesson, frame, box, copies[0], settings)
+    return with_extents(lesson.seen(settings), frame, box, settings)
 
 
 def near(frame: Pyramid, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings) -> Lesson:
-    """What a later frame teaches: the object, affine copies of it, near misses, background, and its extent."""
+    """What a later frame teaches: the object, affine copies of it, near misses and background."""
     own = list(affine.copies(frame, box, 1 + settings.copies, rng, mirrored=settings.mirrored))
     lesson = Lesson.of(own, 1, settings.object_weight / len(own))
-    lesson += _around(frame, box, model, settings.near_negatives, rng, settings)
-    return _with_extents(lesson, frame, box, own[0], settings)
+    return (lesson + _around(frame, box, model, settings.near_negatives, rng, settings)).seen(settings)
 
 
 def far(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Lesson:
@@ -88,8 +87,9 @@ def far(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Lesson:
     return Lesson.of(rows[: settings.far_negatives], 0).seen(settings)
 
 
-def _with_extents(lesson: Lesson, frame: Pyramid, box: Box, own: np.ndarray, settings: Settings) -> Lesson:
-    rows, fits = extent.cuts(frame, box, own, settings)
+def with_extents(lesson: Lesson, frame: Pyramid, box: Box, settings: Settings) -> Lesson:
+    """A lesson, and how large the object is: its first row is the object's own."""
+    rows, fits = extent.cuts(frame, box, lesson.rows[0], settings)
     return replace(lesson, extents=_array(rows), fits=np.array(fits, np.float32)).seen(settings)
 
 

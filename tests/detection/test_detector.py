@@ -48,7 +48,7 @@ def test_the_first_frame_teaches_a_leaf_of_each_tree(scene):
 
 def test_without_colours_no_row_tells_of_them_and_the_model_weighs_none(scene):
     for colours in (True, False):
-        detector = Detector(Settings(colours=colours))
+        detector = Detector(Settings(colours=colours, extent_frames=1))
         _, first = detector.init(scene((60, 50)), START)
         detector.seq = 4  # the next frame is searched for hard negatives
         _, later = detector.step(scene((62, 50)))
