@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from catstream.compression.reduce import energy, reduce
 __all__ = ["Node"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Node:
     """A coreset of `count` consecutive rows.
 
@@ -38,10 +39,11 @@ class Node:
         """c of the paper: what all reductions below it lost, ||A||^2 = ||C||^2 + c."""
         return self.energy - energy(self.rows)
 
-    def strongest(self, size: int) -> np.ndarray:
-        """Its `size` strongest directions, float32 (size, d)."""
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """Its rows turned so that they are orthogonal, and the strongest comes first."""
         # Most leaves are merged before anyone asks, which saves turning them.
-        return self.rows[:size] if self.level else reduce(self.rows, size, towards=self.sum)
+        return self.rows if self.level else reduce(self.rows, len(self.rows), towards=self.sum)
 
     def merged(self, newer: Node) -> Node:
         """One node, a level up, for the rows of two of the same level."""

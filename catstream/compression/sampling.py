@@ -47,7 +47,7 @@ def sample(nodes: Sequence[Node], size: int) -> np.ndarray:
         count = share(node.level, top, size)
         if not count:
             break
-        parts.append(spread(node.strongest(count)) * np.float32(np.sqrt(count / node.count)))
+        parts.append(spread(node.directions[:count]) * np.float32(np.sqrt(count / node.count)))
     return np.vstack(parts)
 
 
