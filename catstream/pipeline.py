@@ -162,6 +162,7 @@ class Pipeline:
                 since=time.monotonic() - max(0.0, time.time() - self._origin.started),
             )
             stack.callback(self._supervisor.stop)
+            stack.callback(self._listen)  # also to what came since the last track, before Ctrl-C
             self._stack = stack.pop_all()
         return self
 
@@ -193,7 +194,7 @@ class Pipeline:
 
     @property
     def health(self) -> dict[str, dict[str, float]]:
-        """The latest counters of each process that came while iterating, by its name."""
+        """The latest counters of each process that came while iterating or by the end, by its name."""
         return {name: health.counters for name, health in self._health.items()}
 
     @property
