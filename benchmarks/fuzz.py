@@ -82,7 +82,7 @@ def messages() -> dict[str, tuple[Any, ...]]:
 
     box = Box(4.5, 3.0, 20.0, 10.0)
     motion = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
-    bearings = Bearings("present", box, box, box, 0.9, False, motion, array(5, 4, dtype="<f8"))
+    bearings = Bearings("present", box, box, box, 0.9, False, motion, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
     none = np.empty((0, 5), "<f4")
     return {
         "answer": (Answer("7f", True, "followed from frame 9 on", 9, box, 4),),

@@ -66,6 +66,8 @@ class Bearings:
     elsewhere  whether it was found by a search of the whole frame, and is not trusted yet
     motion     the Kalman filter's parameters, None before it has any
     centre     float64 (5, 4), the filter's mean (x, y, and their speeds) above its covariance; None before it has any
+    balance    float64 (6,), where the object's colours lie in its window: frames taken in, contrast, the first
+               centre's x and y, the present one's; None where nothing is known of it
     """
 
     state: State
@@ -76,6 +78,7 @@ class Bearings:
     elsewhere: bool
     motion: Motion | None = None
     centre: np.ndarray | None = None
+    balance: np.ndarray | None = None
 
 
 @dataclass(frozen=True, slots=True)

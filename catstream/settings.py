@@ -148,6 +148,15 @@ class Settings:
         float, _about("Steps of size or ratio at which a window fits exp(-1/2) as well as the right one.", gt=0)
     ] = 1.0
     extent_frames: Annotated[int, _about("Frames from one lesson of size and ratio to the next.", ge=1)] = 2
+    balance_slack: Annotated[
+        float,
+        _about(
+            "Share of the window that the centre of the object's colours may come to lie beyond its first place, or "
+            "the middle, before the box follows it (1: it never does).",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.14
     distance_penalty: Annotated[
         float, _about("Score that a window's width of distance costs in the local search.", ge=0)
     ] = 0.1
@@ -191,7 +200,7 @@ class Settings:
     ] = 0.9
     near_negatives: Annotated[int, _about("Background windows a frame around the object.", ge=1)] = 12
     far_negatives: Annotated[int, _about("Hard negatives from a whole frame.", ge=0)] = 10
-    mine_frames: Annotated[int, _about("Frames from one search for hard negatives to the next.", ge=1)] = 5
+    mine_frames: Annotated[int, _about("Frames from one search for hard negatives to the next.", ge=1)] = 8
     mine_score: Annotated[float, _about("Score below which none are searched for.")] = 0.6
 
     @classmethod
@@ -303,6 +312,7 @@ _PAPER = {
     "extent_weight": 0.0,
     "extent_prior": 0.0,
     "colours": False,
+    "balance_slack": 1.0,
     "other_backgrounds": 0.0,
     "mirrored": 0,
     "present_share": 0.0,

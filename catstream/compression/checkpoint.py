@@ -51,6 +51,8 @@ def bearings_state(bearings: Bearings | None) -> State:
     if bearings.motion is not None and bearings.centre is not None:
         parts = {"process": bearings.motion.process, "observation": bearings.motion.observation}
         arrays = {f"bearings.{name}": array for name, array in {**parts, "centre": bearings.centre}.items()}
+    if bearings.balance is not None:
+        arrays["bearings.balance"] = bearings.balance
     names = ("state", "window", "sure", "first", "usual", "elsewhere")
     return arrays, {name: getattr(bearings, name) for name in names}
 
@@ -63,4 +65,4 @@ def bearings_of(arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> 
     if centre is not None:
         motion = Motion(arrays["bearings.process"], arrays["bearings.observation"])
     boxes = {name: facts[name] and Box(*facts[name]) for name in ("window", "sure", "first")}
-    return Bearings(**(facts | boxes), motion=motion, centre=centre)
+    return Bearings(**(facts | boxes), motion=motion, centre=centre, balance=arrays.get("bearings.balance"))

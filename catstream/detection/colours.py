@@ -16,15 +16,15 @@ import numpy as np
 from catstream.detection.compiled import kernel
 from catstream.detection.hog import CELL, WINDOW
 
-__all__ = ["SHADES", "add_scores", "histogram", "shades"]
+__all__ = ["SHADES", "SIDE", "add_scores", "histogram", "shades"]
 
-_SIDE = CELL // 2  # shades a cell is wide and high
+SIDE = CELL // 2  #: shades a cell is wide and high
 _LIGHT, _CHROMA, _CHROMA_STEP = 8, 6, 10  # levels of lightness, of a and of b; Lab units from one of these to the next
 SHADES = _LIGHT * _CHROMA * _CHROMA  #: how many are told apart
 
 _WEIGHT = 3.0  # length of a histogram as features; that of a window's HOG is about 9
-_EDGE = _SIDE  # shades of a window's first cell, which is not counted
-_COUNTED = WINDOW * _SIDE - 2 * _EDGE  # shades along a side of the middle
+_EDGE = SIDE  # shades of a window's first cell, which is not counted
+_COUNTED = WINDOW * SIDE - 2 * _EDGE  # shades along a side of the middle
 
 
 def shades(image: np.ndarray) -> np.ndarray:
@@ -48,7 +48,7 @@ def shades(image: np.ndarray) -> np.ndarray:
 
 def histogram(found: np.ndarray, row: int, column: int, features: np.ndarray) -> None:
     """Features of the window whose first cell is (row, column), into float32 (SHADES,)."""
-    _histogram(found, row * _SIDE + _EDGE, column * _SIDE + _EDGE, _ROOTS, features)
+    _histogram(found, row * SIDE + _EDGE, column * SIDE + _EDGE, _ROOTS, features)
 
 
 def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray) -> None:
@@ -112,7 +112,7 @@ def _add_scores(found, weights, steps, scores):
         for shade in range(len(counts)):
             counts[shade] = 0
         total = 0.0
-        for y in range(row * _SIDE + _EDGE, row * _SIDE + _EDGE + _COUNTED):
+        for y in range(row * SIDE + _EDGE, row * SIDE + _EDGE + _COUNTED):
             for x in range(_EDGE, _EDGE + _COUNTED):
                 shade = found[y, x]
                 total += weights[shade] * steps[counts[shade]]
@@ -120,13 +120,13 @@ def _add_scores(found, weights, steps, scores):
         scores[row, 0] += total
         for column in range(1, scores.shape[1]):
             # The window moves on by a cell: its first column of shades goes, the one beside it comes.
-            left = column * _SIDE
-            for y in range(row * _SIDE + _EDGE, row * _SIDE + _EDGE + _COUNTED):
-                for x in range(left, left + _SIDE):
+            left = column * SIDE
+            for y in range(row * SIDE + _EDGE, row * SIDE + _EDGE + _COUNTED):
+                for x in range(left, left + SIDE):
                     shade = found[y, x]
                     counts[shade] -= 1
                     total -= weights[shade] * steps[counts[shade]]
-                for x in range(left + _COUNTED, left + _COUNTED + _SIDE):
+                for x in range(left + _COUNTED, left + _COUNTED + SIDE):
                     shade = found[y, x]
                     total += weights[shade] * steps[counts[shade]]
                     counts[shade] += 1

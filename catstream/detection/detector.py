@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from catstream.box import Box
 from catstream.detection import bootstrap, extent, lessons, search
-from catstream.detection.cells import row_length
+from catstream.detection.balance import Balance
+from catstream.detection.cells import COLOURS, row_length
 from catstream.detection.hog import WINDOW
 from catstream.detection.lessons import Lesson
 from catstream.detection.motion import CentreFilter
@@ -58,6 +60,7 @@ class Detector:
         self._elsewhere = False  # found by a search of the whole frame, and not trusted yet
         self._first_box: Box | None = None  # None while it was not found yet
         self._centre: CentreFilter | None = None
+        self._balance = Balance()
         self._scm: SparseCollaborativeModel | None = None
 
     @property
@@ -178,6 +181,8 @@ class Detector:
         self._usual_score, self._elsewhere = bearings.usual, bearings.elsewhere
         if bearings.motion is not None and bearings.centre is not None:
             self._centre = CentreFilter.resumed(bearings.motion, bearings.centre, bearings.state != "absent")
+        if bearings.balance is not None:
+            self._balance = Balance.resumed(bearings.balance)
         self.adopt(model)
 
     def bearings_at(self, box: Box, first: Box) -> Bearings:
@@ -197,7 +202,7 @@ class Detector:
         if self._scm is not None:
             found = self._scm.step(image)  # it has no word for absent
             self._box = found.box.scaled(settings.context).held_in(*frame.size)
-            return self._answer(time, found.score, self._lesson(frame, found.score))
+            return self._answer(time, found.score, self._lesson(frame, found))
         found = self._find(frame) if self._first_box else self._seek(frame)
         self._elsewhere &= found.score < settings.trust_score
         there = self._there(found.score)
@@ -206,14 +211,14 @@ class Detector:
             self._elsewhere = found.score < settings.trust_score
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
-            self._box = extent.followed(self._box, found, settings).held_in(*frame.size)
+            self._box = self._balanced(extent.followed(self._box, found, settings), found).held_in(*frame.size)
             if found.score >= settings.sure_score:
                 self._sure_box = self._box
         else:
             self.state = "absent"
         if self._centre is not None:
             self._centre.update(self._box.centre if there else None)
-        return self._answer(time, found.score, self._lesson(frame, found.score) if there else Lesson.none())
+        return self._answer(time, found.score, self._lesson(frame, found) if there else Lesson.none())
 
     def _there(self, score: float) -> bool:
         """Whether the best score in a frame is the object's: high enough, also for what this one usually scores."""
@@ -225,6 +230,13 @@ class Detector:
         if there:
             self._usual_score += _USUAL_RATE * (score - self._usual_score)
         return there
+
+    def _balanced(self, box: Box, found: Found) -> Box:
+        """The box, drawn after the object's colours if it crept off them."""
+        settings = self.settings
+        if found.around is None or self._elsewhere or found.score < settings.extent_score:
+            return box
+        return self._balance.drawn(box, found.around, self.model.weights[COLOURS], settings.balance_slack)
 
     def _find(self, frame: Pyramid) -> Found:
         settings = self.settings
@@ -253,16 +265,17 @@ class Detector:
         return self._fitted(frame, found)
 
     def _fitted(self, frame: Pyramid, found: Found) -> Found:
-        return extent.fitted(frame, found.box, self._first_box or found.box, self.model, self.settings)
+        fitted = extent.fitted(frame, found.box, self._first_box or found.box, self.model, self.settings)
+        return replace(fitted, around=found.around)
 
-    def _lesson(self, frame: Pyramid, score: float) -> Lesson:
+    def _lesson(self, frame: Pyramid, found: Found) -> Lesson:
         settings = self.settings
-        if score < settings.teach_score or self._elsewhere:
+        if found.score < settings.teach_score or self._elsewhere:
             return Lesson.none()
-        lesson = lessons.near(frame, self._box, self.model, self._random(), settings)
+        lesson = lessons.near(frame, self._box, self.model, self._random(), settings, found.around)
         if self.seq % settings.extent_frames == 0:
             lesson = lessons.with_extents(lesson, frame, self._box, settings)
-        if score > settings.mine_score and self.seq % settings.mine_frames == 0:
+        if found.score > settings.mine_score and self.seq % settings.mine_frames == 0:
             lesson += lessons.far(frame, self._box, self.model, settings)
         return lesson
 
@@ -282,4 +295,5 @@ class Detector:
             return None
         motion, centre = (self._centre.motion, self._centre.state) if self._centre is not None else (None, None)
         boxes = self._box, self._sure_box, self._first_box
-        return Bearings(self.state, *boxes, float(self._usual_score), self._elsewhere, motion, centre)
+        usual, balance = float(self._usual_score), self._balance.state.copy()
+        return Bearings(self.state, *boxes, usual, self._elsewhere, motion, centre, balance)

@@ -6,6 +6,7 @@ exp(-distance^2 / 2 sigma^2), so that the score falls smoothly beside the object
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,14 +16,15 @@ from catstream.detection import affine, extent, search, windows
 from catstream.detection.cells import COLOURS, row_length
 from catstream.detection.hog import WINDOW
 from catstream.detection.pyramid import Pyramid
+from catstream.detection.windows import Scored
 from catstream.messages import Model
 from catstream.settings import Settings
 
 __all__ = ["Lesson", "far", "first", "near", "with_extents"]
 
 _NEAR = 2  # cells around the object whose windows are near misses, not background
-_CELLS = 20  # cells around the object that background is taken from
-_MIDDLE = (_CELLS - WINDOW) // 2
+_NEAREST = 0.9  # cells: a window nearer than that is the object as much as its own
+_CELLS = 20  # cells around the object that background is taken from, where no search looked at any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,15 +70,33 @@ def first(frame: Pyramid, box: Box, rng: np.random.Generator, settings: Settings
     count, context, moved = settings.coreset_size, settings.context, settings.other_backgrounds
     copies = affine.copies(frame, box, count, rng, context=context, moved=moved)
     lesson = Lesson.of(list(copies), 1, settings.object_weight)
-    lesson += _around(frame, box, None, count, rng, settings)
+    lesson += _around(_unscored(frame, box), box, count, 0, rng, settings)
     return with_extents(lesson.seen(settings), frame, box, settings)
 
 
-def near(frame: Pyramid, box: Box, model: Model | None, rng: np.random.Generator, settings: Settings) -> Lesson:
-    """What a later frame teaches: the object, affine copies of it, near misses and background."""
+def near(
+    frame: Pyramid,
+    box: Box,
+    model: Model | None,
+    rng: np.random.Generator,
+    settings: Settings,
+    around: Scored | None = None,
+) -> Lesson:
+    """What a later frame teaches: the object, affine copies of it, near misses and background.
+
+    Parameters
+    ----------
+    model : half of the background windows are those that score highest with it; None, all are anywhere
+    around : cells that hold the object, if a search has left some: near misses and background are taken from these
+    """
     own = list(affine.copies(frame, box, 1 + settings.copies, rng, mirrored=settings.mirrored))
     lesson = Lesson.of(own, 1, settings.object_weight / len(own))
-    return (lesson + _around(frame, box, model, settings.near_negatives, rng, settings)).seen(settings)
+    count, hardest = settings.near_negatives, settings.near_negatives // 2
+    if model is None:
+        around, hardest = _unscored(frame, box), 0
+    elif around is None:
+        around = search.scored_around(frame, box, _CELLS, model)
+    return (lesson + _around(around, box, count, hardest, rng, settings)).seen(settings)
 
 
 def far(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Lesson:
@@ -97,24 +117,25 @@ def _array(rows: list[np.ndarray]) -> np.ndarray:
     return np.array(rows, np.float32).reshape(len(rows), row_length())
 
 
-def _around(
-    frame: Pyramid, box: Box, model: Model | None, negatives: int, rng: np.random.Generator, settings: Settings
-) -> Lesson:
-    """Near misses, and background: with a model half of it the highest scoring windows, the rest anywhere."""
-    cells, _, _ = windows.around(frame, box, _CELLS)
+def _unscored(frame: Pyramid, box: Box) -> Scored:
+    cells, origin, step = windows.around(frame, box, _CELLS)
+    return Scored(cells, np.zeros((_CELLS - WINDOW + 1,) * 2, np.float32), origin, step)
+
+
+def _around(scored: Scored, box: Box, count: int, hardest: int, rng: np.random.Generator, settings: Settings) -> Lesson:
+    """Near misses of a box, and `count` background windows: the `hardest` highest scoring ones, the rest anywhere."""
+    row, column = scored.place(box)
+    rows, columns = scored.scores.shape
+    down, across = np.arange(rows)[:, None] - row, np.arange(columns) - column
+    outside = np.maximum(abs(down), abs(across)) > _NEAR + 0.5
     misses, labels = [], []
-    for down, across in rng.integers(-_NEAR, _NEAR + 1, size=(settings.near_misses, 2)):
-        distance = down * down + across * across
-        if distance:
-            misses.append(cells.row(_MIDDLE + down, _MIDDLE + across))
-            labels.append(float(np.exp(-distance / (2 * settings.near_sigma**2))))
-    outside = np.ones((_CELLS - WINDOW + 1,) * 2, bool)
-    outside[_MIDDLE - _NEAR : _MIDDLE + _NEAR + 1, _MIDDLE - _NEAR : _MIDDLE + _NEAR + 1] = False
-    places = []
-    if model is not None:
-        scores = np.where(outside, cells.respond(model.weights, model.bias), -np.inf)
-        places = windows.peaks(scores, negatives // 2, _NEAR)
+    near = np.argwhere(~outside)
+    for place in near[rng.integers(len(near), size=settings.near_misses)] if len(near) else ():
+        distance = math.hypot(down[place[0], 0], across[place[1]])
+        if distance > _NEAREST:
+            misses.append(scored.row(*place))
+            labels.append(math.exp(-((distance / settings.near_sigma) ** 2) / 2))
+    places = windows.peaks(np.where(outside, scored.scores, -np.inf), hardest, _NEAR)
     anywhere = np.argwhere(outside)
-    more = rng.choice(anywhere, negatives - len(places), replace=negatives > len(anywhere))
-    places += [(row, column) for row, column in more]
-    return Lesson.of(misses, labels) + Lesson.of([cells.row(*place) for place in places], 0)
+    places += list(map(tuple, rng.choice(anywhere, count - len(places), replace=count > len(anywhere))))
+    return Lesson.of(misses, labels) + Lesson.of([scored.row(*place) for place in places], 0)

@@ -26,10 +26,14 @@ _MOST_PIXELS = 4_000_000  # of a resized frame: what a whole search may cost for
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A window and its score."""
+    """A window and its score.
+
+    around : what a local search scored, which the window is in; None where there was none
+    """
 
     score: float
     box: Box
+    around: Scored | None = None
 
 
 def local(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
@@ -41,7 +45,7 @@ def local(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
     scored = scored_around(frame, box, cells, model)
     away = (np.arange(cells - WINDOW + 1) - (cells - WINDOW) // 2) / WINDOW
     place = highest(scored.scores - settings.distance_penalty * (away[:, None] ** 2 + away**2))
-    return Found(float(scored.scores[place]), scored.box(*scored.refined(*place)))
+    return Found(float(scored.scores[place]), scored.box(*scored.refined(*place)), scored)
 
 
 def whole(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:

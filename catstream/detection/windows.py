@@ -39,6 +39,11 @@ class Scored:
         (x, y), (w, h) = self.origin, self.step
         return Box(x + column * w, y + row * h, WINDOW * w, WINDOW * h)
 
+    def place(self, box: Box) -> tuple[float, float]:
+        """Row and column, between the cells, of the window that has a box's centre: what `box` turns back."""
+        (x, y), (w, h), (left, top) = box.centre, self.step, self.origin
+        return (y - top) / h - WINDOW / 2, (x - left) / w - WINDOW / 2
+
     def row(self, row: int, column: int) -> np.ndarray:
         """Feature row of the window at (row, column), float32 (d,)."""
         return self.cells.row(row, column)

@@ -181,7 +181,7 @@ def test_the_bearings_of_the_last_message_are_kept_bit_for_bit(settings, message
     motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
     bearings = Bearings("absent", *(Box(*rng.random(4)) for _ in range(3)), rng.random(), True)
     if moving:
-        bearings = dataclasses.replace(bearings, motion=motion, centre=centre)
+        bearings = dataclasses.replace(bearings, motion=motion, centre=centre, balance=rng.random(6))
     compressor = Compressor(settings)
     compressor.take(dataclasses.replace(next(messages), bearings=bearings))
     compressor.save(tmp_path / "state")

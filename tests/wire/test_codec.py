@@ -43,7 +43,7 @@ def summary(columns: int) -> Summary:
 
 MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
 BOXES = Box(4.0, 2.0, 25.0, 12.5), Box(4.5, 2.0, 25.0, 12.5), Box(9.0, 2.0, 25.0, 12.5)
-BEARINGS = Bearings("present", *BOXES, 0.9, False, MOTION, array(5, 4, dtype="<f8"))
+BEARINGS = Bearings("present", *BOXES, 0.9, False, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
 EXAMPLES = {
     "answer": Answer("7f", True, "followed from frame 9 on", 9, Box(4.5, 3.0, 20.0, 10.0), 4),
     "command": Command("7f", "set-box", Box(4.5, 3.0, 20.0, 10.0), True),
