@@ -26,12 +26,13 @@ from catstream.state import TREES
 from catstream.video.demo import write
 from catstream.video.results import tracks
 
+_REST = 200  # frames beyond the last kill: a fast pipeline goes on while a kill is on its way
 TRACK = [sys.executable, "-c", "from catstream.cli import main; main()", "track"]
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     moments, most = (2, 5) if options.quick else (options.moments, options.rows)
-    frames = moments * most
+    frames = moments * most + _REST
     place, chance = scratch(), random.Random(options.seed)
     video, boxes = write(place, frames, (320, 240))
     kept, out = place / "kept", place / "out"

@@ -9,6 +9,7 @@ the picture and comes back elsewhere. The same arguments give the same pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -145,13 +146,17 @@ def write(
     return path, truth
 
 
+def _photograph(name: str) -> np.ndarray:
+    """One that scikit-learn ships, float32 BGR; its own function to load them needs Pillow."""
+    path = files("sklearn") / "datasets" / "images" / f"{name}.jpg"
+    return cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR).astype(np.float32)
+
+
 class _Stage:
     """The two photographs, cut up and ready: float32 colours of 0 to 255."""
 
     def __init__(self, seed: int) -> None:
-        from sklearn.datasets import load_sample_images  # here: it takes a second
-
-        lake, flower = (image[..., ::-1].astype(np.float32) for image in load_sample_images().images)
+        lake, flower = _photograph("china"), _photograph("flower")
         self.lake = cv2.resize(lake, None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_CUBIC).clip(0, 255)
         pagoda = cv2.fillPoly(np.zeros(self.lake.shape[:2], np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
         self.pagoda = cv2.GaussianBlur(pagoda, (0, 0), 1.2)

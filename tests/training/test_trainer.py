@@ -61,4 +61,5 @@ def test_a_direction_in_which_the_object_scores_lower_gives_way_to_the_one_betwe
     mirrored = dataclasses.replace(sample.object, rows=2 * sample.background.mean - sample.object.rows)
     few = dataclasses.replace(sample, object=mirrored)
     model = Trainer(Settings(classifier="one-class")).train(few)
-    assert model.weights.tobytes() == Trainer(Settings(classifier="least-squares")).train(few).weights.tobytes()
+    between = Trainer(Settings(classifier="least-squares")).train(few)
+    np.testing.assert_allclose(model.weights, between.weights, atol=1e-6)  # BLAS need not round the same twice

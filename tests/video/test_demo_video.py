@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import islice, pairwise
 
 import numpy as np
@@ -80,3 +81,11 @@ def test_the_video_lies_beside_its_truth(tmp_path):
         assert sum(1 for _ in source) == len(truth) == 4
     rows = np.loadtxt(path.with_name("groundtruth_rect.txt"), delimiter=",")
     np.testing.assert_allclose(rows, np.array(truth, float), atol=1e-3)
+
+
+def test_it_is_rendered_without_pillow(monkeypatch):
+    """Which only the packages of developers bring with them."""
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    image, box = next(render(1, (320, 240)))
+    assert image.shape == (240, 320, 3)
+    assert box is not None
