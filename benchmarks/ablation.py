@@ -33,6 +33,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "mirrored copies": {"mirrored": 0},
     "other backgrounds behind the first copies": {"other_backgrounds": 0.0},
     "histogram of colours": {"colours": False},
+    "box drawn after the colours": {"balance_slack": 1.0},
     "search over scales": {"scale_count": 1},
     "cost of distance": {"distance_penalty": 0.0},
     "extent tree": {"extent_weight": 0.0},

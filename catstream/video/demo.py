@@ -149,7 +149,7 @@ def write(
 def _photograph(name: str) -> np.ndarray:
     """One that scikit-learn ships, float32 BGR; its own function to load them needs Pillow."""
     path = files("sklearn") / "datasets" / "images" / f"{name}.jpg"
-    return cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR).astype(np.float32)
+    return np.array(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR), np.float32)
 
 
 class _Stage:
