@@ -137,6 +137,7 @@ class Detector:
         self._box = self._sure_box = Box(*map(float, box)).inside(*frame.size).scaled(self.settings.context)
         self.seq, self.state = self.seq + 1, "present"
         self._elsewhere, self._first_box = False, self._first_box or self._box
+        self._balance = Balance()  # this box says anew where in it the colours lie
         if self._centre is not None:
             self._centre.predict()
             self._centre.update(self._box.centre)

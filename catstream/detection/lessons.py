@@ -24,7 +24,7 @@ __all__ = ["Lesson", "far", "first", "near", "with_extents"]
 
 _NEAR = 2  # cells around the object whose windows are near misses, not background
 _NEAREST = 0.9  # cells: a window nearer than that is the object as much as its own
-_CELLS = 20  # cells around the object that background is taken from, where no search looked at any
+_CELLS = 20  # cells around the object, at least, that background is taken from
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,14 +87,15 @@ def near(
     Parameters
     ----------
     model : half of the background windows are those that score highest with it; None, all are anywhere
-    around : cells that hold the object, if a search has left some: near misses and background are taken from these
+    around : cells that hold the object, if a search has left some: near misses and background are taken from these,
+        where they are enough
     """
     own = list(affine.copies(frame, box, 1 + settings.copies, rng, mirrored=settings.mirrored))
     lesson = Lesson.of(own, 1, settings.object_weight / len(own))
     count, hardest = settings.near_negatives, settings.near_negatives // 2
     if model is None:
         around, hardest = _unscored(frame, box), 0
-    elif around is None:
+    elif around is None or min(around.cells.shape) < _CELLS:
         around = search.scored_around(frame, box, _CELLS, model)
     return (lesson + _around(around, box, count, hardest, rng, settings)).seen(settings)
 

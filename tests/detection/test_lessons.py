@@ -85,6 +85,11 @@ def test_where_no_search_left_cells_they_are_cut_around_the_box(frame, model, kn
     assert misses.any()
     assert background.sum() == SETTINGS.near_negatives
     scored = search.scored_around(frame, BOX, 20, model)
-    assert scored.cells.shape == (20, 20)
     assert scored.scores.shape == (20 - WINDOW + 1,) * 2
     assert len(places(scored, lesson.rows[~own])) > 20
+
+
+def test_cells_of_a_narrow_search_are_not_enough(frame, model):
+    narrow = search.scored_around(frame, BOX, 12, model)
+    for one, other in zip(near(frame, model, narrow), near(frame, model), strict=True):
+        np.testing.assert_array_equal(getattr(one, "rows", one), getattr(other, "rows", other))
