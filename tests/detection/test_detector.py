@@ -252,3 +252,9 @@ def test_a_corrected_box_is_gone_on_with_and_teaches(scene):
     assert len(features.rows)
     assert not features.begins
     assert detector.step(scene((92, 60)))[0].box.overlap(Box(92, 60, 48, 40)) > 0.7
+
+
+def test_a_corrected_box_says_anew_where_the_colours_lie(scene):
+    detector = started(scene)
+    assert detector.step(scene((62, 50)))[1].bearings.balance[0] == 1
+    assert detector.correct(scene((90, 60)), Box(90, 60, 48, 40))[1].bearings.balance[0] == 0
