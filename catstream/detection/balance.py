@@ -88,9 +88,9 @@ def _above_background(around: Scored, box: Box, weights: np.ndarray) -> tuple[fl
     mass = np.maximum(weights, 0)[shades]
     inner = mass[_INSIDE, _INSIDE]
     background = (mass.sum() - inner.sum()) / (mass.size - inner.size)
-    if inner.mean() <= background:
-        return None
     above = np.maximum(mass - background, 0)
     total = above.sum()
+    if inner.mean() <= background or not total:  # rounding alone can make an even mass look uneven
+        return None
     across, down = above.sum(axis=0) @ _PLACES / total, above.sum(axis=1) @ _PLACES / total
     return float(1 - background / inner.mean()), float(across), float(down)

@@ -74,6 +74,13 @@ def test_a_background_of_the_same_colour_draws_nothing(model):
     np.testing.assert_array_equal(balance.state, before)
 
 
+@pytest.mark.parametrize("weight", [0.0, 0.1, 0.3, 1 / 3, 0.7, 1.1])
+def test_a_mass_that_is_the_same_everywhere_has_no_centre(weight):
+    balance, box = Balance(), Box(80, 60, 64, 64)
+    even = Model(1, 0, np.full(row_length(), weight, np.float32), 0.0)
+    assert shown(balance, even, box, meadow(112, 92), times=60) == box
+
+
 def test_a_slack_of_a_whole_window_draws_nothing(model):
     balance, good = Balance(), Box(80, 60, 64, 64)
     shown(balance, model, good, meadow(112, 92), times=60)
