@@ -54,6 +54,24 @@ def test_all_processes_tell_how_they_are(run):
     assert pipeline.health["detector"]["sent"] > 0
 
 
+def test_what_a_process_said_after_the_last_track_was_taken_counts_too(video, until):
+    path, boxes = video
+
+    def told():
+        report = health.receive(0.1)
+        return report and report.process == "detector" and report.counters["sent"] > heard and report.counters["sent"]
+
+    with (
+        Pipeline(path, boxes[0], SETTINGS) as pipeline,
+        Subscriber("health", Endpoint.parse(pipeline.endpoint)) as health,
+    ):
+        next(iter(pipeline))
+        heard = pipeline.health.get("detector", {}).get("sent", 0)
+        sent = until(told)
+        until(told)  # the one after it: by then the pipeline's own socket has the first
+    assert pipeline.health["detector"]["sent"] >= sent
+
+
 def test_three_processes_run_while_it_is_open_and_none_afterwards(video, alive):
     path, boxes = video
     with Pipeline(path, boxes[0], SETTINGS) as pipeline:
