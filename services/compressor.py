@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 from catstream.compression.compressor import Compressor
@@ -78,6 +79,8 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
         while not process.ended:
             message = features.receive(0.1)
             end = isinstance(message, End)
+            if message is None:
+                import_module("scipy.linalg")  # which the first reduction needs, and there is time
             if recorder is not None:
                 recorder.listen()
             if message is not None and not end:
