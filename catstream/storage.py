@@ -1,4 +1,4 @@
-"""Arrays and facts in one safetensors file: whole or not at all, checked, and no code in it."""
+"""Files that are there whole or not at all; arrays and facts in one safetensors file, checked, and no code in it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 
-__all__ = ["read", "write"]
+__all__ = ["place", "read", "write"]
 
 _KEY = "catstream"  # one metadata key only: with more, their order and so the bytes would vary
 _VERSION = 1  # of what the metadata means
 
 
-def write(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: dict[str, object]) -> None:
+def place(path: str | os.PathLike[str], data: bytes) -> None:
     """Write a file beside its final name, then put it in place of the old one; it survives a power cut from then on.
 
     Raises
@@ -26,15 +26,11 @@ def write(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: di
     OSError
         Where it cannot be written. What was there before stays as it was.
     """
-    from safetensors.numpy import save
-
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     try:
-        contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        told = {"version": _VERSION, "facts": facts, "checksum": _checksum(contiguous, facts)}
         with part.open("wb") as file:
-            file.write(save(contiguous, metadata={_KEY: json.dumps(told, sort_keys=True)}))
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())  # the new name must not be on disk before all that it names
         part.replace(path)
@@ -42,6 +38,21 @@ def write(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: di
     finally:
         with contextlib.suppress(OSError):  # of a disk that is read-only now; the next one writes over it
             part.unlink(missing_ok=True)
+
+
+def write(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: dict[str, object]) -> None:
+    """Place a file of arrays and facts.
+
+    Raises
+    ------
+    OSError
+        As `place` does.
+    """
+    from safetensors.numpy import save
+
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    told = {"version": _VERSION, "facts": facts, "checksum": _checksum(contiguous, facts)}
+    place(path, save(contiguous, metadata={_KEY: json.dumps(told, sort_keys=True)}))
 
 
 def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, object]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from catstream.box import Box
 from catstream.detection.detector import Detector
-from catstream.errors import VideoError
+from catstream.errors import ProtocolError, VideoError
 from catstream.learned import Learned
 from catstream.messages import End, Features, Model, Position, Track
 from catstream.services.helm import Helm, Orders
@@ -65,7 +65,11 @@ def main(
         file = state / "orders.json" if state is not None else None
         orders = Orders(box, begins=1) if box is not None else Orders(learned.box if learned else None)
         if resume and file is not None and file.exists():
-            orders = Orders.load(file)
+            try:
+                orders = Orders.load(file)
+            except ProtocolError as error:  # what was learned is whole, and goes on
+                process.trouble = str(error)
+                _log.warning("%s", error)
         detector = Detector(process.settings)
         helm = stack.enter_context(Helm(process.endpoint, detector, orders, file))
         line = _Line(process, stack, helm, owned)

@@ -13,9 +13,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Self
 
+from catstream import storage
 from catstream.box import Box
 from catstream.detection.detector import Detector
-from catstream.errors import BoxError
+from catstream.errors import BoxError, ProtocolError
 from catstream.messages import Answer, Command, Features, Track
 from catstream.video.frames import Frame
 from catstream.wire.endpoint import Endpoint
@@ -47,15 +48,25 @@ class Orders:
     def save(self, path: Path) -> None:
         """Write them, whole or not at all."""
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.part")
-        part.write_text(json.dumps(asdict(self)))
-        part.replace(path)
+        storage.place(path, json.dumps(asdict(self)).encode())
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what `save` wrote."""
-        told = json.loads(path.read_text())
-        return cls(**{**told, "box": told["box"] and Box(*told["box"])})
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        ProtocolError
+            Where it cannot be read.
+        """
+        try:
+            told = json.loads(path.read_text())
+            return cls(**{**told, "box": told["box"] and Box(*told["box"])})
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ProtocolError(
+                f"what was commanded cannot be read from {path} ({error!r}): what the run was started with holds, "
+                "command the rest again"
+            ) from None
 
 
 class Helm:

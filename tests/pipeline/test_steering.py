@@ -6,6 +6,7 @@ import os
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 
 import cv2
 import pytest
@@ -14,6 +15,7 @@ import zmq
 from catstream.errors import ProtocolError, RefusedError, ServiceError, SettingsError
 from catstream.learned import Learned
 from catstream.pipeline import Pipeline
+from catstream.services.helm import Orders
 from catstream.settings import Settings
 from catstream.steering import control
 from catstream.subscription import subscribe
@@ -151,6 +153,31 @@ def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
         assert resumed.result()[0]["sent"] <= 1
     assert pipeline.restarts == 1
     assert [track.frame for track in tracks] == list(range(len(boxes)))
+
+
+@pytest.mark.parametrize("torn", ["", "{", "null", '{"box": [1, 2]}'], ids=repr)
+def test_orders_that_a_power_cut_tore_are_said_and_the_run_goes_on(video, tmp_path, torn):
+    path, boxes = video
+    with Pipeline(path, boxes[0], SETTINGS, state=tmp_path / "kept") as pipeline:
+        before = next(track for track in pipeline if track.model_version >= 2)
+    (tmp_path / "kept" / "orders.json").write_text(torn)
+    with Pipeline(resume=tmp_path / "kept", settings=SETTINGS) as pipeline:
+        tracks = list(pipeline)
+    assert "what was commanded cannot be read" in pipeline.trouble["detector"]
+    assert pipeline.restarts == 0
+    assert 0 < tracks[0].frame <= before.frame + SETTINGS.window
+    assert tracks[0].model_version > 0, "what was learned is whole"
+    assert tracks[-1].frame == len(boxes) - 1
+
+
+def test_orders_are_on_disk_before_they_take_the_place_of_older_ones(tmp_path, monkeypatch):
+    done = []
+    for module, name in ((os, "fsync"), (Path, "replace")):
+        call = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *given, call=call, name=name: (done.append(name), call(*given))[1])
+    Orders(paused=True).save(tmp_path / "orders.json")
+    assert done == ["fsync", "replace", "fsync"], "the file, and then its name"
+    assert Orders.load(tmp_path / "orders.json") == Orders(paused=True)
 
 
 def test_stopped_by_a_command_all_is_stored_and_nothing_failed(video):
