@@ -8,7 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["between", "fit"]
+__all__ = ["between", "fit", "prepare"]
+
+
+def prepare() -> None:
+    """Import what the first call needs, in a quarter of a second: for who has the time before it."""
+    import scipy.linalg  # noqa: F401
 
 
 def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.ndarray:

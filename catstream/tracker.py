@@ -71,10 +71,12 @@ class Tracker:
         BoxError
             For a box that is not in the frame, has no area, or is not a number.
         """
-        self.detector = Detector(self.settings)
+        detector = Detector(self.settings)
+        first = detector.init(frame, Box(*box), time)  # where the box is refused, all goes on as before
+        self.detector = detector
         self.compressor = Compressor(self.settings)
         self.trainer = Trainer(self.settings)
-        self._learn(*self.detector.init(frame, Box(*box), time))
+        self._learn(*first)
 
     def update(self, frame: np.ndarray, time: float = 0.0) -> tuple[bool, Box | None]:
         """Find the object in the next frame, and learn from it.

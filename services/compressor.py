@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
+from catstream.compression import reduce
 from catstream.compression.compressor import Compressor
 from catstream.compression.generations import Generations
 from catstream.learned import Learned
@@ -80,7 +80,7 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
             message = features.receive(0.1)
             end = isinstance(message, End)
             if message is None:
-                import_module("scipy.linalg")  # which the first reduction needs, and there is time
+                reduce.prepare()
             if recorder is not None:
                 recorder.listen()
             if message is not None and not end:

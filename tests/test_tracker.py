@@ -74,3 +74,14 @@ def test_init_forgets_all_before(video):
 def test_update_before_init_is_refused(video):
     with pytest.raises(BoxError, match="call init"):
         Tracker().update(video[0][0])
+
+
+def test_a_refused_box_leaves_what_is_followed(video):
+    frames, boxes = video
+    tracker = Tracker()
+    tracker.init(frames[0], boxes[0])
+    with pytest.raises(BoxError):
+        tracker.init(frames[1], (-500, 0, 10, 10))
+    found, box = tracker.update(frames[1])
+    assert found
+    assert box.overlap(Box(*boxes[1])) > 0.5

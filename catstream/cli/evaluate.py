@@ -76,9 +76,11 @@ def evaluate(
 
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
-    if json_file is not None and not json_file.absolute().parent.is_dir():
-        raise CatstreamError(f"cannot write {str(json_file)!r}: its folder does not exist, make it first")
+    if json_file is not None and (json_file.is_dir() or not json_file.absolute().parent.is_dir()):
+        problem = "it is a folder" if json_file.is_dir() else "its folder does not exist, make it first"
+        raise CatstreamError(f"cannot write {str(json_file)!r}: {problem}")
 
+    errors: list[CatstreamError] = []
     console = Console(width=None if sys.stdout.isatty() else 120)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True) as progress:
@@ -90,15 +92,34 @@ def evaluate(
         def done(run: Run) -> None:
             progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}")
 
-        runs = run_all(sequences, names, settings, starts=starts, jobs=jobs, output=output, begin=begin, done=done)
+        runs = run_all(
+            sequences,
+            names,
+            settings,
+            starts=starts,
+            jobs=jobs,
+            output=output,
+            begin=begin,
+            done=done,
+            failed=errors.append,
+        )
 
+    for error in errors:
+        click.echo(f"catstream: {error}", err=True)
+    if not runs:
+        raise CatstreamError("no sequence could be followed: see above")
     rows = rows_of(runs)
     numbers = to_json(rows)
     console.print(_table(numbers))
     if json_file is not None:
-        json_file.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+        try:
+            json_file.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise CatstreamError(f"cannot write {str(json_file)!r}: {error.strerror}") from None
     if output is not None:
         console.print(f"report: {write_report(output / 'report.html', runs, settings)}", soft_wrap=True)
+    if errors:
+        raise CatstreamError(f"{len(errors)} of {len(errors) + len(runs)} runs could not be made, and are in no number")
 
 
 def _table(numbers: dict) -> Table:

@@ -93,6 +93,10 @@ def find_sequences(path: str | Path) -> list[Sequence]:
 def _sequences(folder: Path) -> list[Sequence]:
     name = folder.resolve().name
     rects = sorted(folder.glob("groundtruth_rect*.txt"), key=natural_order)
+    # One of OTB's own, of two objects, is empty.
+    rects = [file for file in rects if file.stat().st_size] or rects
+    if len(rects) == 1:
+        return [_sequence(name, folder, rects[0], _rectangles)]
     if rects:
         ends = [file.name.removeprefix("groundtruth_rect").removesuffix(".txt") for file in rects]
         return [_sequence(name + end, folder, file, _rectangles) for file, end in zip(rects, ends, strict=True)]
@@ -117,10 +121,14 @@ def _sequence(name: str, folder: Path, file: Path, reader: Callable[[np.ndarray]
 def _numbers(file: Path) -> np.ndarray:
     """The table in a text file, float64 (lines, columns), four columns at least."""
     rows: list[list[float]] = []
-    for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), start=1):
+    try:
+        lines = file.read_text(encoding="utf-8-sig").rstrip().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise VideoError(f"{str(file)!r} cannot be read ({error}): expected a text file, a line a frame") from None
+    for number, line in enumerate(lines, start=1):
         fields = line.replace(",", " ").replace(";", " ").split()
-        if not fields:
-            continue
+        if not fields:  # to pass it over would move all boxes after it by a frame
+            raise VideoError(f"{str(file)!r}, line {number} is blank: where the object is absent write nan,nan,nan,nan")
         try:
             row = [float(field) for field in fields]
         except ValueError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -15,10 +16,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from catstream.box import Box
-from catstream.errors import ServiceError, SettingsError, VideoError
+from catstream.errors import CatstreamError, ServiceError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.peers import PEERS, Peer, one_thread
 from catstream.evaluation.runs import Run, claim, label, load, save
+from catstream.services.loop import die_with
 from catstream.settings import Settings
 from catstream.tracker import Tracker
 
@@ -70,6 +72,7 @@ def evaluate(
     output: Path | None = None,
     begin: Callable[[int], None] = lambda _: None,
     done: Callable[[Run], None] = lambda _: None,
+    failed: Callable[[CatstreamError], None] | None = None,
 ) -> list[Run]:
     """All trackers on all sequences.
 
@@ -81,6 +84,7 @@ def evaluate(
     jobs : processes at once, one thread each
     output : where results are kept and found again, or None
     begin, done : called with the number of frames to come, and with each run when it is there
+    failed : called with what went wrong in each run that cannot be made, and the others are; None, it is raised
 
     Returns
     -------
@@ -89,9 +93,10 @@ def evaluate(
     Raises
     ------
     CatstreamError
-        Where a tracker or a name is not known, two sequences have one name, a
-        sequence cannot be read, or `output` holds runs made with other settings.
+        Where a tracker or a name is not known, two sequences have one name, or
+        `output` holds runs made with other settings.
     """
+    trackers = list(dict.fromkeys(trackers))
     _check(sequences, trackers)
     if output is not None:
         claim(output, settings)
@@ -116,23 +121,27 @@ def evaluate(
             missing.append(task)
         else:
             add(run)
-    for run in _work(missing, jobs):
-        if output is not None:
-            save(output, run)
-        add(run)
-    return [runs[tracker, label(sequence, start)] for tracker, _, sequence, start in wanted]
+    for result in _work(missing, output, jobs):
+        if isinstance(result, Run):
+            add(result)
+        elif failed is None:
+            raise result
+        else:
+            failed(result)
+    names = [(tracker, label(sequence, start)) for tracker, _, sequence, start in wanted]
+    return [runs[name] for name in names if name in runs]
 
 
-def _work(tasks: list[Any], jobs: int) -> Iterator[Run]:
+def _work(tasks: list[Any], output: Path | None, jobs: int) -> Iterator[Run | CatstreamError]:
     if jobs == 1:
-        yield from (_follow(*task) for task in tasks)
+        yield from (_follow(output, *task) for task in tasks)
         return
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_end_quietly) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_serve, initargs=(os.getpid(),)) as pool:
         try:
             # Long ones first, so that none is left running alone at the end.
             tasks = sorted(tasks, key=lambda task: task[3] - len(task[2]))
-            for future in as_completed([pool.submit(_follow, *task) for task in tasks]):
+            for future in as_completed([pool.submit(_follow, output, *task) for task in tasks]):
                 yield future.result()
         except BrokenProcessPool:
             raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
@@ -140,18 +149,29 @@ def _work(tasks: list[Any], jobs: int) -> Iterator[Run]:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _follow(*task: Any) -> Run:
-    """`follow` on one core: all trackers run under the same conditions, and the jobs are the parallelism."""
-    with threadpool_limits(1), one_thread():
-        return follow(*task)
+def _follow(
+    output: Path | None, tracker: str, settings: Settings, sequence: Sequence, start: int
+) -> Run | CatstreamError:
+    """`follow`, and keep the run. On one core: all trackers have the same conditions, the jobs are the parallelism."""
+    try:
+        with threadpool_limits(1), one_thread():
+            run = follow(tracker, settings, sequence, start)
+        if output is not None:
+            save(output, run)
+    except CatstreamError as error:
+        return CatstreamError(f"{tracker} on {label(sequence, start)}: {error}")
+    return run
 
 
-def _end_quietly() -> None:
-    """Ctrl-C reaches the workers too; the parent is the one that speaks."""
+def _serve(parent: int) -> None:
+    """Ctrl-C reaches the workers too; the parent is the one that speaks, and none outlives it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    die_with(parent)
 
 
 def _check(sequences: list[Sequence], trackers: list[str]) -> None:
+    if not trackers:
+        raise SettingsError(f"no tracker is given: there are {', '.join(TRACKERS)}")
     for tracker in trackers:
         if tracker not in TRACKERS:
             raise SettingsError(f"there is no tracker {tracker!r}: there are {', '.join(TRACKERS)}")

@@ -14,9 +14,11 @@ import cv2
 import numpy as np
 
 from catstream.box import Box
-from catstream.errors import SettingsError
+from catstream.errors import BoxError, SettingsError
 
-__all__ = ["PEERS", "Peer", "one_thread"]
+__all__ = ["OPENCV", "PEERS", "Peer", "one_thread"]
+
+OPENCV: str = cv2.__version__  #: which OpenCV that is
 
 #: Name on the command line -> class in OpenCV.
 PEERS = {"csrt": "TrackerCSRT", "kcf": "TrackerKCF", "mil": "TrackerMIL", "tld": "TrackerTLD"}
@@ -36,10 +38,22 @@ class Peer:
         self._tracker: Any = None
 
     def init(self, frame: np.ndarray, box: Sequence[float]) -> None:
-        """Start on x, y, w, h in pixels; OpenCV takes whole ones."""
+        """Start on x, y, w, h in pixels; OpenCV takes whole ones, and some of its trackers only those in the frame.
+
+        Raises
+        ------
+        BoxError
+            Where OpenCV takes it not even so.
+        """
+        height, width = frame.shape[:2]
+        left, top, w, h = (round(value) for value in box)
+        right, bottom = min(left + max(w, 1), width), min(top + max(h, 1), height)
+        left, top = min(max(left, 0), width - 1), min(max(top, 0), height - 1)
         self._tracker = self._create()
-        x, y, w, h = (round(value) for value in box)
-        self._tracker.init(frame, (x, y, max(w, 1), max(h, 1)))
+        try:
+            self._tracker.init(frame, (left, top, max(right - left, 1), max(bottom - top, 1)))
+        except cv2.error as error:
+            raise BoxError(f"OpenCV does not start on the box {Box(*box)}: {error.err or error}") from None
 
     def update(self, frame: np.ndarray) -> tuple[bool, Box | None]:
         """Whether it is found, and where. A tracker that fails inside OpenCV has lost it."""
@@ -56,7 +70,7 @@ def _find(name: str) -> Callable[[], Any]:
         if create is not None:
             return create
     raise SettingsError(
-        f"OpenCV {cv2.__version__} has no tracker {name!r}: install the contrib modules of OpenCV 4, "
+        f"OpenCV {OPENCV} has no tracker {name!r}: install the contrib modules of OpenCV 4, "
         'pip install "catstream[peers]"'
     )
 

@@ -20,7 +20,8 @@ from catstream.settings import Settings
 
 __all__ = ["write_report"]
 
-_FILMS = 8
+_FILMS = 8  # of the first tracker
+_OTHER_FILMS = 2  # of each other
 
 
 def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
@@ -32,7 +33,10 @@ def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
         Where the file cannot be written.
     """
     rows = rows_of(runs)
-    films = [film_of(run) for run in worst(runs, _FILMS)]
+    films: list[Film] = []
+    for place, tracker in enumerate(dict.fromkeys(run.tracker for run in runs)):
+        own = [run for run in runs if run.tracker == tracker]
+        films += map(film_of, worst(own, _OTHER_FILMS if place else _FILMS))
     sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
     changed = {name: value for name, value in settings.values().items() if value != getattr(Settings(), name)}
     body = [
@@ -52,15 +56,17 @@ def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
 
 
 def _plots(runs: list[Run]) -> str:
-    """Success and precision, averaged over the runs of each tracker."""
+    """Success and precision of each tracker, averaged over the sequences."""
 
     def curves(
         places: np.ndarray, measure: Callable[..., np.ndarray], at: Callable[[np.ndarray], float]
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        trackers = dict.fromkeys(run.tracker for run in runs)
+        found: dict[str, dict[str, list[np.ndarray]]] = {}
+        for run in runs:  # as in the table: first over the starts of a sequence
+            found.setdefault(run.tracker, {}).setdefault(run.sequence.name, []).append(measure(run.boxes, run.truth))
         means = {
-            tracker: np.mean([measure(run.boxes, run.truth) for run in runs if run.tracker == tracker], axis=0)
-            for tracker in trackers
+            tracker: np.mean([np.mean(plots, axis=0) for plots in sequences.values()], axis=0)
+            for tracker, sequences in found.items()
         }
         ranked = sorted(means.items(), key=lambda item: -at(item[1]))
         return {f"{tracker}  {at(curve):.3f}": (places, curve) for tracker, curve in ranked}

@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ import numpy as np
 from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.metrics import Score, score
+from catstream.evaluation.peers import OPENCV
 from catstream.settings import Settings
 
 __all__ = ["Run", "claim", "label", "load", "save"]
@@ -73,7 +75,7 @@ def label(sequence: Sequence, start: int) -> str:
 
 
 def claim(output: Path, settings: Settings) -> None:
-    """Make the folder for runs, and see that those in it were made with these settings.
+    """Make the folder for runs, and see that those in it were made with these settings, and these versions.
 
     Raises
     ------
@@ -82,14 +84,15 @@ def claim(output: Path, settings: Settings) -> None:
     VideoError
         Where the folder cannot be written.
     """
-    file, values = output / "catstream" / "settings.json", settings.values()
+    file = output / "catstream" / "settings.json"
+    values = settings.values() | {"catstream": version("catstream"), "opencv": OPENCV}
     try:
         if file.exists():
             before = json.loads(file.read_text(encoding="utf-8"))
             changed = sorted(key for key in {*before, *values} if before.get(key) != values.get(key))
             if changed:
                 raise SettingsError(
-                    f"the runs in {str(output)!r} were made with other settings ({', '.join(changed)}): "
+                    f"the runs in {str(output)!r} were made with other settings or versions ({', '.join(changed)}): "
                     "give another --output, or remove that folder"
                 )
         else:
@@ -106,24 +109,33 @@ def _files(output: Path, tracker: str, name: str) -> tuple[Path, Path, Path]:
 
 
 def save(output: Path, run: Run) -> None:
-    """Write a run; the folder of VOT's layout appears last and whole, so that it says: finished."""
+    """Write a run; the folder of VOT's layout appears last and whole, so that it says: finished.
+
+    Raises
+    ------
+    VideoError
+        Where it cannot be written.
+    """
     boxes, confidence, seconds = _files(output, run.tracker, run.name)
     folder, home = boxes.parent, output / run.tracker
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(folder, ignore_errors=True)
-    for made in (part, home / "times"):
-        made.mkdir(parents=True, exist_ok=True)
-    np.savetxt(home / f"{run.name}.txt", run.boxes, fmt="%.4f", delimiter=",")
-    np.savetxt(home / "times" / f"{run.name}_time.txt", run.seconds, fmt="%.8f")
-    np.savetxt(part / boxes.name, run.boxes, fmt="%.4f", delimiter=",")
-    np.savetxt(part / confidence.name, run.confidence, fmt="%.6f")
-    np.savetxt(part / seconds.name, run.seconds, fmt="%.8f")
-    part.rename(folder)
+    try:
+        for made in (part, home / "times"):
+            made.mkdir(parents=True, exist_ok=True)
+        np.savetxt(home / f"{run.name}.txt", run.boxes, fmt="%.4f", delimiter=",")
+        np.savetxt(home / "times" / f"{run.name}_time.txt", run.seconds, fmt="%.8f")
+        np.savetxt(part / boxes.name, run.boxes, fmt="%.4f", delimiter=",")
+        np.savetxt(part / confidence.name, run.confidence, fmt="%.6f")
+        np.savetxt(part / seconds.name, run.seconds, fmt="%.8f")
+        part.rename(folder)
+    except OSError as error:
+        raise VideoError(f"its result cannot be written to {str(home)!r} ({error.strerror}): make room") from None
 
 
 def load(output: Path, tracker: str, sequence: Sequence, start: int) -> Run | None:
-    """A finished run, or None where there is none.
+    """A finished run, or None where there is none, or it began on another box.
 
     Raises
     ------
@@ -148,4 +160,4 @@ def load(output: Path, tracker: str, sequence: Sequence, start: int) -> Run | No
         ) from None
     if not len(sequence) - start == len(run.boxes) == len(run.confidence) == len(run.seconds):
         return None
-    return run
+    return run if np.array_equal(run.boxes[0], run.truth[0].round(4)) else None

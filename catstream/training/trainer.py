@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from importlib import import_module
 
 import numpy as np
 
@@ -22,7 +21,7 @@ class Trainer:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        import_module("scipy.linalg")  # now, and not with the first sample, whose model is waited for
+        ridge.prepare()  # now, and not with the first sample, whose model is waited for
 
     def train(self, sample: Sample) -> Model:
         """Learn from a sample, in time that depends on n only.

@@ -56,6 +56,12 @@ def test_otb_with_two_objects_is_two_sequences(tmp_path):
     np.testing.assert_allclose(find_sequences(place)[1].boxes, TRUTH + 1)
 
 
+def test_an_object_of_otb_without_truth_is_no_sequence(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.2.txt", "img", lines(TRUTH))
+    (place / "groundtruth_rect.1.txt").touch()
+    check(place)
+
+
 def test_the_truth_of_one_sequence_of_otb_begins_at_its_300th_image(tmp_path):
     boxes = np.tile(TRUTH[:1], (471, 1))
     (tmp_path / "David").mkdir()
@@ -125,11 +131,19 @@ def test_a_folder_of_sequences_in_natural_order(tmp_path):
         ("1,2,3,4\n1,2,3,4,5\n", "line 2: expected 4 numbers"),
         ("1,2,3,4\na,b,c,d\n", "line 2"),
         ("nan,nan,nan,nan\n", "no box at all"),
+        ("1,2,3,4\n\n1,2,3,4\n", "line 2 is blank: .* nan,nan,nan,nan"),
     ],
 )
 def test_a_truth_that_cannot_be_read_says_where(tmp_path, text, message):
     place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", text)
     with pytest.raises(VideoError, match=message):
+        find_sequences(place)
+
+
+def test_a_truth_that_is_no_text_says_so(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", "")
+    (place / "groundtruth_rect.txt").write_bytes("1,2,3,4\n".encode("utf-16"))
+    with pytest.raises(VideoError, match=r"cannot be read .* expected a text file"):
         find_sequences(place)
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
+import cv2
 import numpy as np
+import psutil
 import pytest
 
-from catstream.errors import CatstreamError, SettingsError, VideoError
-from catstream.evaluation import onepass
+from catstream.errors import BoxError, CatstreamError, SettingsError, VideoError
+from catstream.evaluation import onepass, runs
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import evaluate, follow, starts_of
 from catstream.evaluation.peers import PEERS, Peer
@@ -22,7 +26,7 @@ SETTINGS = Settings()
 @pytest.fixture
 def run(sequence, found) -> Run:
     frames = len(sequence)
-    found[9] = np.nan
+    found[0], found[9] = sequence.boxes[0], np.nan
     return Run("catstream", sequence, 0, found.round(4), np.linspace(1, 0.5, frames).round(6), np.full(frames, 0.02))
 
 
@@ -33,8 +37,9 @@ def counted(monkeypatch, found):
 
     def instead(tracker, _, sequence, start=0):
         calls.append((tracker, sequence.name, start))
-        frames = len(sequence) - start
-        return Run(tracker, sequence, start, found[start:].round(4), np.ones(frames), np.full(frames, 0.01))
+        frames, boxes = len(sequence) - start, found[start:].round(4)
+        boxes[0] = sequence.boxes[start].round(4)
+        return Run(tracker, sequence, start, boxes, np.ones(frames), np.full(frames, 0.01))
 
     monkeypatch.setattr(onepass, "follow", instead)
     return calls
@@ -127,6 +132,21 @@ def test_runs_of_another_truth_are_made_again(tmp_path, sequence, run, counted):
     assert len(counted) == 1
 
 
+def test_a_run_from_another_box_is_made_again(tmp_path, sequence, counted):
+    evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
+    corrected = Sequence(sequence.name, sequence.path, sequence.boxes + 3)
+    evaluate([corrected], ["catstream"], SETTINGS, output=tmp_path)
+    assert len(counted) == 2
+
+
+def test_runs_of_another_version_are_not_mixed_in(tmp_path, monkeypatch, sequence, counted):
+    evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
+    monkeypatch.setattr(runs, "OPENCV", "3.0")
+    with pytest.raises(SettingsError, match=r"versions \(opencv\)"):
+        evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
+    assert len(counted) == 1
+
+
 def test_runs_made_with_other_settings_are_not_mixed_in(tmp_path, sequence, counted):
     evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
     with pytest.raises(SettingsError, match="coreset_size"):
@@ -157,6 +177,74 @@ def test_unknown_trackers_and_equal_names_are_refused_before_anything_runs(seque
     with pytest.raises(VideoError, match="two sequences are called 'walk'"):
         evaluate([sequence, sequence], ["catstream"], SETTINGS)
     assert not counted
+
+
+def test_no_tracker_at_all_is_refused_and_one_named_twice_runs_once(sequence, counted):
+    with pytest.raises(SettingsError, match="no tracker is given"):
+        evaluate([sequence], [], SETTINGS)
+    assert len(evaluate([sequence], ["mil", "mil"], SETTINGS)) == len(counted) == 1
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_sequence_that_cannot_be_followed_is_named_and_the_others_are_followed(tmp_path, sequence, jobs):
+    longer = Sequence("longer", sequence.path, np.vstack([sequence.boxes, sequence.boxes[:1]]))
+    errors: list[CatstreamError] = []
+    found = evaluate([longer, sequence], ["mil"], SETTINGS, jobs=jobs, output=tmp_path, failed=errors.append)
+    assert [run.name for run in found] == ["walk"]
+    assert load(tmp_path, "mil", sequence, 0) is not None
+    (error,) = errors
+    assert str(error).startswith("mil on longer: ")
+    assert "1 frames too few" in str(error)
+
+
+def test_an_error_that_nobody_takes_is_raised(sequence):
+    longer = Sequence("longer", sequence.path, np.vstack([sequence.boxes, sequence.boxes[:1]]))
+    with pytest.raises(CatstreamError, match=r"mil on longer: .* too few"):
+        evaluate([longer], ["mil"], SETTINGS)
+
+
+def test_a_killed_evaluation_leaves_no_worker(tmp_path, sequence):
+    script = tmp_path / "killed.py"
+    script.write_text(f"""
+import time
+from catstream.evaluation.datasets import find_sequences
+from catstream.evaluation.onepass import evaluate
+from catstream.settings import Settings
+
+def done(run):
+    print("done", flush=True)
+    time.sleep(60)
+
+if __name__ == "__main__":
+    evaluate(find_sequences({str(sequence.path)!r}), ["mil"], Settings(), starts=2, jobs=2, done=done)
+""")
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "done\n"
+        workers = [child for child in psutil.Process(parent.pid).children() if "spawn_main" in str(child.cmdline())]
+        assert workers
+        parent.kill()
+    _, alive = psutil.wait_procs(workers, timeout=20)
+    assert not alive
+
+
+def test_a_box_across_the_edge_of_the_frame_is_clipped_for_opencv(sequence):
+    frame = next(iter(sequence.frames()))
+    peer = Peer("mil")
+    peer.init(frame, (-8.0, 90.0, 40.0, 40.0))
+    found, _ = peer.update(frame)
+    assert found
+
+
+def test_what_opencv_does_not_start_on_is_one_line(monkeypatch, sequence):
+    class Broken:
+        def init(self, *_):
+            raise cv2.error("assertion failed")
+
+    peer = Peer("mil")
+    monkeypatch.setattr(peer, "_create", Broken)
+    with pytest.raises(BoxError, match="does not start on the box 1,2,30,40"):
+        peer.init(next(iter(sequence.frames())), (1, 2, 30, 40))
 
 
 def test_a_tracker_that_this_opencv_has_not_says_how_to_get_it(monkeypatch):

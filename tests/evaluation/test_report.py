@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from catstream.cli.evaluate import evaluate
-from catstream.errors import VideoError
+from catstream.errors import CatstreamError, VideoError
 from catstream.evaluation.films import film_of, worst
 from catstream.evaluation.report import write_report
 from catstream.evaluation.runs import Run
@@ -55,6 +57,16 @@ def test_the_report_needs_nothing_else(tmp_path, sequence, found, lost):
     assert page.count("<tr") == 1 + 2 + 2
 
 
+def test_of_each_tracker_the_worst_failures_are_shown_and_more_of_the_first(tmp_path, sequence, lost):
+    def named(tracker: str) -> list[Run]:
+        sequences = [replace(sequence, name=f"{tracker}{number}") for number in range(4)]
+        return [replace(lost, tracker=tracker, sequence=other) for other in sequences]
+
+    page = write_report(tmp_path / "report.html", named("catstream") + named("mil"), Settings()).read_text()
+    assert len(re.findall(r"<b>catstream\d</b>, catstream: wrong for", page)) == 4
+    assert len(re.findall(r"<b>mil\d</b>, mil: wrong for", page)) == 2
+
+
 def test_a_report_that_cannot_be_written_says_so(tmp_path, lost):
     with pytest.raises(VideoError, match="cannot write the report"):
         write_report(tmp_path / "missing" / "report.html", [lost], Settings())
@@ -75,6 +87,27 @@ def test_the_command_prints_a_table_and_writes_all(tmp_path, walk):
 def test_the_command_shows_the_spread_over_several_starts(walk):
     result = CliRunner().invoke(evaluate, [str(walk), "--starts", "2", "--tracker", "mil"], catch_exceptions=False)
     assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", result.output)
+
+
+def test_what_could_not_be_followed_is_said_after_the_table_of_the_rest(tmp_path, walk):
+    torn = tmp_path / "torn"
+    shutil.copytree(walk, torn)
+    (torn / "img" / "0012.png").unlink()
+    file = tmp_path / "out.json"
+    result = CliRunner().invoke(evaluate, [str(walk), str(torn), "--tracker", "mil", "--json", str(file)])
+    assert re.search(r"walk +mil +12 +0\.\d{3}", result.output)
+    assert re.search(r"mil on torn: .* 1 frames too few", result.output)
+    assert isinstance(result.exception, CatstreamError)
+    assert "1 of 2 runs" in str(result.exception)
+    assert [row["name"] for row in json.loads(file.read_text())["sequences"]] == ["walk"]
+
+
+def test_a_place_for_the_numbers_that_is_none_is_refused_before_the_work(tmp_path, walk):
+    for place, message in ((tmp_path, "it is a folder"), (tmp_path / "a" / "b", "does not exist")):
+        result = CliRunner().invoke(evaluate, [str(walk), "--tracker", "mil", "--json", str(place)])
+        assert isinstance(result.exception, CatstreamError)
+        assert message in str(result.exception)
+        assert not result.output
 
 
 def test_the_help_names_every_tracker_and_measure():
