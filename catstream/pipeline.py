@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from catstream.box import Box
 from catstream.errors import RecordingError, ServiceError, SettingsError, VideoError
@@ -47,7 +47,7 @@ class Pipeline:
     source : a video file, a folder of images, a pattern, a camera, a stream: see `catstream.video.source`
     box : x, y, w, h of the object in the first frame, in pixels; with neither this nor a model the
         first frame is held, or those of a live source pass by, until `catstream.control` sets a box
-    settings : all defaults where None
+    settings : or names and values of those that are not by default; where a run goes on, of those that are to be others
     model : file that `catstream save` wrote: the object is searched for, absent until it is found, and
         learning goes on from there
     part : which frames of a file or folder there are to follow, `slice(100, 200, 2)` for 100, 102 ... 198
@@ -86,7 +86,7 @@ class Pipeline:
         self,
         source: str | None = None,
         box: Sequence[float] | None = None,
-        settings: Settings | None = None,
+        settings: Settings | Mapping[str, Any] | None = None,
         *,
         model: str | os.PathLike[str] | None = None,
         part: slice = WHOLE,
@@ -99,14 +99,16 @@ class Pipeline:
             raise SettingsError("a run is begun in a folder (state) or goes on in one (resume): give one of them")
         self._kept = Origin.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
-        self.settings, self.part, self.notes = settings or Settings(), part, dict(notes or {})
+        self.part, self.notes = part, dict(notes or {})
         self.after: Position | None = None
         if self._kept is not None:
             source = source or self._kept.source
             if box is None and model is None:
                 box, model = self._kept.box, self._kept.model or None
-            self.settings, self.notes = settings or self._kept.settings, {**self._kept.notes, **self.notes}
             self.part = self._kept.part if part == WHOLE else part
+            self.notes = self._kept.notes | self.notes
+        given = settings.changed() if isinstance(settings, Settings) else settings or {}
+        self.settings = (self._kept.settings if self._kept is not None else Settings()).but(given)
         if source is None:
             raise SettingsError("a new run needs a source: give one")
         self.source = str(source)

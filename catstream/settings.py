@@ -212,7 +212,25 @@ class Settings:
         overrides: Mapping[str, Any] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> Settings:
-        """Gather settings from all their places.
+        """Gather settings from all their places: those that `given` finds, the others by default.
+
+        Raises
+        ------
+        SettingsError
+            For a name that does not exist (names the nearest), or a value that
+            does not fit.
+        """
+        return cls.of(cls.given(preset=preset, file=file, overrides=overrides, environment=environment))
+
+    @staticmethod
+    def given(
+        *,
+        preset: str | None = None,
+        file: str | os.PathLike[str] | None = None,
+        overrides: Mapping[str, Any] | Iterable[str] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> dict[str, Any]:
+        """Names and values that are given somewhere, as `of` and `but` check them.
 
         Parameters
         ----------
@@ -224,8 +242,7 @@ class Settings:
         Raises
         ------
         SettingsError
-            For a name that does not exist (names the nearest), or a value that
-            does not fit.
+            For a preset that does not exist, or a file that cannot be read.
         """
         values: dict[str, Any] = {}
         if preset is not None:
@@ -237,11 +254,7 @@ class Settings:
         for variable, text in (os.environ if environment is None else environment).items():
             if variable.startswith("CATSTREAM_"):
                 values[variable.removeprefix("CATSTREAM_").lower()] = text
-        if isinstance(overrides, Mapping):
-            values.update(overrides)
-        else:
-            values.update(map(_pair, overrides))
-        return cls.of(values)
+        return values | _named(overrides)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Settings:
@@ -278,13 +291,13 @@ class Settings:
         size = {"coreset_size": max(2, round(self.coreset_share * frames)), "coreset_share": 0.0}
         return Settings.of(self.values() | size)
 
-    def but(self, pairs: Iterable[str]) -> Settings:
-        """These, but for some: texts `name=value` as `--set` takes them.
+    def but(self, others: Mapping[str, Any] | Iterable[str]) -> Settings:
+        """These, but for some: names and values, or texts `name=value` as `--set` takes them.
 
         >>> Settings(lockstep=True).but(["coreset_size=32"]).changed()
         ['lockstep=true', 'coreset_size=32']
         """
-        return Settings.of(self.values() | dict(map(_pair, pairs)))
+        return Settings.of(self.values() | _named(others))
 
     def values(self) -> dict[str, Any]:
         """All of them, by name."""
@@ -343,6 +356,10 @@ def describe() -> list[tuple[str, str, Any, str]]:
         text = " | ".join(map(str, options)) if options else kind.__name__
         rows.append((field.name, " ".join([text, ", ".join(bounds)]).strip(), field.default, meta.description))
     return rows
+
+
+def _named(given: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
+    return dict(given if isinstance(given, Mapping) else map(_pair, given))
 
 
 def _pair(text: str) -> tuple[str, str]:

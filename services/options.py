@@ -12,7 +12,7 @@ import click
 from catstream.box import Box
 from catstream.settings import PRESETS, Settings
 
-__all__ = ["with_model", "with_object", "with_part", "with_settings"]
+__all__ = ["with_given", "with_model", "with_object", "with_part", "with_settings"]
 
 with_model = click.option(
     "--model", type=click.Path(path_type=Path), metavar="FILE", help="What `catstream save` wrote of the object."
@@ -46,14 +46,25 @@ def with_part(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
-def with_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """Add `--settings`, `--preset` and `--set`; the command gets them as one argument `settings`."""
+def with_given(command: Callable[..., None]) -> Callable[..., None]:
+    """Add `--settings`, `--preset` and `--set`; the command gets what is given as one argument `given`, a dict."""
 
     @click.option("--settings", "file", type=click.Path(path_type=Path), help="TOML file of settings.")
     @click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings.")
     @click.option("--set", "pairs", multiple=True, metavar="NAME=VALUE", help="One setting; may be repeated.")
     @wraps(command)
     def wrapped(file: Path | None, preset: str | None, pairs: tuple[str, ...], **options: Any) -> None:
-        command(settings=Settings.load(preset=preset, file=file, overrides=pairs), **options)
+        command(given=Settings.given(preset=preset, file=file, overrides=pairs), **options)
+
+    return wrapped
+
+
+def with_settings(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the same; the command gets them, and the others by default, as one argument `settings`."""
+
+    @with_given
+    @wraps(command)
+    def wrapped(given: dict[str, Any], **options: Any) -> None:
+        command(settings=Settings.of(given), **options)
 
     return wrapped

@@ -18,10 +18,8 @@ from catstream.box import Box
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
-from catstream.services.options import with_object, with_part, with_settings
-from catstream.settings import Settings
+from catstream.services.options import with_given, with_object, with_part
 from catstream.video.results import ResultsWriter, last_position, tracks
-from catstream.video.source import is_live
 
 __all__ = ["track"]
 
@@ -40,9 +38,9 @@ _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 @click.option("--resume", type=_FOLDER, help="Go on with what is kept in such a folder.")
 @with_object
 @with_part
-@with_settings
+@with_given
 def track(
-    settings: Settings,
+    given: dict[str, Any],
     part: slice,
     source: str | None,
     box: Box | None,
@@ -99,14 +97,10 @@ def track(
         raise click.UsageError("--state begins a run, --resume goes on with one: give one of them")
     if resume is None and source is None:
         raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
-    if video and source is not None and is_live(source):
-        raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
-    if lockstep:
-        settings = Settings.of({**settings.values(), "lockstep": True})
     pipeline = Pipeline(
         source,
         box,
-        None if resume is not None and settings == Settings() else settings,
+        given | ({"lockstep": True} if lockstep else {}),
         model=model,
         part=part,
         state=state,
@@ -117,6 +111,8 @@ def track(
     video, output = "video" in pipeline.notes, Path(pipeline.notes["output"]) if "output" in pipeline.notes else None
     if video and output is None:
         raise click.UsageError("--video needs --output, the folder to write it to")
+    if video and pipeline.live:
+        raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
     if resume is not None and output is not None:
         pipeline.after = last_position(output, pipeline.name)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

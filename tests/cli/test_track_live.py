@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from catstream.box import Box
+from catstream.pipeline import Pipeline
 from catstream.subscription import subscribe
 from catstream.video.demo import render
 
@@ -157,7 +158,6 @@ def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, 
 LIVE = "http://127.0.0.1:1/one"
 REFUSED = {
     "in lockstep": (["--lockstep"], "leave lockstep away"),
-    "its frames once more": (["--output", "out", "--video"], "leave it away"),
     "from a later frame": (["--start", "9"], "leave start, end and stride away"),
     "not there": ([], "connection refused"),
 }
@@ -170,3 +170,14 @@ def test_what_a_stream_cannot_give_is_refused_before_anything_starts(said, tmp_p
     assert "Traceback" not in errors
     assert words in " ".join(errors.split())
     assert not list(tmp_path.iterdir())
+
+
+def test_its_frames_cannot_be_had_once_more_for_a_video(camera, said, story, tmp_path):
+    cam = camera(lambda _: story[0][0])
+    with Pipeline(cam.url, story[0][1], state=tmp_path / "kept"):
+        pass
+    for run in ([cam.url, "--box", ",".join(map(str, story[0][1]))], ["--resume", tmp_path / "kept"]):
+        code, _, errors = said("track", *run, "--output", tmp_path / "out", "--video")
+        assert code == 2
+        assert "leave it away" in " ".join(errors.split())
+        assert not (tmp_path / "out").exists()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import os
 import time
 
 import psutil
 import pytest
 
 from catstream.compression.generations import Generations
+from catstream.pipeline import Pipeline
 from catstream.settings import Settings
-from catstream.state import TREES
+from catstream.state import TREES, Origin
 from catstream.video.source import open_source
 
 OFTEN = ["--set", "checkpoint_seconds=0.05", "--lockstep"]
@@ -135,3 +137,29 @@ def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, 
     assert "a pipeline that runs keeps its state" in errors
     assert running.wait(120) == 0
     assert frames(tmp_path / "out") == list(range(60))
+
+
+def test_settings_that_are_given_again_change_and_all_others_are_kept(killed, said, tmp_path):
+    kept = killed()
+    (tmp_path / "mine.toml").write_text("window = 99\nlag_frames = 7\n")
+    given = {
+        ("--set", "window=512"): ["lockstep=true", "window=512", "checkpoint_seconds=0.05"],
+        ("--set", "window=256", "--set", "lockstep=false"): ["checkpoint_seconds=0.05"],
+        ("--settings", tmp_path / "mine.toml"): ["lag_frames=3", "window=99", "checkpoint_seconds=0.05"],
+        ("--lockstep",): ["lockstep=true", "lag_frames=3", "window=99", "checkpoint_seconds=0.05"],
+    }
+    for options, changed in given.items():
+        variables = {"CATSTREAM_LAG_FRAMES": "3"} if "--settings" in options else {}
+        code, _, errors = said("track", "--resume", kept, *options, env=os.environ | variables)
+        assert code == 0, errors
+        assert Origin.load(kept).settings.changed() == changed
+
+
+def test_a_program_that_goes_on_gives_the_settings_that_are_others(video, tmp_path):
+    source, box = video
+    begun = {"settings": Settings(window=8, lockstep=True), "state": tmp_path / "kept"}
+    with Pipeline(source, [float(side) for side in box.split(",")], **begun):
+        pass
+    for given in (Settings(window=4), {"window": 4}):
+        assert Pipeline(resume=tmp_path / "kept", settings=given).settings == Settings(window=4, lockstep=True)
+    assert Pipeline(resume=tmp_path / "kept", settings={"window": 256}).settings == Settings(lockstep=True)
