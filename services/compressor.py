@@ -22,6 +22,7 @@ __all__ = ["main"]
 
 _END_SECONDS = 5.0  # that the end of the tracks, after that of the features, may take
 _STORE_SECONDS = 60.0  # that a slow disk may take
+_READ_SECONDS = 1e-7  # that it may take for a byte
 _LOCK_SECONDS = 10.0  # that a compressor before this one may take to end
 
 
@@ -58,6 +59,8 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
 
         recorder = None
         if record is not None:
+            read = record.stat().st_size if record.exists() else 0  # all of it, to go on after its last whole message
+            process.allow(_STORE_SECONDS + read * _READ_SECONDS)
             writer = stack.enter_context(RecordingWriter(record, process.run, resume=True))
             recorder = stack.enter_context(Recorder(writer, process.endpoint))
 

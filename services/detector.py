@@ -80,8 +80,9 @@ def main(
         elif learned is not None:
             detector.seek(learned.model, learned.box)
         # From the last frame that was stored, which is passed over: there may be none after it.
-        first = max(detector.seq - 1, 0)
-        process.allow(_OPEN_SECONDS + first * _SKIP_SECONDS)
+        first, step = max(detector.seq - 1, 0), part.step or 1
+        process.allow(_OPEN_SECONDS + ((part.start or 0) + first * step) * _SKIP_SECONDS)
+        process.allow_each((step - 1) * _SKIP_SECONDS)
         frames = stack.enter_context(open_source(source, first, part=part, since=since, idle=line.idle))
         line.source = frames
         coming = frames if frames.live else stack.enter_context(closing(ahead(frames)))

@@ -91,6 +91,10 @@ class Process:
         """Say that this turn of the loop may take so long: it is not stuck before."""
         self._pulse.allow(seconds)
 
+    def allow_each(self, seconds: float) -> None:
+        """Say that each turn of the loop from now on may take so much longer."""
+        self._pulse.allow_each(seconds)
+
     def close(self) -> None:
         """Send the last health, then close."""
         self._health.close()

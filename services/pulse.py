@@ -24,7 +24,7 @@ _FADES = 0.99  # with each turn: what the slowest of late was
 
 
 class Pulse:
-    """Shared by the loop, which calls `beat` and `allow`, and who watches, who reads `turns` and `patience`.
+    """Shared by the loop, which calls `beat`, `allow` and `allow_each`, and by who watches: `turns` and `patience`.
 
     handle : file descriptor of the memory, inherited; None to make it
     least : seconds that any turn may take
@@ -65,6 +65,10 @@ class Pulse:
         self._allowed = True
         self._cells[1] = max(self._least, seconds)
         self._cells[0] += 1
+
+    def allow_each(self, seconds: float) -> None:
+        """Say that each turn from now on may take so much longer."""
+        self._least += seconds
 
     def close(self) -> None:
         """Let go of the handle; the memory stays as long as the object."""
