@@ -1,6 +1,7 @@
 """What each ingredient is worth: all of them but one, over all sequences and several starts of each.
 
-Single runs are chaotic: what counts is the difference run by run, beside its standard error.
+Single runs are chaotic: what counts is the difference sequence by sequence, beside its standard error. How many runs
+changed at all says how much the sequences ask for an ingredient.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from accuracy import MEANS, accuracy_command, compared, difference, means, spread, videos
+from accuracy import MEANS, accuracy_command, changed, compared, difference, means, spread, videos
 from table import Table, publish
 
 from catstream.evaluation.runs import Run
 from catstream.settings import PRESETS, Settings
 
-COLUMNS = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error")
+COLUMNS = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error", "runs changed")
 _NEVER = -100.0  # no score is below it
 _LONGER_THAN_ANY_VIDEO = 1 << 30
 
@@ -67,8 +68,11 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def beside(whole: list[Run], runs: dict[str, list[Run]]) -> list[tuple[str | float, ...]]:
-    """A row for each variant: its means, and what is lost against the whole."""
-    return [(name, *means(found), spread(found), *difference(whole, found)) for name, found in runs.items()]
+    """A row for each variant: its means, what is lost against the whole, and in how many runs it shows."""
+    return [
+        (name, *means(found), spread(found), *difference(whole, found), changed(whole, found))
+        for name, found in runs.items()
+    ]
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from catstream.evaluation.runs import Run
 from catstream.evaluation.summary import rows_of
 from catstream.settings import Settings
 
-__all__ = ["accuracy_command", "compared", "difference", "means", "videos"]
+__all__ = ["accuracy_command", "changed", "compared", "difference", "means", "videos"]
 
 #: What `means` gives, as headings.
 MEANS = ("AUC", "success", "precision")
@@ -74,6 +74,16 @@ def spread(runs: Iterable[Run]) -> float:
 
 
 def difference(runs: list[Run], others: list[Run]) -> tuple[float, float]:
-    """Mean difference of AUC run by run, and its standard error: above twice that it is hardly chance."""
-    apart = np.array([a.score().auc - b.score().auc for a, b in zip(runs, others, strict=True)])
-    return float(apart.mean()), float(apart.std() / np.sqrt(len(apart)))
+    """Mean difference of AUC over the sequences, and its standard error: above twice that it is hardly chance.
+
+    Starts of one sequence are alike: they count as one.
+    """
+    pairs = zip(rows_of(runs), rows_of(others), strict=True)
+    apart = np.array([row.auc - other.auc for row, other in pairs])
+    return float(apart.mean()), float(apart.std(ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else 0.0
+
+
+def changed(runs: list[Run], others: list[Run]) -> int:
+    """How many runs have another box anywhere."""
+    pairs = zip(runs, others, strict=True)
+    return sum(not np.array_equal(run.boxes, other.boxes, equal_nan=True) for run, other in pairs)

@@ -6,9 +6,11 @@ CSRT and KCF come with the contrib modules of OpenCV 4: pip install "catstream[p
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Iterator
 from statistics import median
 
+import cv2
 from accuracy import videos
 from journey import travel
 from sequences import named, rendered, video
@@ -16,7 +18,7 @@ from table import Table, command, publish
 from throughput import MODES, steps
 
 from catstream.errors import SettingsError
-from catstream.evaluation.onepass import evaluate
+from catstream.evaluation.onepass import evaluate, follow
 from catstream.evaluation.peers import Peer
 from catstream.evaluation.runs import Run
 from catstream.settings import Settings
@@ -42,8 +44,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def beside_peers(options: argparse.Namespace) -> Table:
-    """All trackers on all sequences, one after the other, each on one core; and the pipeline on as many as it uses."""
-    trackers, note = ["catstream"], "without decoding, but for the three processes, which use all cores"
+    """All trackers on all sequences, each alone on one core; the pipeline, and CSRT once more, on all cores."""
+    trackers, note = ["catstream"], "one core and no decoding, but for the three processes, which use all cores"
     for name in PEERS:
         try:
             Peer(name)
@@ -52,7 +54,13 @@ def beside_peers(options: argparse.Namespace) -> Table:
             note += f"\n{error}"
     sequences = videos(options)
     journeys = [
-        travel(video(sequence), sequence.boxes[0], Settings(), part=slice(len(sequence))) for sequence in sequences
+        travel(
+            video(sequence),
+            sequence.boxes[0],
+            Settings(),
+            part=slice(sequence.begin, sequence.begin + len(sequence)),
+        )
+        for sequence in sequences
     ]
     pipeline = sum(len(journey.boxes) - 1 for journey in journeys) / sum(
         journey.moments[-1] - journey.moments[0] for journey in journeys
@@ -66,6 +74,11 @@ def beside_peers(options: argparse.Namespace) -> Table:
         rate = together(others)
         rows.append((tracker, rate, together(own) / rate, median(ratios), min(ratios), pipeline / rate))
     rows.append(("catstream, three processes", pipeline, together(own) / pipeline, None, None, 1.0))
+    if "csrt" in trackers:
+        cv2.setNumThreads(os.cpu_count() or 1)
+        threaded = together([follow("csrt", Settings(), sequence) for sequence in sequences])
+        cv2.setNumThreads(1)
+        rows.append(("csrt, all cores", threaded, together(own) / threaded, None, None, pipeline / threaded))
     columns = ("tracker", "frames/s", "catstream is faster by", "median sequence", "worst", "three processes by")
     return Table("Beside OpenCV's trackers", columns, rows, f"{len(own)} sequences, {note}")
 

@@ -36,8 +36,10 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     rows = []
     for percent in sizes:
         theirs, ours = runs[f"paper's, {percent} %"], runs[f"ours, {percent} %"]
-        panda = [run.score().success for run in theirs if "panda" in run.name]
-        rows.append((f"{percent} %", means(ours)[1], means(theirs)[1], panda[0] if panda else None, *PAPER[percent]))
+        panda = [run for run in theirs if "panda" in run.name]
+        rows.append(
+            (f"{percent} %", means(ours)[1], means(theirs)[1], means(panda)[1] if panda else None, *PAPER[percent])
+        )
     columns = ("n", "ours: mean", "paper's way: mean", "paper's way: panda", "paper: mean of ten", "paper: Panda")
     yield Table("Success against the size of the coreset", columns, rows, f"we: {len(found)} videos of TLD")
 

@@ -48,7 +48,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         sequence = named(options, name)
         path, truth = lengthened(sequence, frames)
         for n in options.sizes[:1] if options.quick else options.sizes:
-            settings = Settings(**PRESETS.get(options.preset, {}) | {"coreset_size": n})
+            settings = Settings(**PRESETS.get(options.preset, {}) | {"coreset_size": n, "coreset_share": 0.0})
             label = f"{sequence.name}, n = {n}"
             journey = journeys[label] = travel(str(path), truth[0], settings, watch=max(frames // 200, 1))
             ends = (LENGTHS * frames).astype(int)
