@@ -99,7 +99,7 @@ def supervisor(settings: Settings, source: str, **options: Any) -> None:
     """Start the other three on a source, and keep them running."""
     from catstream.services import supervisor
 
-    supervisor.main(source, settings, **options)
+    sys.exit(supervisor.main(source, settings, **options))
 
 
 if __name__ == "__main__":

@@ -108,6 +108,7 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
             process.trouble = generations.trouble if generations else ""
             process.beat(counters, now=end)
             if end:
+                process.broken = message.failed
                 samples.send(message)
                 break
         deadline = time.monotonic() + _END_SECONDS

@@ -113,6 +113,9 @@ def main(
         except VideoError as error:
             reason, failed = str(error), True
         line.end(detector.seq, reason, failed)
+        process.broken = failed
+        if failed:
+            _log.error("%s", reason)
 
 
 def _follow(detector: Detector, frame: Frame, orders: Orders) -> tuple[Track, Features]:

@@ -19,10 +19,13 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.refusals import refusals
 from catstream.wire.sockets import Publisher
 
-__all__ = ["REFUSED", "Parent", "Process", "die_with", "run"]
+__all__ = ["BROKEN", "REFUSED", "Parent", "Process", "die_with", "run"]
 
 #: Exit code of a process that would fail the same way again: it is not restarted.
 REFUSED = 2
+
+#: Exit code of a process that has done its work, on a stream that ended before it should: it is not restarted either.
+BROKEN = 3
 
 _CLOSE_SECONDS = 30.0
 _QUICK_SIZE = 128  # coreset size up to which a turn of compressor and trainer is short on any machine
@@ -46,6 +49,7 @@ class Process:
 
     settings, endpoint : as all processes of this pipeline have them
     trouble : what is wrong, for a person; told with its health
+    broken : whether the stream ended before it should, as its `End` tells
     """
 
     def __init__(self, name: str, settings: Settings, pulse: int | None = None) -> None:
@@ -53,6 +57,7 @@ class Process:
         self.settings = settings
         self.endpoint = Endpoint.parse(settings.endpoint, settings.keys)
         self.trouble = ""
+        self.broken = False
         # All but the detector turn in a time that grows with the coreset size.
         factor = 1.0 if name == "detector" else max(1.0, (settings.coreset_size / _QUICK_SIZE) ** 2)
         self._pulse = Pulse(pulse, PATIENCE * factor)
@@ -112,8 +117,8 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
 
     Returns
     -------
-    its exit code: 0 at the end of the stream or after SIGTERM, `REFUSED` for an error that names its cause, and
-    that would come again
+    its exit code: 0 at the end of the stream or after SIGTERM, `BROKEN` where the source broke, `REFUSED` for an error
+    that names its cause, and that would come again
     """
     logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
     if parent is not None:
@@ -130,7 +135,7 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
     except CatstreamError as error:
         _log.error("%s", error)
         return REFUSED
-    return 0
+    return BROKEN if process.broken else 0
 
 
 def die_with(parent: int) -> None:

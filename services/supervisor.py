@@ -18,7 +18,7 @@ from typing import IO
 
 from catstream.box import Box
 from catstream.errors import ServiceError
-from catstream.services.loop import REFUSED
+from catstream.services.loop import BROKEN, REFUSED
 from catstream.services.pulse import Pulse
 from catstream.settings import Settings
 from catstream.video.source import WHOLE
@@ -30,7 +30,7 @@ __all__ = ["NAMES", "Supervisor", "main"]
 NAMES = ("detector", "compressor", "trainer")
 
 _RESTARTS, _PER_SECONDS = 5, 60.0
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 5.0
+_FIRST_PAUSE = 0.1
 _FAREWELL_SECONDS = 12.0
 _APART_SECONDS = 3.0  # between the ends of compressor and detector, where both have ended well
 _BLINK_SECONDS = 0.5  # that count at most from one look at the children to the next: who slept longer saw nothing
@@ -60,7 +60,7 @@ class _Child:
 
     @property
     def finished(self) -> bool:
-        return self.process is not None and self.process.poll() == 0
+        return self.process is not None and self.process.poll() in (0, BROKEN)
 
     def hangs(self, seconds: float) -> bool:
         """Whether its loop has stood still for too long, having been watched for so many seconds more."""
@@ -157,6 +157,13 @@ class Supervisor:
         """Whether all is done: the detector has ended well, which it does once all that it sent is stored."""
         return self._children["detector"].finished
 
+    @property
+    def failure(self) -> str:
+        """Why the source broke, once all is done; empty where it did not."""
+        detector = self._children["detector"]
+        broke = detector.process is not None and detector.process.poll() == BROKEN
+        return detector.last_words() if broke else ""
+
     def news(self, name: str) -> list[str]:
         """What a child logged since the last time that this was asked."""
         return self._children[name].news()
@@ -188,7 +195,7 @@ class Supervisor:
                     child.hung = True
                     child.process.kill()
                 continue
-            if code == 0:
+            if child.finished:
                 # It was told to end, and the detector was not; or that died after its end, and repeats it.
                 if child is not detector and now - child.seen > _APART_SECONDS:
                     self._start(child)
@@ -203,7 +210,7 @@ class Supervisor:
                     f"{child.last_words()}"
                 )
             _log.warning("the %s died with %s, and is restarted: %s", child.name, _ending(code), child.last_words())
-            pause = min(_FIRST_PAUSE * 2 ** (recent - 1), _LONGEST_PAUSE) * random.uniform(0.5, 1)
+            pause = _FIRST_PAUSE * 2 ** (recent - 1) * random.uniform(0.5, 1)
             child.process, child.due = None, now + pause
 
     def stop(self) -> None:
@@ -255,8 +262,13 @@ class Supervisor:
         )
 
 
-def main(source: str, settings: Settings, box: Box | None, model: Path | None, part: slice = WHOLE) -> None:
-    """Run a pipeline for whoever subscribes, until the source ends or a signal comes."""
+def main(source: str, settings: Settings, box: Box | None, model: Path | None, part: slice = WHOLE) -> int:
+    """Run a pipeline for whoever subscribes, until the source ends or a signal comes.
+
+    Returns
+    -------
+    the exit code: `BROKEN` where the source broke, 0 otherwise
+    """
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
@@ -266,8 +278,11 @@ def main(source: str, settings: Settings, box: Box | None, model: Path | None, p
         try:
             while not supervisor.finished and not ended.wait(0.05):
                 supervisor.check()
+            if failure := supervisor.failure:
+                _log.error("%s", failure)
         finally:
             supervisor.stop()
+    return BROKEN if failure else 0
 
 
 def _ending(code: int) -> str:

@@ -32,4 +32,5 @@ def main(process: Process) -> None:
             models.welcome()
             process.beat(counters, now=end)
             if end:
+                process.broken = message.failed
                 break

@@ -6,6 +6,7 @@ import os
 import signal
 import time
 
+import cv2
 import psutil
 import pytest
 
@@ -17,6 +18,7 @@ from catstream.pipeline import Pipeline
 from catstream.services.supervisor import NAMES, Supervisor
 from catstream.settings import Settings
 from catstream.state import TREES
+from catstream.video.source import open_source
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Subscriber
 
@@ -38,6 +40,36 @@ def test_started_by_hand_in_any_order_they_complete_a_run(video, folder, tcp, se
     assert not end.failed
     assert [process.wait(30) for process in processes] == [0, 0, 0]
     assert Generations(folder / TREES).load(Settings()).seq == len(boxes)
+
+
+@pytest.fixture
+def broken(video, tmp_path):
+    """A source that breaks at its sixth frame, and the object's box."""
+    path, boxes = video
+    with open_source(path) as source:
+        for frame, _ in zip(source, range(9), strict=False):
+            cv2.imwrite(str(tmp_path / f"{frame.number}.png"), frame.image)
+    (tmp_path / "5.png").write_text("no image")
+    return tmp_path, ",".join(map(str, boxes[0]))
+
+
+def test_a_source_that_breaks_ends_its_supervisor_with_the_reason(broken, service):
+    source, box = broken
+    supervisor = service("supervisor", source, "--box", box)
+    errors = supervisor.communicate(timeout=60)[1]
+    assert supervisor.returncode == 3, errors
+    assert "5.png' (frame 5): replace or remove it" in errors
+    assert "restarted" not in errors
+
+
+def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, folder, service):
+    source, box = broken
+    arguments = {"compressor": ["--state", folder], "trainer": [], "detector": [source, "--box", box]}
+    processes = [service(name, "--set", f"endpoint={folder}", *given) for name, given in arguments.items()]
+    errors = [process.communicate(timeout=60)[1] for process in processes]
+    assert [process.returncode for process in processes] == [3, 3, 3], errors
+    assert "5.png' (frame 5): replace or remove it" in errors[-1]
+    assert Generations(folder / TREES).load(Settings()).seq == 5
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGKILL, -9)])
