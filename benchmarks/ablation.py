@@ -55,6 +55,12 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     base = Settings()
     variants = {"nothing left out": base}
     variants |= {f"without {name}": replace(base, **changes) for name, changes in WITHOUT.items()}
+    if options.only:
+        variants = {
+            name: settings
+            for name, settings in variants.items()
+            if settings is base or any(word in name for word in options.only)
+        }
     if options.quick:
         variants = dict(list(variants.items())[:2])
     found = videos(options)
@@ -62,7 +68,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     whole = runs["nothing left out"]
     note = f"{len(whole)} runs each; spread: standard deviation over {options.starts} starts, mean over the sequences"
     yield Table("Ablation", COLUMNS, beside(whole, runs), note)
-    if not options.quick:  # last and alone, as SCM takes longer than all that is above
+    if not options.quick and not options.only:  # last and alone, as SCM takes longer than all that is above
         paper = compared(options, found, {"the paper's tracker": Settings(**PRESETS["one-class-paper"])})
         yield Table("The paper's tracker", COLUMNS, beside(whole, paper), note)
 
@@ -76,5 +82,9 @@ def beside(whole: list[Run], runs: dict[str, list[Run]]) -> list[tuple[str | flo
 
 
 if __name__ == "__main__":
-    options = accuracy_command(__doc__, starts=5).parse_args()
+    parser = accuracy_command(__doc__, starts=5)
+    parser.add_argument(
+        "--only", nargs="+", metavar="WORD", help="leave out only ingredients whose name has one of these words"
+    )
+    options = parser.parse_args()
     publish(figures(options), options.json)
