@@ -102,8 +102,9 @@ class Guard:
 
         request = Request(scope, receive)
         answer: ASGIApp = self._stranger(request) or self._app
-        if answer is self._app and self._secret is not None and not request.url.path.startswith(_OPEN):
-            if (request.method, request.url.path) == ("POST", "/enter"):
+        path = scope["path"]  # which the routes go by: that of `request.url` may begin in the client's Host header
+        if answer is self._app and self._secret is not None and not path.startswith(_OPEN):
+            if (request.method, path) == ("POST", "/enter"):
                 answer = await self._enter(request)
             else:
                 answer = self._unknown(request) or self._app
@@ -123,7 +124,7 @@ class Guard:
         shown = _shown(request.headers)
         if shown is not None:
             return self._wrong(shown, request)
-        if request.url.path == "/":
+        if request.scope["path"] == "/":
             return FileResponse(_DOOR, 401)
         return PlainTextResponse("a token is needed: Authorization: Bearer TOKEN\n", 401)
 
