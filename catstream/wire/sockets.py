@@ -367,7 +367,7 @@ class Receiver(_Socket):
         if message is None:
             return None
         if message.seq <= self.taken:  # it was asked and sent all again: it does not know what is taken
-            self._answer(peer, Stored(self._position.seq, self.taken, self._position.version))
+            self._answer(peer, self._stored())
             return None
         if message.seq > self.taken + 1:
             if message.seq > self.taken + self._window + 1:  # more than a sender may have on its way
@@ -386,13 +386,17 @@ class Receiver(_Socket):
         """Say that all is taken up to the last message, and stored up to `position.seq`, but for `position.unsaved`."""
         self._position = position
         if self._peer is not None:
-            self._answer(self._peer, Stored(position.seq, self.taken, position.version, position.unsaved))
+            self._answer(self._peer, self._stored())
 
     def close(self) -> None:
         """Close, after the sender where it has sent its end: a connection that breaks may cost it the last answer."""
         if self._ended and not self._left:
             self._look(_LINGER, until=zmq.EVENT_DISCONNECTED)
         super().close()
+
+    def _stored(self) -> Stored:
+        at = self._position
+        return Stored(at.seq, self.taken, at.version, at.unsaved)
 
     def _answer(self, peer: bytes, message: Stored | Position) -> None:
         with contextlib.suppress(zmq.Again):  # a sender that does not listen asks again

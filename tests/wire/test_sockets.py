@@ -13,9 +13,9 @@ import pytest
 import zmq
 
 from catstream.errors import ProtocolError, ServiceError
-from catstream.messages import End, Health, Model, Position, Sample, Summary, Track
+from catstream.messages import End, Health, Model, Position, Sample, Stored, Summary, Track
 from catstream.wire.channels import CHANNELS
-from catstream.wire.codec import encode
+from catstream.wire.codec import decode, encode
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher, Receiver, Sender, Subscriber
 
@@ -237,6 +237,23 @@ def test_a_receiver_that_is_asked_stores_what_it_has_taken_first(endpoint, until
         with Sender("results", endpoint, 10) as sender:
             until(lambda: found and found[-1], lambda: (found.append(sender.position()), receiver.receive(0)))
     assert found[-1] == Position(5, version=7)
+
+
+def test_a_message_that_comes_again_is_answered_as_it_was_before(endpoint, stranger, until):
+    told = []
+    with Receiver("results", endpoint, Position(), WINDOW) as receiver:
+        sender = stranger(zmq.DEALER, "results")
+        for _ in range(2):
+            sender.send(encode(track(1)))
+
+        def turn():
+            if receiver.receive(0.05) is not None:  # on a full disk
+                receiver.acknowledge(Position(1, version=7, unsaved=1))
+            if sender.poll(0):
+                told.append(decode(sender.recv(), Stored))
+
+        until(lambda: len(told) == 2, turn)
+    assert told == [Stored(1, 1, version=7, unsaved=1)] * 2
 
 
 def test_a_receiver_of_another_stream_is_noticed(endpoint, until):
