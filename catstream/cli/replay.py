@@ -15,7 +15,7 @@ from rich.table import Table
 from catstream.errors import RecordingError
 from catstream.messages import Features, Model, Track
 from catstream.recording.file import Recording, RecordingWriter, run_of
-from catstream.recording.learning import Lesson, Marks, learn, marks_of
+from catstream.recording.learning import Lesson, Marks, check, learn, marks_of
 from catstream.recording.player import Player
 from catstream.wire.endpoint import Endpoint, meeting_place, private_folder
 
@@ -99,6 +99,7 @@ def _play(recording: Recording, place: Endpoint, speed: float | None, wait: bool
 def _learn(
     recording: Recording, pairs: tuple[str, ...], output: Path | None, incomplete: bool, console: Console
 ) -> None:
+    check(recording, incomplete=incomplete)  # before there is a file of what cannot be learned
     then, total = recording.settings, recording.counts[Features]
     trials = {"the same": then}
     if pairs:

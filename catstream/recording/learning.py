@@ -17,7 +17,7 @@ from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 from catstream.wire.codec import encode
 
-__all__ = ["Lesson", "Marks", "learn", "marks_of"]
+__all__ = ["Lesson", "Marks", "check", "learn", "marks_of"]
 
 
 @dataclass(slots=True)
@@ -77,6 +77,17 @@ class Lesson:
     marks: Marks = field(default_factory=Marks)
 
 
+def check(recording: Recording, *, incomplete: bool = False) -> None:
+    """Raise RecordingError where features are missing that are needed to learn from it, or there are none."""
+    if not recording.counts[Features]:
+        raise RecordingError(f"{recording.path} holds no features to learn from: {recording}")
+    if (missing := recording.missing[Features]) and not incomplete:
+        raise RecordingError(
+            f"{recording.path} misses the features of {missing} frames, so no model can come out as it was: record a "
+            "whole run with `catstream track --record`, or learn from what is there (--incomplete)"
+        )
+
+
 @threadpool_limits.wrap(limits=1)  # as the processes have: more threads add in another order
 def learn(
     recording: Recording,
@@ -102,15 +113,9 @@ def learn(
     Raises
     ------
     RecordingError
-        Where features are missing, or there are none.
+        As `check` does.
     """
-    if not recording.counts[Features]:
-        raise RecordingError(f"{recording.path} holds no features to learn from: {recording}")
-    if (missing := recording.missing[Features]) and not incomplete:
-        raise RecordingError(
-            f"{recording.path} misses the features of {missing} frames, so no model can come out as it was: record a "
-            "whole run with `catstream track --record`, or learn from what is there (--incomplete)"
-        )
+    check(recording, incomplete=incomplete)
     recorded = {model.version: encode(model) for model in recording.models()}
     compressor, trainer, lesson = Compressor(settings), Trainer(settings), Lesson(settings)
     newest: Model | None = None

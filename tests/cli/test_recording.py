@@ -58,6 +58,22 @@ def test_a_model_that_does_not_come_out_again_is_an_error(recorded, said, tmp_pa
     assert "recorded models did not come out again" in errors
 
 
+def test_what_is_refused_leaves_no_file_and_may_be_asked_for_again(recorded, said, tmp_path):
+    recording, output = Recording(recorded), tmp_path / "models.rec"
+    with RecordingWriter(tmp_path / "gap.rec", recording.run) as writer:
+        for _, message in list(recording.messages())[1:]:
+            if not (isinstance(message, Features) and message.seq == 30):
+                writer.write(message)
+    learn = ["replay", tmp_path / "gap.rec", "--learn", "--output", output]
+    code, _, errors = said(*learn)
+    assert code == 1
+    assert "learn from what is there (--incomplete)" in " ".join(errors.split())
+    assert not output.exists()
+    code, _, errors = said(*learn, "--incomplete")
+    assert code == 0, errors
+    assert Recording(output).counts[Model]
+
+
 def test_a_recording_is_watched_like_a_pipeline(recorded, catstream, tmp_path):
     player = catstream("replay", recorded, "--endpoint", tmp_path, "--fast", "--wait")
     watcher = catstream("watch", "tracks", "--json", "--endpoint", tmp_path)
