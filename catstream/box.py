@@ -88,13 +88,19 @@ class Box(NamedTuple):
         Raises
         ------
         BoxError
-            Where a number is not finite, the box has no area, or its centre
-            lies outside the frame.
+            Where a number is not finite, the box has no area, it is more than
+            twice as wide or high as the frame, or its centre lies outside it.
         """
         if not all(math.isfinite(value) for value in self):
             raise BoxError(f"a box needs four finite numbers, got {self}: give x,y,w,h in pixels")
         if self.w < 2 or self.h < 2:
             raise BoxError(f"a box needs a width and a height of at least 2 pixels, got {self.w:g} x {self.h:g}")
+        # Such a box covers the frame from edge to edge, wherever in it its centre lies: it says nothing of an object.
+        if self.w > 2 * width or self.h > 2 * height:
+            raise BoxError(
+                f"a box may be twice as wide and high as the frame of {width} x {height} pixels, got "
+                f"{self.w:g} x {self.h:g}: draw it tight around the object"
+            )
         x, y = self.centre
         if not (0 <= x < width and 0 <= y < height):
             raise BoxError(

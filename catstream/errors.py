@@ -28,7 +28,7 @@ class SettingsError(CatstreamError, ValueError):
 
 
 class BoxError(CatstreamError, ValueError):
-    """A box that is not in the frame, has no area, or is not a number."""
+    """A box that is not in the frame or far larger than it, has no area, or is not a number."""
 
 
 class VideoError(CatstreamError):

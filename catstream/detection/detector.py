@@ -80,7 +80,7 @@ class Detector:
         Raises
         ------
         BoxError
-            For a box that is not in the frame, has no area, is not a number, or looks like what is around it.
+            For a box that is no start for this frame (see `Box.inside`), or looks like what is around it.
             Nothing is forgotten then.
         """
         frame = Pyramid.of(image)

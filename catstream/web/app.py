@@ -143,11 +143,14 @@ def _command(body: bytes | None) -> tuple[str, list[float] | None, bool]:
     """Verb, box and whether to keep what was learned, as they were posted; ValueError where they cannot be read."""
     if body is None:
         raise ValueError("expected a command, got far more")
-    command: Any = json.loads(body)
+    try:
+        command: Any = json.loads(body, parse_int=float)  # one of too many digits for that is infinite, and refused
+    except RecursionError:
+        raise ValueError("expected a command, got brackets within brackets") from None
     if not isinstance(command, dict) or command.get("verb") not in ("set-box", "pause", "resume", "stop"):
         raise ValueError('expected {"verb": "set-box", "pause", "resume" or "stop"}')
     verb, box, keep = command["verb"], command.get("box"), command.get("keep", False)
-    numbers = isinstance(box, list) and len(box) == 4 and all(type(side) in (int, float) for side in box)
+    numbers = isinstance(box, list) and len(box) == 4 and all(type(side) is float for side in box)
     if (verb == "set-box") != numbers or not isinstance(keep, bool) or (box is not None and not numbers):
         raise ValueError('expected "box": [x, y, w, h] with set-box and with nothing else, and "keep": true or false')
     return verb, box, keep

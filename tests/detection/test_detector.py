@@ -178,6 +178,22 @@ def test_a_box_that_is_none_is_refused(scene, box):
         Detector(Settings()).init(scene(), Box(*box))
 
 
+@pytest.mark.parametrize("place", ["init", "correct"])
+@pytest.mark.parametrize(
+    "box", [(-1e300, -1e300, 2e300, 2e300), (0, 0, 641, 20), (0, 0, 20, 481)], ids=["huge", "wide", "high"]
+)
+def test_a_box_of_more_than_twice_the_frame_is_refused_and_what_is_goes_on(scene, place, box):
+    detector = started(scene)
+    with pytest.raises(BoxError, match="twice as wide and high as the frame of 320 x 240 pixels"):
+        getattr(detector, place)(scene((60, 50)), Box(*box))
+    assert detector.step(scene((60, 50)))[0].state != "absent"
+
+
+def test_a_box_of_twice_the_frame_is_a_start(scene):
+    track, _ = Detector(Settings()).init(scene((60, 50)), Box(-160, -120, 640, 480))
+    assert track.box.overlap(Box(-160, -120, 640, 480)) > 0.9
+
+
 def test_a_step_before_a_start_is_refused(scene):
     with pytest.raises(BoxError, match="call init"):
         Detector(Settings()).step(scene())

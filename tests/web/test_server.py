@@ -184,6 +184,15 @@ def test_a_command_that_cannot_be_is_refused_before_it_is_sent(page, command):
     assert "expected" in answer.json()["reason"]
 
 
+@pytest.mark.parametrize(
+    "body", ["[" * 4000, '{"verb": "set-box", "box": [1, 2, 3, %s]}' % ("9" * 400)], ids=["deep", "many digits"]
+)
+def test_a_command_that_is_hard_to_read_is_refused_like_any_other(page, body):
+    answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 400
+    assert "expected" in answer.json()["reason"]
+
+
 def test_who_steers_too_often_is_told_to_wait(page):
     answers = [page.post("/control", json={"verb": "format"}) for _ in range(40)]
     assert 429 in {answer.status_code for answer in answers}
