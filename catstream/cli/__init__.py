@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
+from typing import Any
 
 import click
 
 from catstream.errors import CatstreamError
 
-__all__ = ["VERBS", "main", "verb"]
+__all__ = ["INTERRUPTED", "VERBS", "main", "verb"]
+
+#: Exit code of a command that Ctrl-C ended before it was done.
+INTERRUPTED = 130
 
 #: Verb -> what it does. Its module is imported only when it is called: some take long.
 VERBS = {
@@ -51,6 +55,13 @@ class _Verbs(click.Group):
     def get_command(self, _: click.Context, name: str) -> click.Command | None:
         return verb(name) if name in VERBS else None
 
+    def invoke(self, context: click.Context) -> Any:
+        try:
+            return super().invoke(context)
+        except (KeyboardInterrupt, click.Abort):  # which click would take for an error
+            click.echo("stopped", err=True)
+            context.exit(INTERRUPTED)
+
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Verbs"):
             formatter.write_dl(list(VERBS.items()))
@@ -68,7 +79,7 @@ def group() -> None:
 
 
 def main() -> None:
-    """Run the command line: one line for an error, and exit code 1."""
+    """Run the command line: one line for an error, and exit code 1; `INTERRUPTED` after Ctrl-C."""
     try:
         group(prog_name="catstream")
     except CatstreamError as error:

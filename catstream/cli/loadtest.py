@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
+from catstream.cli import INTERRUPTED
 from catstream.errors import CatstreamError
 from catstream.services.options import with_settings
 from catstream.settings import Settings
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["loadtest"]
 
-_BROKEN, _INTERRUPTED = 1, 130
+_BROKEN = 1  # exit code where a limit was, or a stream
 _QUIET_CORES = 0.25  # busy with other things: more is worth a word
 _FIND = ("p99=0.1", "skipped=0.01")  # what a rate must hold where nothing else is given
 
@@ -139,7 +140,7 @@ def loadtest(
             console.print(f"report: {write_report(output / 'report.html', trial)}", soft_wrap=True)
     if trial.interrupted:
         console.print("stopped: these are the figures so far" if trial.steps else "stopped: nothing was measured yet")
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
     if trial.found:
         console.print(f"the highest rate that holds {', '.join(map(str, asked))}: {trial.found:g} frames/s a stream")
     for line in trial.broken:

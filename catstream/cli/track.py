@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 from catstream.box import Box
+from catstream.cli import INTERRUPTED
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
@@ -24,7 +25,6 @@ from catstream.video.results import ResultsWriter, last_position, tracks
 __all__ = ["track"]
 
 _FOLDER = click.Path(path_type=Path)
-_INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 
 
 @click.command()
@@ -148,7 +148,7 @@ def track(
     if interrupted:
         go_on = f", go on with: catstream track --resume {state or resume}" if state or resume else ""
         console.print(f"stopped: the results so far are kept{go_on}", highlight=False)
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
 
 
 class _Sinks:

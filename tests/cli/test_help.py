@@ -1,9 +1,11 @@
-"""Help teaches: what a verb does, what it writes, and an example that works."""
+"""Help teaches: what a verb does, what it writes, and an example that works. And what all verbs do alike."""
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -47,3 +49,21 @@ def test_a_verb_that_does_not_exist_is_refused():
 @pytest.mark.parametrize("name", [*NAMES, "supervisor"])
 def test_every_process_says_what_it_does(name):
     assert help_of("-m", "catstream.services", name).startswith(f"Usage: python -m catstream.services {name}")
+
+
+#: Verbs that take long, and how one sees that they are at it.
+LONG = {
+    "status": (["--wait", 60, "--endpoint", "."], lambda tasks, _: any("ZMQ" in task.read_text() for task in tasks)),
+    "demo": (["--frames", 100_000], lambda _, folder: list(folder.glob("demo/*"))),
+}
+
+
+@pytest.mark.parametrize(("verb", "options", "begun"), [(verb, *how) for verb, how in LONG.items()], ids=LONG)
+def test_ctrl_c_ends_any_verb_with_130_and_no_traceback(catstream, until, tmp_path, verb, options, begun):
+    process = catstream(verb, *options, cwd=tmp_path)
+    until(lambda: begun(Path(f"/proc/{process.pid}/task").glob("*/comm"), tmp_path) or process.poll() is not None)
+    process.send_signal(signal.SIGINT)
+    errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, errors
+    assert errors.strip().splitlines()[-1] == "stopped"
+    assert "Traceback" not in errors
