@@ -9,12 +9,18 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from catstream.messages import Run
 from catstream.services.options import with_part
+from catstream.settings import Settings
 from catstream.sinks import parquet
 from catstream.sinks.sink import open_sink
 from catstream.subscription import knock, subscribe
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Subscriber
 
 __all__ = ["sink"]
+
+_RUN_SECONDS = 1.0  # that a detector which follows frames may take to say what it runs with
 
 
 @click.command()
@@ -32,7 +38,8 @@ def sink(
     What a file is for is said by how its name ends; none may be there yet. Each
     track is written as it comes, and what is written stays, however this ends; an
     MP4 needs an orderly end. The pipeline does not wait: what was missed is
-    counted.
+    counted. Where another begins at the same place, the first was killed: that is
+    its end too.
 
     \b
     FILES
@@ -55,20 +62,32 @@ def sink(
             raise click.UsageError("--parquet is made from a database: name a .sqlite file too")
         parquet.require()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    written, newest = 0, -1
+    written, newest, reach, reason = 0, -1, 0, ""
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
-            knock(tracks.endpoint, tracks.keys)
+            place = knock(tracks.endpoint, tracks.keys)
             sinks = [stack.enter_context(closing(open_sink(path, source, part))) for path in files]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in tracks:
+                reach = reach or _reach(place)
+                if newest - track.frame > reach:
+                    reason = ": it had no end, and another run began"
+                    break
                 if track.frame <= newest:  # a restarted detector repeats some
                     continue
                 for each in sinks:
                     each.write(track)
                 written, newest = written + 1, track.frame
                 status.update(f"frame {newest}, {tracks.missed} missed")
-        reason = f": {tracks.end.reason}" if tracks.end is not None else ""
+        if tracks.end is not None:
+            reason = f": {tracks.end.reason}"
         click.echo(f"{written} tracks, {tracks.missed} missed{reason}", err=True)
     if columns is not None:
         parquet.export(databases[0], columns)
+
+
+def _reach(place: Endpoint) -> int:
+    """How many tracks a restarted detector repeats at most: those that may be on their way, as the run was told."""
+    with Subscriber("lessons", place, only=Run) as runs:
+        run = runs.receive(_RUN_SECONDS)
+    return int(run.settings["window"]) if run is not None else Settings().window

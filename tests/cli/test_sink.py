@@ -6,13 +6,18 @@ import json
 import select
 import signal
 import sqlite3
+import time
 from contextlib import closing
 
 import pytest
 
+from catstream.messages import Health, Track
 from catstream.pipeline import Pipeline
+from catstream.recording.file import run_of
 from catstream.settings import Settings
 from catstream.video.source import open_source
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.sockets import Publisher
 
 
 @pytest.mark.parametrize("stopped", [False, True], ids=["to the end", "stopped"])
@@ -41,6 +46,35 @@ def test_tracks_go_to_files_and_stay_there(video, catstream, tmp_path, stopped):
         assert sum(1 for _ in shown) == len(frames)
     assert (tmp_path / "t.parquet").stat().st_size > 0
     assert not files[1].with_name("tracks.sqlite-wal").exists()
+
+
+def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the_end(
+    catstream, folder, tmp_path, until
+):
+    endpoint, file = Endpoint.parse(str(folder)), tmp_path / "tracks.ndjson"
+    with (
+        Publisher("health", endpoint, "detector") as health,
+        Publisher("tracks", endpoint) as tracks,
+        Publisher("lessons", endpoint, greeting=run_of(Settings(window=100))) as lessons,
+    ):
+        sink = catstream("sink", file, "--endpoint", folder)
+        until(file.exists, lambda: health.send(Health("detector", time.time())))
+
+        def follow(frames):
+            for frame in frames:
+                tracks.send(Track(frame + 1, frame, frame / 30, "absent", None, 0.0, 0))
+                lessons.welcome()
+                time.sleep(0.002)
+
+        until(lambda: tracks.heard, tracks.welcome)
+        follow(range(300))
+        follow(range(205, 310))
+        follow(range(200))
+        errors = sink.communicate(timeout=60)[1]
+    assert sink.returncode == 0, errors
+    frames = [json.loads(line)["frame"] for line in file.read_text().splitlines()]
+    assert frames == list(range(310))
+    assert "310 tracks, 0 missed: it had no end, and another run began" in errors
 
 
 def test_where_no_pipeline_is_heard_no_file_is_left(said, tmp_path):
