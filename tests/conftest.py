@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import socket
 import threading
@@ -9,6 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -67,6 +69,20 @@ def until():
         return found
 
     return wait
+
+
+@pytest.fixture
+def full():
+    """Has the disk be full for a file that this process has open."""
+
+    def now(path):
+        handles = [int(handle.name) for handle in Path("/proc/self/fd").iterdir() if handle.resolve() == path.resolve()]
+        assert handles, f"{path} is not open"
+        with Path("/dev/full").open("wb") as nothing:
+            for handle in handles:
+                os.dup2(nothing.fileno(), handle)
+
+    return now
 
 
 class Camera:

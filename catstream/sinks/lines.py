@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from catstream.errors import VideoError
@@ -37,11 +39,17 @@ class LineSink(ABC):
         text = self.line(track)
         if text is None:
             return
-        try:
+        with self._to_disk():
             self._file.write(text + "\n")
-        except OSError as error:
-            raise VideoError(f"cannot write to {self.path} any more: {error.strerror}") from None
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        with self._to_disk():  # where a line was not taken, it is tried once more
+            self._file.close()
+
+    @contextmanager
+    def _to_disk(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise VideoError(f"cannot write to {self.path} any more: {error.strerror}") from None

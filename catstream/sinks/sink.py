@@ -32,7 +32,7 @@ class Sink(Protocol):
         """Add a track; raises VideoError where the file takes no more."""
 
     def close(self) -> None:
-        """Make the file whole; what was written stays."""
+        """Make the file whole; what was written stays. Raises VideoError where the file takes no more."""
 
 
 _KINDS: dict[str, Callable[[Path], Sink]] = {

@@ -45,5 +45,5 @@ class VideoSink:
 
     def close(self) -> None:
         """Finish the video."""
-        self._video.close()
         self._frames.close()
+        self._video.close()

@@ -58,14 +58,14 @@ class ResultsWriter:
     Raises
     ------
     VideoError
-        Where the directory cannot be written to, before any work is done.
+        Where the directory cannot be written to, before any work is done; or takes no more, later.
     """
 
     def __init__(self, directory: str | Path, name: str, start: int = 0, *, resume: bool = False) -> None:
         self.directory = Path(directory)
         self.rows = start
-        with contextlib.ExitStack() as files:
-            try:
+        try:
+            with contextlib.ExitStack() as files:
                 self.directory.mkdir(parents=True, exist_ok=True)
                 if resume:
                     self.rows = _cut(self.directory, name)
@@ -75,23 +75,24 @@ class ResultsWriter:
                     )
                     for file in (*_rows(name), _TRACKS)
                 )
-            except OSError as error:
-                raise VideoError(
-                    f"cannot write results to {str(directory)!r} ({error.strerror}): "
-                    "give a folder that exists or can be made, and that you may write to"
-                ) from None
-            self._files = files.pop_all()
-        if not self._tracks.tell():
-            self._tracks.write(COLUMNS + "\n")
+                if not self._tracks.tell():
+                    self._tracks.write(COLUMNS + "\n")
+                self._files = files.pop_all()
+        except OSError as error:
+            raise VideoError(
+                f"cannot write results to {str(directory)!r} ({error.strerror}): "
+                "give a folder that exists or can be made, and that you may write to"
+            ) from None
 
     def write(self, track: Track, seconds: float) -> None:
         """Add one frame, and the seconds of work it took. A frame that has its row already is skipped."""
         if track.frame < self.rows:
             return
-        for _ in range(track.frame - self.rows):
-            self._row(_ABSENT, "nan", "nan")
-        self._row(_ABSENT if track.box is None else _sides(track.box), f"{track.score:.6f}", f"{seconds:.6f}")
-        self._tracks.write(row(track) + "\n")
+        with self._to_disk():
+            for _ in range(track.frame - self.rows):
+                self._row(_ABSENT, "nan", "nan")
+            self._row(_ABSENT if track.box is None else _sides(track.box), f"{track.score:.6f}", f"{seconds:.6f}")
+            self._tracks.write(row(track) + "\n")
         self.rows = track.frame + 1
 
     def _row(self, box: str, score: str, seconds: str) -> None:
@@ -100,7 +101,15 @@ class ResultsWriter:
 
     def close(self) -> None:
         """Close the files; what was written stays."""
-        self._files.close()
+        with self._to_disk():  # where a row was not taken, it is tried once more
+            self._files.close()
+
+    @contextlib.contextmanager
+    def _to_disk(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise VideoError(f"cannot write results to {str(self.directory)!r} any more: {error.strerror}") from None
 
     def __enter__(self) -> Self:
         return self

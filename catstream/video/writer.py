@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
@@ -18,8 +20,9 @@ class VideoWriter:
     """Writes an MP4; a context manager.
 
     H.264 where this FFmpeg can, else MPEG-4. The file gets its name when it is
-    closed and whole; until then it is NAME.part, and a run that wrote no frame
-    leaves nothing.
+    closed and whole; until then it is NAME.part. A run that wrote no frame
+    leaves nothing, nor does one that could not write it whole: an MP4 without
+    its end cannot be read.
 
     Parameters
     ----------
@@ -30,7 +33,7 @@ class VideoWriter:
     Raises
     ------
     VideoError
-        Where the file cannot be written, before any work is done.
+        Where the file cannot be written, before any work is done; or takes no more, later.
     """
 
     def __init__(self, path: str | Path, rate: float, size: tuple[int, int]) -> None:
@@ -63,18 +66,32 @@ class VideoWriter:
 
         down, across = self._stream.height - image.shape[0], self._stream.width - image.shape[1]
         even: Any = cv2.copyMakeBorder(image, 0, down, 0, across, cv2.BORDER_REPLICATE)
-        self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(even, format="bgr24")))
+        with self._to_disk():
+            self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(even, format="bgr24")))
         self.frames += 1
 
     def close(self) -> None:
         """Finish the file and give it its name."""
-        if self.frames:
-            self._container.mux(self._stream.encode(None))
-        self._container.close()
-        if self.frames:
-            self._part.replace(self.path)
-        else:
-            self._part.unlink(missing_ok=True)
+        try:
+            with self._to_disk():
+                with self._container:
+                    if self.frames:
+                        self._container.mux(self._stream.encode(None))
+                if self.frames:
+                    self._part.replace(self.path)
+        finally:
+            with contextlib.suppress(OSError):  # of a disk that is read-only now
+                self._part.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _to_disk(self) -> Iterator[None]:
+        import av
+
+        try:
+            yield
+        except (OSError, av.FFmpegError) as error:
+            self.frames = 0  # as nothing can be read: to write on to such a file ends the process
+            raise VideoError(f"cannot write the video {str(self.path)!r} any more: {error.strerror}") from None
 
     def __enter__(self) -> Self:
         return self

@@ -166,6 +166,15 @@ def test_an_output_that_cannot_be_written_to_is_refused(video, said, tmp_path, o
     assert (tmp_path / "file").read_text() == "mine\n"
 
 
+@pytest.mark.parametrize("file", ["demo.txt", "demo.mp4.part"])
+def test_a_disk_that_fills_up_ends_the_run_in_one_line(video, said, tmp_path, file):
+    source, box = video
+    (tmp_path / file).symlink_to("/dev/full")
+    code, _, errors = said("track", source, "--box", box, "--output", tmp_path, "--video")
+    assert code == 1
+    assert "any more: No space left on device" in one_line(errors)
+
+
 def test_a_second_start_at_the_same_place_is_refused_and_older_results_stay(video, catstream, said, tmp_path):
     source, box = video
     place = ["--set", f"endpoint={tmp_path / 'run'}"]

@@ -95,6 +95,19 @@ def test_a_video_has_the_frames_of_its_tracks(tmp_path):
         assert sum(1 for _ in frames) == len(TRACKS)
 
 
+@pytest.mark.parametrize("suffix", [".ndjson", ".csv", ".txt"])
+def test_a_disk_that_is_full_is_said_in_one_line_and_what_was_written_stays(tmp_path, full, suffix):
+    path = tmp_path / f"tracks{suffix}"
+    sink = open_sink(path)
+    sink.write(TRACKS[0])
+    before = path.read_text()
+    full(path)
+    for last in (lambda: sink.write(TRACKS[2]), sink.close):  # which tries it once more
+        with pytest.raises(VideoError, match=r"cannot write to .* any more: No space left on device$"):
+            last()
+    assert path.read_text() == before
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_file_that_is_there_is_kept(tmp_path, suffix):
     path = tmp_path / f"tracks{suffix}"

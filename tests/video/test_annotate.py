@@ -76,6 +76,23 @@ def test_an_interrupted_run_keeps_its_video(tmp_path):
         assert sum(1 for _ in source) == 1
 
 
+@pytest.mark.parametrize("frames", [0, 200], ids=["at its end", "while it is written"])
+def test_a_disk_that_is_full_is_said_in_one_line_and_nothing_is_left_of_the_video(tmp_path, rng, full, frames):
+    image = rng.integers(0, 256, (240, 320, 3), np.uint8)  # noise, which no codec makes small
+
+    def run():
+        with AnnotatedVideo(tmp_path / "out.mp4", 25, (320, 240)) as video:
+            for frame in range(50):  # the encoder keeps some back
+                video.write(image, track(frame=frame))
+            full(tmp_path / "out.mp4.part")
+            for frame in range(frames):
+                video.write(image, track(frame=frame))
+
+    with pytest.raises(VideoError, match=r"cannot write the video .* any more: No space left on device$"):
+        run()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_place_that_cannot_be_written_is_refused_at_once(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(VideoError, match="cannot write the video"):

@@ -66,6 +66,23 @@ def test_the_same_tracks_give_the_same_bytes(tmp_path):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
+@pytest.mark.parametrize("file", ["walk.txt", "walk_confidence.value", "walk_time.txt", "tracks.csv"])
+def test_a_disk_that_is_full_is_said_in_one_line_and_what_was_written_stays(tmp_path, full, file):
+    results = ResultsWriter(tmp_path, "walk")
+    results.write(track(0), 0.01)
+    full(tmp_path / file)
+    for last in (lambda: results.write(track(1), 0.01), results.close):  # which tries it once more
+        with pytest.raises(VideoError, match=r"cannot write results to .* any more: No space left on device$"):
+            last()
+    assert len((tmp_path / file).read_text().splitlines()) == 1 + (file == "tracks.csv")
+
+
+def test_a_disk_that_is_full_from_the_start_is_refused_at_once(tmp_path):
+    (tmp_path / "tracks.csv").symlink_to("/dev/full")
+    with pytest.raises(VideoError, match="No space left on device"):
+        ResultsWriter(tmp_path, "walk")
+
+
 def test_a_place_that_cannot_be_written_is_refused_at_once(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(VideoError, match="cannot write results"):
