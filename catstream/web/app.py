@@ -135,7 +135,7 @@ class _Pages:
         return PlainTextResponse("ok\n")
 
     async def readyz(self, _: Request) -> Response:
-        silent = [name for name in CHANNELS["health"].senders if name not in self._feed.board.health]
+        silent = [name for name in CHANNELS["health"].senders if name not in self._feed.board.heard]
         return PlainTextResponse(f"not heard: {', '.join(silent)}\n", 503) if silent else PlainTextResponse("ok\n")
 
 

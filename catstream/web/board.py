@@ -8,13 +8,16 @@ from typing import Any, Literal
 from catstream.messages import End, Features, Health, Model, Preview, Track
 from catstream.web.film import Film
 
-__all__ = ["TREES", "Board", "Standing"]
+__all__ = ["SILENCE_SECONDS", "TREES", "Board", "Standing"]
 
 #: How the pipeline is: not heard yet, heard, silent since, at its end.
 Standing = Literal["waiting", "running", "gone", "ended"]
 
 #: The compressor's coreset trees.
 TREES = ("object", "background", "loss", "extent")
+
+#: After which who says nothing is gone: each process is heard once a second.
+SILENCE_SECONDS = 4.0
 
 _POINT_SECONDS = 0.25
 _POINTS = 480  # two minutes
@@ -29,6 +32,8 @@ class Board:
 
     standing, reason : of the pipeline
     tracks : how many came
+    health : what each process said last
+    heard : when each was heard last, of those that are not silent since
     """
 
     def __init__(self) -> None:
@@ -38,6 +43,7 @@ class Board:
         self.tracks = 0
         self.track: Track | None = None
         self.health: dict[str, Health] = {}
+        self.heard: dict[str, float] = {}
         self.learned_after: float | None = None
         self.film = Film()
         self.pictures: OrderedDict[int, Preview] = OrderedDict()
@@ -57,6 +63,8 @@ class Board:
                 self._learn(message, now)
             case Health():
                 self.health[message.process] = message
+                heard = self.heard | {message.process: now}
+                self.heard = {name: last for name, last in heard.items() if now - last <= SILENCE_SECONDS}
                 if self.standing in ("waiting", "gone") or now - self._ended > _FAREWELL_SECONDS:
                     self.standing, self.reason = "running", ""
                 self._point(now)
@@ -77,6 +85,7 @@ class Board:
         if self.standing != "ended":
             self.reason = reason
         self.health.clear()
+        self.heard.clear()
         self._changed("status", "trees")
 
     def rate(self, now: float) -> float:
@@ -164,7 +173,7 @@ class Board:
             "standing": self.standing,
             "reason": self.reason,
             "endpoint": self.endpoint,
-            "processes": sorted(self.health),
+            "processes": sorted(self.heard),
             "paused": bool(self.counter("detector", "paused")),
             "waiting": bool(self.counter("detector", "waiting")),
             "lost_seconds": self.counter("detector", "lost_seconds"),

@@ -10,14 +10,13 @@ from time import monotonic
 
 from catstream.errors import CatstreamError
 from catstream.subscription import subscribe
-from catstream.web.board import Board
+from catstream.web.board import SILENCE_SECONDS, Board
 from catstream.wire.endpoint import find
 
 __all__ = ["Feed"]
 
 _log = logging.getLogger(__name__)
 
-_SILENCE_SECONDS = 4.0  # each process is heard once a second
 _PAUSE_SECONDS = 0.5
 
 #: What is taken always, and what only while somebody looks: it costs the pipeline something.
@@ -90,7 +89,7 @@ class Feed:
 
     async def _take(self, channel: str) -> None:
         """Until the pipeline ends; what is for viewers only while there are any."""
-        timeout = _SILENCE_SECONDS if channel == "health" else None
+        timeout = SILENCE_SECONDS if channel == "health" else None
         while True:
             if channel in _WATCHED:
                 await self._watched.wait()

@@ -68,6 +68,21 @@ def test_silence_and_the_end_are_told_apart(board, facts):
     assert (status["standing"], status["reason"]) == ("ended", "the source came to its end")
 
 
+def test_a_process_that_is_silent_is_not_among_those_that_are_heard(board):
+    names, told = ("compressor", "detector", "trainer"), {}
+    for name in names:
+        board.take(Health(name, 1.0, {"sent": 1.0}), 0.0)
+    assert board.news(told)["status"]["processes"] == list(names)
+    for moment in (1.0, 2.0, 3.0, 4.0, 5.0):
+        for name in names[:2]:
+            board.take(Health(name, 1.0, {}), moment)
+    assert board.news(told)["status"]["processes"] == list(names[:2])
+    board.take(Health("trainer", 1.0, {}), 6.0)
+    assert board.news(told)["status"]["processes"] == list(names)
+    board.lost("nothing came")
+    assert board.news(told)["status"]["processes"] == []
+
+
 def test_the_last_words_of_a_pipeline_are_not_taken_for_the_next_one(board):
     board.take(End(2, "the source came to its end"), 10.0)
     board.take(Health("compressor", 1.0, {}), 10.5)

@@ -109,6 +109,19 @@ def test_it_is_healthy_by_itself_and_ready_with_all_processes(page, pipeline, un
     assert '\ncatstream_refused_messages_total{process="trainer"} 1.0\n' in shown
 
 
+def test_it_is_not_ready_where_one_process_is_silent(page, pipeline, until, monkeypatch):
+    monkeypatch.setattr("catstream.web.board.SILENCE_SECONDS", 0.5)
+
+    def answer(*heard):
+        for name in heard:
+            pipeline[name].send(Health(name, time.monotonic(), {}))
+        return page.get("/readyz")
+
+    until(lambda: answer("detector", "compressor", "trainer").status_code == 200)
+    until(lambda: answer("detector", "compressor").status_code == 503)
+    assert answer("detector", "compressor").text == "not heard: trainer\n"
+
+
 def test_tracks_come_to_the_page_as_they_are_sent(page, pipeline, facts):
     def turn():
         pipeline["detector"].send(Health("detector", time.monotonic(), {}))
