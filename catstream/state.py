@@ -1,6 +1,6 @@
 """The state of a pipeline on disk: what it needs to go on after a power cut.
 
-    DIR/origin.safetensors  what it was started with
+    DIR/origin.safetensors  what it was started with, for its owner alone: the source may have a password in it
     DIR/orders.json         what was commanded: see `catstream.services.helm`
     DIR/trees/              the compressor's checkpoints: see `catstream.compression.generations`
 
@@ -73,7 +73,7 @@ class Origin:
         facts: dict[str, object] = {field.name: getattr(self, field.name) for field in fields(self)}
         facts |= {"part": [self.part.start, self.part.stop, self.part.step], "settings": self.settings.values()}
         try:
-            storage.write(folder / _FILE, {}, facts)
+            storage.write(folder / _FILE, {}, facts, mode=0o600)
         except OSError as error:
             raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
 

@@ -18,8 +18,12 @@ _KEY = "catstream"  # one metadata key only: with more, their order and so the b
 _VERSION = 1  # of what the metadata means
 
 
-def place(path: str | os.PathLike[str], data: bytes) -> None:
+def place(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
     """Write a file beside its final name, then put it in place of the old one; it survives a power cut from then on.
+
+    Parameters
+    ----------
+    mode : who may read and write it from its first byte on, but for what the umask takes away
 
     Raises
     ------
@@ -29,7 +33,8 @@ def place(path: str | os.PathLike[str], data: bytes) -> None:
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     try:
-        with part.open("wb") as file:
+        part.unlink(missing_ok=True)  # what a power cut left would keep its mode
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())  # the new name must not be on disk before all that it names
@@ -40,8 +45,10 @@ def place(path: str | os.PathLike[str], data: bytes) -> None:
             part.unlink(missing_ok=True)
 
 
-def write(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: dict[str, object]) -> None:
-    """Place a file of arrays and facts.
+def write(
+    path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: dict[str, object], mode: int = 0o666
+) -> None:
+    """Place a file of arrays and facts, with a mode as `place` takes it.
 
     Raises
     ------
@@ -52,7 +59,7 @@ def write(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: di
 
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     told = {"version": _VERSION, "facts": facts, "checksum": _checksum(contiguous, facts)}
-    place(path, save(contiguous, metadata={_KEY: json.dumps(told, sort_keys=True)}))
+    place(path, save(contiguous, metadata={_KEY: json.dumps(told, sort_keys=True)}), mode)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, object]]:
