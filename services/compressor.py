@@ -20,6 +20,7 @@ from catstream.wire.sockets import Publisher, Receiver
 
 __all__ = ["main"]
 
+_FAREWELL_SECONDS = 5.0  # that the sender may take to end where all were asked to
 _END_SECONDS = 5.0  # that the end of the tracks, after that of the features, may take
 _STORE_SECONDS = 60.0  # that a slow disk may take
 _READ_SECONDS = 1e-7  # that it may take for a byte
@@ -79,7 +80,8 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
 
         if compressor.last_sample is not None:
             samples.send(compressor.last_sample)
-        while not process.ended:
+        end = False
+        while not process.ended_for(_FAREWELL_SECONDS if features.fed else 0):
             message = features.receive(0.1)
             end = isinstance(message, End)
             if message is None:
@@ -111,8 +113,11 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
                 process.broken = message.failed
                 samples.send(message)
                 break
+        else:
+            if compressor.seq > stored:  # who goes on sending has nothing of it to repeat
+                features.acknowledge(store(needed=False))
         deadline = time.monotonic() + _END_SECONDS
-        while recorder is not None and recorder.end is None and not process.ended and time.monotonic() < deadline:
+        while end and recorder is not None and recorder.end is None and time.monotonic() < deadline:
             features.receive(0.02)  # a detector that did not hear that its end is stored asks again
             recorder.listen()
             process.beat(counters)

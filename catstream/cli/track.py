@@ -66,7 +66,8 @@ def track(
     is opened again until it is back.
 
     A detector, a compressor and a trainer run as processes of their own;
-    Ctrl-C ends them, and the results so far are kept.
+    Ctrl-C ends them, as SIGTERM and a terminal that is lost do, and the results
+    so far are kept.
 
     With --state, what was learned is kept too, on disk, once a second: after a
     power cut, a crash or Ctrl-C, --resume goes on where the run was, with the
@@ -116,6 +117,8 @@ def track(
     if resume is not None and output is not None:
         pipeline.after = last_position(output, pipeline.name)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup has it
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
     console = Console(stderr=True, soft_wrap=True)
     run = _Run(pipeline)
     interrupted = False

@@ -376,11 +376,16 @@ class Receiver(_Socket):
                 self._asked = monotonic()
                 self._answer(peer, self._position)
             return None
-        self._asked, self._peer = 0.0, peer
+        self._asked, self._peer, self._left = 0.0, peer, False
         self.taken = message.seq
-        if isinstance(message, End):
-            self._ended, self._left = True, False
+        self._ended = isinstance(message, End)
         return message
+
+    @property
+    def fed(self) -> bool:
+        """Whether the one that sent last is still there, and has not sent its end."""
+        self._look()
+        return self._peer is not None and not self._ended and not self._left
 
     def acknowledge(self, position: Position) -> None:
         """Say that all is taken up to the last message, and stored up to `position.seq`, but for `position.unsaved`."""

@@ -13,8 +13,9 @@ import pytest
 from catstream.box import Box
 from catstream.compression.generations import Generations
 from catstream.errors import ServiceError
-from catstream.messages import End
+from catstream.messages import End, Track
 from catstream.pipeline import Pipeline
+from catstream.recording.file import Recording
 from catstream.services.supervisor import NAMES, Supervisor
 from catstream.settings import Settings
 from catstream.state import TREES
@@ -80,6 +81,43 @@ def test_no_process_outlives_its_supervisor(video, service, number, code, until,
     supervisor.send_signal(number)
     assert supervisor.wait(30) == code
     until(lambda: not any(alive(child.pid) for child in children))
+
+
+def test_all_that_are_asked_to_end_at_once_do_so_soon_and_all_is_stored(video, folder, service, until):
+    path, boxes = video
+    arguments = {
+        "compressor": ["--state", folder, "--record", folder / "run.rec"],
+        "trainer": [],
+        "detector": ["--recorded", path, "--box", ",".join(map(str, boxes[0]))],
+    }
+    with Subscriber("tracks", Endpoint.parse(str(folder))) as tracks:
+        processes = [service(name, "--set", f"endpoint={folder}", *given) for name, given in arguments.items()]
+        until(lambda: isinstance(track := tracks.receive(0.1), Track) and track.frame >= 20)
+        asked = time.monotonic()
+        for process in processes:
+            process.send_signal(signal.SIGTERM)
+        end = until(lambda: next((m for m in iter(lambda: tracks.receive(0.1), None) if isinstance(m, End)), None))
+        assert [process.wait(30) for process in processes] == [0, 0, 0]
+        assert time.monotonic() - asked < 5
+    assert 20 < end.totals["sent"] < len(boxes)
+    assert end.totals["stored"] == end.totals["sent"]
+    assert Recording(folder / "run.rec").end is not None
+
+
+def test_a_compressor_that_is_asked_to_end_alone_stores_what_it_has_and_leaves(video, folder, service, until):
+    path, boxes = video
+    arguments = {"compressor": ["--state", folder], "detector": [path, "--box", ",".join(map(str, boxes[0]))]}
+    place = ["--set", f"endpoint={folder}", "--set", "checkpoint_seconds=3600", "--set", "window=2000"]
+    with Subscriber("health", Endpoint.parse(str(folder))) as health:
+        compressor, detector = (service(name, *place, *given) for name, given in arguments.items())
+        # Without a trainer the detector stands still, with features that were taken and not stored.
+        told = (report.counters for report in iter(lambda: health.receive(60), None) if report.process == "detector")
+        taken = next(counters["taken"] for counters in told if counters["taken"])
+        compressor.send_signal(signal.SIGTERM)
+        assert compressor.wait(30) == 0
+        stored = until(lambda: (stored := next(told)["stored"]) >= taken and stored)
+    assert Generations(folder / TREES).load(Settings()).seq == stored
+    assert detector.poll() is None
 
 
 def test_a_process_whose_parent_is_gone_already_ends_at_once(folder, service):
