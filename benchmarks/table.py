@@ -22,7 +22,7 @@ from catstream.errors import CatstreamError
 __all__ = ["Table", "command", "publish"]
 
 _DATA = Path(os.environ.get("TRACKING_DATA") or Path(__file__).parents[2] / "shared" / "data")
-_LIBRARIES = ("catstream", "numpy", "numba", "opencv-python-headless", "scikit-learn", "pyzmq")
+_LIBRARIES = ("catstream", "numpy", "numba", "scikit-learn", "pyzmq")
 
 Cell = str | int | float | None
 
@@ -90,5 +90,6 @@ def _machine() -> dict[str, object]:
         "processor": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
+        "opencv": cv2.__version__,  # which may be of another package, with more in it
         **{library: version(library) for library in _LIBRARIES},
     }
