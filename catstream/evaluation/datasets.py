@@ -95,10 +95,8 @@ def _sequences(folder: Path) -> list[Sequence]:
     rects = sorted(folder.glob("groundtruth_rect*.txt"), key=natural_order)
     # One of OTB's own, of two objects, is empty.
     rects = [file for file in rects if file.stat().st_size] or rects
-    if len(rects) == 1:
-        return [_sequence(name, folder, rects[0], _rectangles)]
     if rects:
-        ends = [file.name.removeprefix("groundtruth_rect").removesuffix(".txt") for file in rects]
+        ends = [file.stem.removeprefix("groundtruth_rect") if len(rects) > 1 else "" for file in rects]
         return [_sequence(name + end, folder, file, _rectangles) for file, end in zip(rects, ends, strict=True)]
     for file, reader in (
         (folder / "gt.txt", _corners),

@@ -60,16 +60,15 @@ def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the
         sink = catstream("sink", file, "--endpoint", folder)
         until(file.exists, lambda: health.send(Health("detector", time.time())))
 
-        def follow(frames):
-            for frame in frames:
+        def follow(first, last, written):
+            for frame in range(first, last):
                 tracks.send(Track(frame + 1, frame, frame / 30, "absent", None, 0.0, 0))
-                lessons.welcome()
-                time.sleep(0.002)
+            until(lambda: len(file.read_text().splitlines()) == written, lessons.welcome)
 
         until(lambda: tracks.heard, tracks.welcome)
-        follow(range(300))
-        follow(range(205, 310))
-        follow(range(200))
+        follow(0, 300, written=300)
+        follow(205, 310, written=310)
+        follow(0, 200, written=310)
         errors = sink.communicate(timeout=60)[1]
     assert sink.returncode == 0, errors
     frames = [json.loads(line)["frame"] for line in file.read_text().splitlines()]

@@ -206,24 +206,26 @@ def test_an_error_that_nobody_takes_is_raised(sequence):
 def test_a_killed_evaluation_leaves_no_worker(tmp_path, sequence):
     script = tmp_path / "killed.py"
     script.write_text(f"""
-import time
+import signal
 from catstream.evaluation.datasets import find_sequences
 from catstream.evaluation.onepass import evaluate
 from catstream.settings import Settings
 
 def done(run):
     print("done", flush=True)
-    time.sleep(60)
+    signal.pause()
 
 if __name__ == "__main__":
     evaluate(find_sequences({str(sequence.path)!r}), ["mil"], Settings(), starts=2, jobs=2, done=done)
 """)
     with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        assert parent.stdout.readline() == "done\n"
-        workers = [child for child in psutil.Process(parent.pid).children() if "spawn_main" in str(child.cmdline())]
-        assert workers
-        parent.kill()
+        try:
+            assert parent.stdout is not None
+            assert parent.stdout.readline() == "done\n"
+            workers = [child for child in psutil.Process(parent.pid).children() if "spawn_main" in str(child.cmdline())]
+            assert workers
+        finally:
+            parent.kill()
     _, alive = psutil.wait_procs(workers, timeout=20)
     assert not alive
 
