@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import reprlib
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from catstream.errors import BoxError
@@ -62,23 +64,26 @@ class Box(NamedTuple):
         return shared / (self.area + other.area - shared)
 
     @classmethod
-    def parse(cls, text: str) -> Box:
-        """Read `x,y,w,h` (commas, blanks or tabs between them).
+    def of(cls, value: str | Iterable[float]) -> Box:
+        """Read a box as people write it: four numbers, or a text `x,y,w,h` (commas, blanks or tabs between them).
 
         Raises
         ------
         BoxError
-            Where there are not four numbers.
+            If these are not four numbers.
 
-        >>> Box.parse("10,20,30,40")
+        >>> Box.of("10,20,30,40")
         Box(x=10.0, y=20.0, w=30.0, h=40.0)
+        >>> import numpy as np
+        >>> Box.of(np.array([10, 20, 30, 40])) == Box.of([10, 20, 30, 40])
+        True
         """
-        fields = text.replace(",", " ").split()
         try:
-            x, y, w, h = (float(field) for field in fields)
-        except ValueError:
+            fields = value.replace(",", " ").split() if isinstance(value, str) else list(value)
+            x, y, w, h = map(float, fields)
+        except (TypeError, ValueError):
             raise BoxError(
-                f"a box is four numbers x,y,w,h in pixels, got {text!r}: for example --box 120,80,64,48"
+                f"a box is four numbers x,y,w,h in pixels, got {reprlib.repr(value)}: for example 120,80,64,48"
             ) from None
         return cls(x, y, w, h)
 

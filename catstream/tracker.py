@@ -8,7 +8,7 @@ three side by side.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -57,13 +57,13 @@ class Tracker:
             raise BoxError("nothing is tracked yet: call init with a frame and a box first")
         return self._track
 
-    def init(self, frame: np.ndarray, box: Sequence[float], time: float = 0.0) -> None:
+    def init(self, frame: np.ndarray, box: str | Iterable[float], time: float = 0.0) -> None:
         """Start on a box, and forget all before.
 
         Parameters
         ----------
         frame : uint8 (h, w, 3) BGR, or (h, w) grey
-        box : x, y, w, h in pixels
+        box : x, y, w, h in pixels: four numbers, or a text such as "120,80,64,48"
         time : seconds since the start of the video
 
         Raises
@@ -72,7 +72,7 @@ class Tracker:
             For a box that is not in the frame, has no area, or is not a number.
         """
         detector = Detector(self.settings)
-        first = detector.init(frame, Box(*box), time)  # where the box is refused, all goes on as before
+        first = detector.init(frame, Box.of(box), time)  # where the box is refused, all goes on as before
         self.detector = detector
         self.compressor = Compressor(self.settings)
         self.trainer = Trainer(self.settings)
