@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import socket
+import struct
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -12,13 +14,15 @@ import uvicorn
 
 from catstream.errors import ServiceError
 from catstream.web.app import create
+from catstream.web.connections import MOST, Connection
 from catstream.web.feed import Feed
 from catstream.web.guard import Guard, is_loopback
 
 __all__ = ["Server"]
 
-_CONNECTIONS = 256
 _FAREWELL_SECONDS = 2
+_ANY = ("0.0.0.0", "::")  # nosec B104  hosts that stand for all addresses of this machine
+_GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
 
 
 class Server:
@@ -32,12 +36,13 @@ class Server:
 
     Attributes
     ----------
-    url : of the page
+    url : of the page, for a browser on this machine
+    urls : this and, if it listens at all addresses of this machine, those that other machines can open it by
 
     Raises
     ------
     ServiceError
-        Where others could look without a token, the token could be guessed, or the port is taken.
+        If others could look without a token, the token could be guessed, or the port is taken.
     """
 
     def __init__(
@@ -52,14 +57,19 @@ class Server:
         guard = Guard(create(self._feed), token)
         self._socket = _listening(host, port)
         bound = self._socket.getsockname()[1]
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{bound}/" + (f"#{token}" if token else "")
+        end = f":{bound}/" + (f"#{token}" if token else "")
+        hosts = ["127.0.0.1", *_names_of_this_machine()] if host in _ANY else [f"[{host}]" if ":" in host else host]
+        self.urls = [f"http://{name}{end}" for name in hosts]
+        self.url = self.urls[0]
         config = uvicorn.Config(
             guard,
+            http=Connection,
+            ws="none",
             log_level="warning",
             access_log=False,
             server_header=False,
             proxy_headers=False,
-            limit_concurrency=_CONNECTIONS,
+            backlog=MOST // 2,
             timeout_graceful_shutdown=_FAREWELL_SECONDS,
         )
         self._server = _Uvicorn(config, self._feed)
@@ -99,10 +109,21 @@ def _listening(host: str, port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((host, port))
-        listening.listen(_CONNECTIONS)
+        listening.listen(MOST // 2)
     except OSError as error:
         listening.close()
         raise ServiceError(
             f"cannot listen on {host}:{port} ({error.strerror}): give another --port or --host"
         ) from None
     return listening
+
+
+def _names_of_this_machine() -> list[str]:
+    """The host name, and the IPv4 address of each network interface but the loopback."""
+    names = [socket.gethostname()]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _, interface in socket.if_nameindex():
+            with contextlib.suppress(OSError):  # it has no address
+                answer = fcntl.ioctl(asking, _GET_ADDRESS, struct.pack("256s", interface.encode()))
+                names.append(socket.inet_ntoa(answer[20:24]))
+    return [name for name in names if not name.startswith("127.")]

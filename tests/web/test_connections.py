@@ -1,0 +1,87 @@
+"""Connections that a client holds open: no number of them keeps others from the page. Real sockets, on loopback."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import ExitStack, suppress
+from urllib.parse import urlsplit
+
+import pytest
+
+from catstream.messages import Preview
+from catstream.web import connections
+from catstream.web.board import Board
+
+TOKEN = "correct-horse-battery"
+HALF = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX-"
+BEGUN = {
+    "nothing": b"",
+    "half a head": HALF,
+    "half a body": b"POST /control HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
+    b"Content-Length: 20\r\n\r\n{",
+    "half of the next request": b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" + HALF,
+}
+
+
+@pytest.fixture
+def connect():
+    """Opens connections to a page."""
+    with ExitStack() as stack:
+
+        def start(page):
+            address = urlsplit(str(page.base_url))
+            return stack.enter_context(socket.create_connection((address.hostname, address.port), timeout=60))
+
+        yield start
+
+
+def sent_until_it_is_closed(client, data):
+    """Send again and again; fails with TimeoutError if the server stops reading and does not close the connection."""
+    with suppress(ConnectionError):
+        while True:
+            client.sendall(data)
+
+
+@pytest.mark.parametrize("begun", BEGUN.values(), ids=BEGUN)
+def test_a_request_that_is_not_whole_in_time_ends_its_connection(serve, connect, monkeypatch, begun):
+    monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.05)
+    client = connect(serve())
+    client.sendall(begun)
+    with suppress(ConnectionResetError):
+        while client.recv(4096):
+            pass
+
+
+def test_a_request_that_comes_byte_by_byte_gets_no_more_time_for_it(serve, connect, monkeypatch):
+    monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.05)
+    client = connect(serve())
+    client.sendall(HALF)
+    sent_until_it_is_closed(client, b"x")
+
+
+def test_a_client_that_does_not_read_its_answers_is_let_go(serve, connect, monkeypatch):
+    monkeypatch.setattr(connections, "_ANSWER_SECONDS", 0.05)
+    monkeypatch.setattr(Board, "picture", lambda *_: Preview(1, 64, 48, None, bytes(1 << 23)))
+    client = connect(serve())
+    sent_until_it_is_closed(client, b"GET /pictures/1.jpg HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+
+
+@pytest.mark.parametrize("begun", [b"", HALF], ids=["nothing", "half a head"])
+def test_no_number_of_idle_connections_keeps_others_out(serve, connect, begun):
+    page = serve(token=TOKEN)
+    for _ in range(connections.MOST + 50):
+        connect(page).sendall(begun)
+    assert page.get("/healthz").status_code == 200
+    assert page.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
+
+
+def test_a_page_that_is_open_stays_so_while_others_open_connections(serve, connect, monkeypatch):
+    monkeypatch.setattr("catstream.web.feed.SILENCE_SECONDS", 0.1)  # after which the page is told of it
+    page = serve()
+    with page.stream("GET", "/events") as events:
+        lines = events.iter_lines()
+        assert next(lines) == "retry: 1000"
+        for _ in range(connections.MOST + 50):
+            connect(page).sendall(HALF)
+        assert page.get("/healthz").status_code == 200
+        assert any(line.startswith("data: ") for line in lines)
