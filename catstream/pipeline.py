@@ -23,6 +23,7 @@ from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.state import Origin, began, held, position
+from catstream.video.frames import without_password
 from catstream.video.source import WHOLE, is_live, open_source
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.sockets import Receiver, Subscriber
@@ -142,7 +143,8 @@ class Pipeline:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
-            endpoint = stack.enter_context(meeting_place(self.settings.endpoint, folder, self.settings.keys))
+            source = without_password(self._origin.source)
+            endpoint = stack.enter_context(meeting_place(self.settings.endpoint, folder, self.settings.keys, source))
             self.endpoint = str(endpoint)
             state = stack.enter_context(self._begun(self._state)) if self._state is not None else None
             start = self._start(state) if state is not None and self._kept is not None else Position()

@@ -23,10 +23,12 @@ from catstream import storage
 from catstream.box import Box
 from catstream.compression.generations import Generations
 from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.learned import Learned
 from catstream.messages import Position
 from catstream.settings import Settings
+from catstream.training.trainer import Trainer
 
-__all__ = ["TREES", "Origin", "began", "held", "position"]
+__all__ = ["TREES", "Origin", "began", "held", "learned", "position"]
 
 #: Folder of the checkpoints, in that of the state.
 TREES = "trees"
@@ -133,6 +135,20 @@ def began(folder: Path) -> bool:
 def position(folder: Path, settings: Settings) -> Position:
     """Where the newest whole checkpoint is."""
     return Generations(folder / TREES).load(settings).position
+
+
+def learned(folder: Path, settings: Settings) -> Learned:
+    """What was learned of the object, by the newest whole checkpoint: the sample in it gives its model once more.
+
+    Raises
+    ------
+    ServiceError
+        If there is no checkpoint, or nothing was learned before the newest one.
+    """
+    compressor = Generations(folder / TREES).load(settings)
+    if compressor.last_sample is None or compressor.box is None or not compressor.sampled:
+        raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
+    return Learned(Trainer(settings).train(compressor.last_sample), compressor.last_sample, compressor.box)
 
 
 @contextlib.contextmanager

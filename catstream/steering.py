@@ -31,6 +31,7 @@ class Control:
     """The helm of one running pipeline; close it, or use it in a `with`. Any number may hold one.
 
     endpoint : where it is attached
+    source : that the pipeline follows, empty if that is not known here
     timeout : seconds that a command may take
 
     Raises
@@ -43,9 +44,9 @@ class Control:
         From each command, where the pipeline does not let these keys steer.
     """
 
-    def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "") -> None:
-        self._place = find(endpoint, keys)
-        self.endpoint, self.timeout = str(self._place), timeout
+    def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> None:
+        self._place = find(endpoint, keys, source)
+        self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
         self._commands = Requester("control", self._place)
 
     def set_box(self, box: Sequence[float], *, keep: bool = False) -> Answer:
@@ -121,7 +122,7 @@ class Control:
         return answer
 
 
-def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "") -> Control:
+def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> Control:
     """Take the helm of a running pipeline.
 
     Parameters
@@ -129,10 +130,11 @@ def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "") -> Cont
     endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
     timeout : seconds that a command may take
     keys : the folder of keys of this client, where the pipeline asks for some; they must be allowed to steer
+    source : that the pipeline follows, instead of its endpoint: "walk.mp4"
 
     Raises
     ------
     ServiceError
         Where `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
     """
-    return Control(endpoint, timeout=timeout, keys=keys)
+    return Control(endpoint, timeout=timeout, keys=keys, source=source)

@@ -123,6 +123,7 @@ class Helm:
         while self._boxes:
             command, box = self._boxes.popleft()
             keeps = command.keep and self._detector.model.version > 0
+            first = self.orders.box is None
             try:
                 place = self._detector.correct if keeps else self._detector.init
                 found = place(frame.image, box, frame.time)
@@ -131,7 +132,7 @@ class Helm:
                 continue
             if not keeps:
                 self._hold(replace(self.orders, box=box, begins=found[0].seq))
-            what = "the same object goes on" if keeps else "another object begins"
+            what = "the same object goes on" if keeps else "the object begins" if first else "another object begins"
             self._answer(command, True, f"{what} at {box} in frame {found[0].frame}")
             return found
         return None

@@ -21,7 +21,8 @@ from catstream.errors import ServiceError
 from catstream.services.loop import BROKEN, REFUSED
 from catstream.services.pulse import Pulse
 from catstream.settings import Settings
-from catstream.video.source import WHOLE
+from catstream.video.frames import without_password
+from catstream.video.source import WHOLE, is_live
 from catstream.wire.endpoint import meeting_place, private_folder
 
 __all__ = ["NAMES", "Supervisor", "main"]
@@ -272,7 +273,8 @@ def main(source: str, settings: Settings, box: Box | None, model: Path | None, p
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
-    with private_folder() as folder, meeting_place(settings.endpoint, folder, settings.keys) as endpoint:
+    shown = without_password(source if is_live(source) else str(Path(source).absolute()))
+    with private_folder() as folder, meeting_place(settings.endpoint, folder, settings.keys, shown) as endpoint:
         settings = replace(settings, endpoint=str(endpoint))
         supervisor = Supervisor(source, box, settings, folder, model=model, owned=False, part=part)
         try:

@@ -83,7 +83,10 @@ def replay(
     if learns:
         _learn(found, pairs, output, incomplete, console)
     else:
-        with suppress(KeyboardInterrupt), private_folder() as folder, meeting_place(endpoint, folder, keys) as place:
+        with ExitStack() as stack:
+            stack.enter_context(suppress(KeyboardInterrupt))
+            folder = stack.enter_context(private_folder())
+            place = stack.enter_context(meeting_place(endpoint, folder, keys, str(recording.absolute())))
             _play(found, place, None if fast else speed, wait, console)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -10,26 +12,70 @@ from typing import Any
 import click
 
 from catstream.box import Box
+from catstream.errors import ServiceError
+from catstream.state import Origin, learned
 from catstream.steering import Control, control
 
 __all__ = ["pause", "resume", "save", "set_box", "stop"]
 
 
-def _at_the_helm(command: Callable[..., str]) -> Callable[..., None]:
-    """Add `--endpoint`, `--keys` and `--timeout`; the command gets a Control, and what it returns is printed."""
+@dataclass(frozen=True, slots=True)
+class _Meant:
+    """The pipeline that a command is for, as the options say it.
 
-    @click.option(
-        "--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given."
-    )
+    yes  whether a person who named none agrees to the only one
+    """
+
+    endpoint: str
+    source: str
+    keys: str
+    timeout: float
+    yes: bool
+
+    @property
+    def named(self) -> bool:
+        return bool(self.endpoint or self.source)
+
+    def control(self) -> Control:
+        """Connect to it and say which one it is; a person at a terminal who named none is asked first."""
+        pipeline = control(self.endpoint, timeout=self.timeout, keys=self.keys, source=self.source)
+        line = f"pipeline: {pipeline.source or 'a pipeline'} at {pipeline.endpoint}"
+        if self.named or self.yes or not sys.stdin.isatty():
+            click.echo(line, err=True)
+        elif not click.confirm(f"{line}. Is it the one that you mean?", default=True, err=True):
+            pipeline.close()
+            raise ServiceError("nothing was done: name the pipeline with --endpoint or --source")
+        return pipeline
+
+
+def _with_pipeline(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that say which pipeline is meant; the command gets them as one argument `meant`."""
+
+    @click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs.")
+    @click.option("--source", default="", metavar="SOURCE", help="The source that it follows, instead of --endpoint.")
     @click.option(
         "--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some."
     )
     @click.option(
         "--timeout", default=5.0, show_default=True, type=click.FloatRange(0), help="Seconds to wait for an answer."
     )
+    @click.option("--yes", is_flag=True, help="Do not ask whether the only pipeline that runs is the one meant.")
     @wraps(command)
-    def wrapped(endpoint: str, keys: str, timeout: float, **options: Any) -> None:
-        with control(endpoint, timeout=timeout, keys=keys) as pipeline:
+    def wrapped(endpoint: str, source: str, keys: str, timeout: float, yes: bool, **options: Any) -> None:
+        if endpoint and source:
+            raise click.UsageError("--endpoint and --source both say which pipeline is meant: give one of them")
+        command(meant=_Meant(endpoint, source, keys, timeout, yes), **options)
+
+    return wrapped
+
+
+def _steers(command: Callable[..., str]) -> Callable[..., None]:
+    """Add the same; the command gets a Control, and what it returns is printed."""
+
+    @_with_pipeline
+    @wraps(command)
+    def wrapped(meant: _Meant, **options: Any) -> None:
+        with meant.control() as pipeline:
             click.echo(command(pipeline, **options))
 
     return wrapped
@@ -38,7 +84,7 @@ def _at_the_helm(command: Callable[..., str]) -> Callable[..., None]:
 @click.command("set-box", context_settings={"ignore_unknown_options": True})  # -3,40,60,60 is a box
 @click.argument("box", metavar="X,Y,W,H")
 @click.option("--keep", is_flag=True, help="It is the same object: what was learned of it is kept.")
-@_at_the_helm
+@_steers
 def set_box(pipeline: Control, box: str, keep: bool) -> str:
     """Tell a running pipeline where the object is.
 
@@ -55,7 +101,7 @@ def set_box(pipeline: Control, box: str, keep: bool) -> str:
 
 
 @click.command()
-@_at_the_helm
+@_steers
 def pause(pipeline: Control) -> str:
     """Have a running pipeline take no more frames.
 
@@ -71,7 +117,7 @@ def pause(pipeline: Control) -> str:
 
 
 @click.command()
-@_at_the_helm
+@_steers
 def resume(pipeline: Control) -> str:
     """Have a paused pipeline go on.
 
@@ -84,24 +130,43 @@ def resume(pipeline: Control) -> str:
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@_at_the_helm
-def save(pipeline: Control, file: Path) -> str:
-    """Write what a running pipeline has learned to FILE.
+@click.option(
+    "--state", type=click.Path(path_type=Path), metavar="FOLDER", help="Of a run with --state; it may be over."
+)
+@_with_pipeline
+def save(meant: _Meant, file: Path, state: Path | None) -> None:
+    """Write what a pipeline has learned to FILE.
 
     It holds the newest model, and a summary of all that it was learned from.
     `catstream track SOURCE --model FILE` finds the object again by it, and goes
-    on learning from there. The pipeline goes on meanwhile.
+    on learning from there. A pipeline that runs goes on meanwhile.
+
+    With --state it is what the newest checkpoint in that folder holds, and no
+    pipeline has to run. A run without such a folder writes the same file at its
+    end with `catstream track --save-model FILE`.
 
     \b
     EXAMPLES
       catstream save walker.safetensors
+      catstream save walker.safetensors --state kept
       catstream track other.mp4 --model walker.safetensors
     """
-    return f"model {pipeline.save(file).version} is in {file}"
+    if state is None:
+        with meant.control() as pipeline:
+            version = pipeline.save(file).version
+    elif meant.named:
+        raise click.UsageError(
+            "--state names the folder of a run, --endpoint and --source a running pipeline: give one"
+        )
+    else:
+        found = learned(state, Origin.load(state).settings)
+        found.save(file)
+        version = found.model.version
+    click.echo(f"model {version} is in {file}")
 
 
 @click.command()
-@_at_the_helm
+@_steers
 def stop(pipeline: Control) -> str:
     """End a running pipeline as if its source had come to its end.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
-__all__ = ["RATE", "Frame", "Source", "Upright", "reason"]
+__all__ = ["RATE", "Frame", "Source", "Upright", "reason", "without_password"]
 
 #: Frames a second of a source that does not say: images have no clock.
 RATE = 25.0
@@ -89,3 +90,12 @@ class Upright:
 def reason(error: Any) -> str:
     """What FFmpeg says went wrong, in its words."""
     return (error.strerror or str(error)).lower()
+
+
+def without_password(source: str) -> str:
+    """The address of a stream without its user and password; any other source as it is.
+
+    >>> without_password("rtsp://me:secret@10.0.0.7/stream1")
+    'rtsp://10.0.0.7/stream1'
+    """
+    return re.sub(r"(?<=://)[^/]*@", "", source)

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import cv2
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, Upright, reason
+from catstream.video.frames import RATE, Frame, Source, Upright, reason, without_password
 
 __all__ = ["LiveSource"]
 
@@ -62,7 +62,7 @@ class LiveSource(Source):
     ) -> None:
         super().__init__(_name(text), None, RATE, (0, 0))
         self.skipped = self.reopened = 0
-        self._text, self._shown = text, re.sub(r"//[^/]*@", "//", text)  # without user and password
+        self._text, self._shown = text, without_password(text)
         self._number, self._zero, self._idle = start, since, idle
         self._upright = Upright()
         self._news = threading.Condition()  # guards what follows

@@ -17,7 +17,7 @@ import shutil
 import socket
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from catstream.errors import ServiceError
@@ -30,6 +30,7 @@ _LONGEST_PATH = 107  # bytes that the kernel takes for the name of a Unix socket
 _PREFIX = "catstream-"  # of private folders
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
 _MARK = "owner"  # file in a private folder, locked while its owner lives
+_SOURCE = "source"  # file beside the note below that says which source the pipeline follows
 _NOTE = "endpoint"  # file in the private folder of a running pipeline that says where its processes meet
 
 
@@ -37,9 +38,10 @@ _NOTE = "endpoint"  # file in the private folder of a running pipeline that says
 class Endpoint:
     """Where the processes meet: a folder, or hosts and the first port; and what is asked of who comes.
 
-    host   of all processes, as ZeroMQ takes it, but of those in `hosts`
-    hosts  of processes by name
-    keys   what all connect with, None where nobody is asked
+    host    of all processes, as ZeroMQ takes it, but of those in `hosts`
+    hosts   of processes by name
+    keys    what all connect with, None where nobody is asked
+    source  that the pipeline follows, without a password; empty if it is not known here
 
     >>> Endpoint.parse("tcp://localhost:5700").address(CHANNELS["models"])
     'tcp://127.0.0.1:5702'
@@ -52,6 +54,7 @@ class Endpoint:
     port: int = 0
     hosts: dict[str, str] = field(default_factory=dict)
     keys: Keys | None = None
+    source: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         """As the setting `endpoint` says it."""
@@ -189,13 +192,14 @@ def _sweep(home: Path) -> None:
 
 
 @contextlib.contextmanager
-def meeting_place(text: str, default: Path, keys: str = "") -> Iterator[Endpoint]:
+def meeting_place(text: str, default: Path, keys: str = "", source: str = "") -> Iterator[Endpoint]:
     """The endpoint for one pipeline, held for it alone; afterwards no socket file is left.
 
     Parameters
     ----------
     text, keys : the settings `endpoint` and `keys`
     default : the pipeline's private folder, to use where that is empty; `running` finds the pipeline by it
+    source : that the pipeline follows, without a password, for people who have several pipelines running
 
     Raises
     ------
@@ -204,7 +208,7 @@ def meeting_place(text: str, default: Path, keys: str = "") -> Iterator[Endpoint
     """
     endpoint = Endpoint.parse(text or str(default), keys)
     if endpoint.folder is None:  # the kernel gives a port to one process only
-        with _noted(endpoint, default):
+        with _noted(endpoint, default, source):
             yield endpoint
         return
     folder = endpoint.folder.absolute()
@@ -226,7 +230,7 @@ def meeting_place(text: str, default: Path, keys: str = "") -> Iterator[Endpoint
             ) from None
         try:
             endpoint = Endpoint.parse(str(folder), keys)
-            with _noted(endpoint, default):
+            with _noted(endpoint, default, source):
                 yield endpoint
         finally:
             for channel in CHANNELS.values():
@@ -237,17 +241,22 @@ def meeting_place(text: str, default: Path, keys: str = "") -> Iterator[Endpoint
 
 
 @contextlib.contextmanager
-def _noted(endpoint: Endpoint, folder: Path) -> Iterator[None]:
-    """Leave a note of where a pipeline is; it is locked for as long as the process lives, however that ends."""
+def _noted(endpoint: Endpoint, folder: Path, source: str) -> Iterator[None]:
+    """Leave a note that says where a pipeline is and which source it follows.
+
+    The note is locked for as long as the process lives, however that ends.
+    """
     path = folder / _NOTE
     with path.open("w") as note:
         fcntl.flock(note, fcntl.LOCK_EX)
+        (folder / _SOURCE).write_text(source)
         note.write("\n".join([str(endpoint), *([str(endpoint.keys.folder)] if endpoint.keys is not None else [])]))
         note.flush()
         try:
             yield
         finally:
             path.unlink(missing_ok=True)
+            (folder / _SOURCE).unlink(missing_ok=True)
 
 
 def running() -> list[Endpoint]:
@@ -258,34 +267,67 @@ def running() -> list[Endpoint]:
             with contextlib.suppress(OSError), path.open() as note:  # it may be gone by now, or another user's
                 text = note.read()
                 if text and os.fstat(note.fileno()).st_uid == os.geteuid() and _locked(note.fileno()):
-                    endpoints.append(Endpoint.parse(*text.split("\n")))
+                    endpoint = Endpoint.parse(*text.split("\n"))
+                    endpoints.append(replace(endpoint, source=_read(path.with_name(_SOURCE))))
     return endpoints
 
 
-def find(text: str = "", keys: str = "") -> Endpoint:
-    """The endpoint of a running pipeline: the one given, or where none is that of the only one of this user.
+def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
+    """The endpoint of a running pipeline: the one given, or the one that follows `source`, or the user's only one.
 
     Parameters
     ----------
-    text, keys : the settings `endpoint` and `keys`; the only one of this user has its keys noted
+    text, keys : the settings `endpoint` and `keys`; a pipeline of this user has its keys noted
+    source : that a pipeline of this user follows, as it was given, or its file name
 
     Raises
     ------
     ServiceError
-        Where there is none, or more than one.
+        If there is none, or more than one.
     """
     if text:
-        return Endpoint.parse(text, keys)
+        given = Endpoint.parse(text, keys)
+        return replace(given, source=_source_at(given))
     endpoints = running()
+    if source:
+        found = [endpoint for endpoint in endpoints if _follows(endpoint, source)]
+        if not found:
+            raise ServiceError(f"no pipeline of yours follows {source!r}{_told(endpoints)}")
+        if len(found) > 1:
+            raise ServiceError(f"{len(found)} pipelines follow {source!r}: say which (--endpoint){_told(found)}")
+        return found[0]
     if not endpoints:
         raise ServiceError(
             "no pipeline of yours is running: start one (catstream track), or say where it is (--endpoint)"
         )
     if len(endpoints) > 1:
         raise ServiceError(
-            f"{len(endpoints)} pipelines are running, say which (--endpoint): {', '.join(sorted(map(str, endpoints)))}"
+            f"{len(endpoints)} pipelines are running: say which (--endpoint or --source){_told(endpoints)}"
         )
     return endpoints[0]
+
+
+def _read(path: Path) -> str:
+    """The text of a file, empty if there is none."""
+    with contextlib.suppress(OSError):
+        return path.read_text()
+    return ""
+
+
+def _told(endpoints: list[Endpoint]) -> str:
+    """The pipelines that are running, for the end of an error's line."""
+    return "".join(f"; {place.source or 'a pipeline'} at {place}" for place in sorted(endpoints, key=str))
+
+
+def _source_at(endpoint: Endpoint) -> str:
+    """The source of a pipeline of this user that runs there; empty if it is not known."""
+    place = str(endpoint.folder.absolute()) if endpoint.folder is not None else str(endpoint)
+    return next((other.source for other in running() if str(other) == place), "")
+
+
+def _follows(endpoint: Endpoint, source: str) -> bool:
+    """Whether a pipeline follows this source: the same text, the same file, or a file of that name."""
+    return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
 
 
 def _homes() -> list[Path]:

@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from catstream.compression.generations import Generations
+from catstream.learned import Learned
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.state import TREES, Origin
@@ -81,6 +82,11 @@ def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed
         assert (tmp_path / "out" / file).read_bytes() == (undisturbed / file).read_bytes()
     assert "60 messages sent, 60 stored" in errors
     assert Generations(kept / TREES).load(Settings()).seq == 60
+    code, output, errors = said("save", tmp_path / "one", "--state", kept)
+    assert code == 0, errors
+    saved = Learned.load(tmp_path / "one")
+    assert output == f"model {saved.model.version} is in {tmp_path / 'one'}\n"
+    assert saved.model.version == Generations(kept / TREES).load(Settings()).version
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
     assert frames(tmp_path / "out") == list(range(60)), "a run that is complete gets no row more"

@@ -197,5 +197,5 @@ def test_without_a_place_there_must_be_just_one_pipeline(tmp_path, monkeypatch):
     places = (private_folder(), private_folder())
     with places[0] as one, places[1] as two, meeting_place("", one) as first:
         assert find() == first
-        with meeting_place("", two), pytest.raises(ServiceError, match="2 pipelines are running, say which"):
+        with meeting_place("", two), pytest.raises(ServiceError, match="2 pipelines are running: say which"):
             find()

@@ -1,0 +1,96 @@
+"""Which pipeline `stop`, `set-box`, `pause`, `resume` and `save` command: the one that is named, or the only one."""
+
+from __future__ import annotations
+
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from threading import Event
+
+import pytest
+from click.testing import CliRunner, _NamedTextIOWrapper
+
+from catstream.cli import group
+from catstream.messages import Answer
+from catstream.wire.endpoint import meeting_place, private_folder
+from catstream.wire.sockets import Responder
+
+
+@pytest.fixture
+def pipeline(tmp_path, monkeypatch):
+    """Starts a pipeline as far as commands can tell; gives its endpoint and the list of the commands that came.
+
+    No pipelines but those of the test are found.
+    """
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    with ExitStack() as stack:
+        yield lambda source: stack.enter_context(_commanded(source))
+
+
+@contextmanager
+def _commanded(source):
+    heard, over = [], Event()
+
+    def serve():
+        while not over.wait(0.01):
+            for command in responder.waiting():
+                heard.append(command.verb)
+                responder.answer(Answer(command.id, True, f"{command.verb} was done", 7, None, 1))
+
+    with (
+        private_folder() as folder,
+        meeting_place("", folder, source=source) as place,
+        Responder("control", place) as responder,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        serving = pool.submit(serve)
+        try:
+            yield place, heard
+        finally:
+            over.set()
+            serving.result(20)
+
+
+def said(*words, **options):
+    return CliRunner().invoke(group, [*map(str, words)], prog_name="catstream", **options)
+
+
+def at_a_terminal(monkeypatch):
+    monkeypatch.setattr(_NamedTextIOWrapper, "isatty", lambda _: True, raising=False)
+
+
+@pytest.mark.parametrize("words", [["stop"], ["pause"], ["resume"], ["set-box", "1,2,3,4"]])
+def test_a_script_is_told_which_pipeline_was_meant(pipeline, words):
+    place, heard = pipeline("/films/walk.mp4")
+    result = said(*words)
+    assert result.exit_code == 0
+    assert result.stderr == f"pipeline: /films/walk.mp4 at {place}\n"
+    assert result.stdout == f"{words[0]} was done\n"
+    assert heard == [words[0]]
+
+
+def test_at_a_terminal_the_only_pipeline_is_commanded_if_a_person_says_so(pipeline, monkeypatch):
+    place, heard = pipeline("/films/walk.mp4")
+    at_a_terminal(monkeypatch)
+    refused = said("stop", input="n\n")
+    assert (refused.exit_code, heard) == (1, [])
+    assert f"/films/walk.mp4 at {place}. Is it the one that you mean?" in refused.stderr
+    assert "nothing was done" in str(refused.exception)
+    assert said("stop", input="\n").exit_code == 0
+    for named in (["--yes"], ["--endpoint", place], ["--source", "walk.mp4"]):
+        assert "Is it the one" not in said("stop", *named, input="n\n").stderr
+    assert heard == ["stop"] * 4
+
+
+def test_a_pipeline_is_named_by_its_source(pipeline, tmp_path, monkeypatch):
+    _, walk = pipeline(str(tmp_path / "walk.mp4"))
+    _, street = pipeline("rtsp://10.0.0.7/street")
+    assert "walk.mp4 at /" in str(said("stop").exception), "the error of several pipelines says what each follows"
+    monkeypatch.chdir(tmp_path)
+    for name in ("walk.mp4", tmp_path / "walk.mp4", "./walk.mp4"):
+        assert said("pause", "--source", name).exit_code == 0
+    assert said("stop", "--source", "rtsp://10.0.0.7/street").exit_code == 0
+    assert (walk, street) == (["pause"] * 3, ["stop"])
+    assert "no pipeline of yours follows 'other.mp4'" in str(said("stop", "--source", "other.mp4").exception)
+    assert said("stop", "--source", "walk.mp4", "--endpoint", tmp_path).exit_code == 2
