@@ -32,10 +32,10 @@ demo: $(READY)  ## render a video, follow the object in it, say how well that we
 	$(BIN)/catstream demo
 
 test: $(READY)  ## all tests but the slow ones, doctests too
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist worksteal
 
 test-slow: $(READY)  ## the slow ones: long real sequences, soaks
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest -m slow --timeout 3600 -o faulthandler_timeout=0
 
 lint: $(READY)  ## style, types, and what is unsafe
 	$(BIN)/ruff check .

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -18,8 +20,53 @@ import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
 from threadpoolctl import threadpool_limits
 
+from catstream.box import Box
+from catstream.video.demo import write
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
+
+#: Which of the processes that share the tests (pytest-xdist) this is, and of how many.
+WORKER, WORKERS = (
+    int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]),
+    int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)),
+)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers():
+    """One more than there are cores: a test that waits for the processes it started needs none."""
+    return min(len(os.sched_getaffinity(0)) + 1, 8)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_places(tmp_path_factory):
+    """A runtime folder and a folder of temporary files of our own: no other pipeline of this user is found there."""
+    tmp_path_factory.getbasetemp()  # stays after the tests, to be looked at
+    with tempfile.TemporaryDirectory(prefix="cs-") as folder, pytest.MonkeyPatch.context() as patch:
+        for name, variable in (("run", "XDG_RUNTIME_DIR"), ("tmp", "TMPDIR")):
+            (Path(folder) / name).mkdir(mode=0o700)
+            patch.setenv(variable, str(Path(folder) / name))
+        patch.setattr(tempfile, "tempdir", None)  # it is read from TMPDIR again
+        yield
+
+
+@pytest.fixture(scope="session")
+def demo_video(tmp_path_factory):
+    """Renders the first frames of the demo video, once for all workers: its path, and the object's boxes."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def rendered(frames):
+        folder = shared / f"demo-{frames}"
+        folder.mkdir(exist_ok=True)
+        with (folder / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / "groundtruth_rect.txt").exists():  # which is written last
+                write(folder, frames, (320, 240))
+        boxes = np.loadtxt(folder / "groundtruth_rect.txt", delimiter=",")
+        return folder / "demo.mp4", [Box(*box) for box in boxes.tolist()]
+
+    return rendered
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -46,7 +93,8 @@ def folder():
 def tcp():
     """A tcp endpoint: as many free ports in a row as the channels take."""
     ports = max(channel.port + len(channel.senders) for channel in CHANNELS.values())
-    for first in random.sample(range(20000, 32000, ports), 50):
+    own = range(20000 + 12000 * WORKER // WORKERS, 20000 + 12000 * (WORKER + 1) // WORKERS - ports, ports)
+    for first in random.sample(own, min(50, len(own))):
         with ExitStack() as stack:
             try:
                 for port in range(first, first + ports):

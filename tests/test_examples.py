@@ -17,7 +17,6 @@ import catstream
 from catstream.errors import SilenceError
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
-from catstream.video.demo import write
 from catstream.wire.keys import create
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -36,9 +35,9 @@ def command(example):
     return [node, EXAMPLES / example]
 
 
-def test_the_rerun_subscriber_writes_what_the_viewer_would_show(tmp_path):
+def test_the_rerun_subscriber_writes_what_the_viewer_would_show(demo_video, tmp_path):
     pytest.importorskip("rerun", reason="rerun is missing: pip install 'catstream[rerun]'")
-    (source, boxes), shown = write(tmp_path, 60, (320, 240)), tmp_path / "walk.rrd"
+    (source, boxes), shown = demo_video(60), tmp_path / "walk.rrd"
     with (
         Pipeline(str(source), boxes[0], Settings(window=1)) as pipeline,
         subprocess.Popen(
@@ -61,8 +60,8 @@ def test_the_rerun_subscriber_writes_what_the_viewer_would_show(tmp_path):
 
 @pytest.mark.parametrize("example", ["subscriber.py", "subscriber.mjs"])
 @pytest.mark.parametrize("secured", [False, True], ids=["without keys", "with keys"])
-def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(example, secured, tmp_path):
-    words, (source, boxes) = command(example), write(tmp_path, 60, (320, 240))
+def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(demo_video, example, secured, tmp_path):
+    words, (source, boxes) = command(example), demo_video(60)
     keys = str(tmp_path / "keys") if secured else ""
     if secured:
         create(tmp_path / "keys")

@@ -7,15 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from catstream.video.demo import write
-
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
 
 @pytest.fixture(scope="session")
-def video(tmp_path_factory):
+def video(demo_video):
     """A short demo video, and the object's box in each of its frames."""
-    path, boxes = write(tmp_path_factory.mktemp("video"), 90, (320, 240))
+    path, boxes = demo_video(90)
     return str(path), boxes
 
 

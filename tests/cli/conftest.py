@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import io
+import logging
 import signal
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, redirect_stderr, redirect_stdout
 
 import pytest
 
-from catstream.video.demo import write
+from catstream.cli import main
 
 
 @pytest.fixture(scope="session")
-def video(tmp_path_factory):
+def video(demo_video):
     """A short demo video, and the box in its first frame as `--box` takes it."""
-    path, boxes = write(tmp_path_factory.mktemp("video"), 60, (320, 240))
+    path, boxes = demo_video(60)
     return str(path), ",".join(map(str, boxes[0]))
 
 
@@ -39,12 +41,45 @@ def catstream():
 
 
 @pytest.fixture
-def said(catstream):
-    """Runs the command to its end: exit code, output, errors."""
+def said_by_process(catstream):
+    """Runs the command as a process of its own, to its end: exit code, output, errors."""
 
     def run(*arguments, **options):
         process = catstream(*arguments, **options)
         output, errors = process.communicate(timeout=120)
         return process.returncode, output, errors
+
+    return run
+
+
+@pytest.fixture
+def said():
+    """Runs the command in this process, which imports nothing anew: exit code, output, errors."""
+
+    def run(*arguments, cwd=None, env=None):
+        output, errors = io.StringIO(), io.StringIO()
+        warnings = logging.StreamHandler(errors)
+        warnings.setLevel(logging.WARNING)
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            redirect_stdout(output),
+            redirect_stderr(errors),
+            ExitStack() as stack,
+        ):
+            logging.getLogger().addHandler(warnings)
+            stack.callback(logging.getLogger().removeHandler, warnings)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                stack.callback(signal.signal, number, signal.getsignal(number))
+            patch.setattr(sys, "argv", ["catstream", *map(str, arguments)])
+            if cwd is not None:
+                patch.chdir(cwd)
+            for name, value in (env or {}).items():
+                patch.setenv(name, value)
+            code = 0
+            try:
+                main()
+            except SystemExit as end:
+                code = end.code or 0
+        return code, output.getvalue(), errors.getvalue()
 
     return run

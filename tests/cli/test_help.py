@@ -13,42 +13,49 @@ from catstream.cli import VERBS
 from catstream.services.supervisor import NAMES
 
 
-def help_of(*arguments):
-    run = subprocess.run([sys.executable, *arguments, "--help"], capture_output=True, text=True, timeout=60)
-    assert run.returncode == 0
-    assert not run.stderr
-    return " ".join(run.stdout.split())
+@pytest.fixture
+def help_of(said):
+    """What `catstream VERB --help` says."""
+
+    def ask(*verb):
+        code, output, errors = said(*verb, "--help")
+        assert (code, errors) == (0, "")
+        return " ".join(output.split())
+
+    return ask
 
 
-MAIN = ["-c", "from catstream.cli import main; main()"]
-
-
-def test_the_command_names_its_verbs_and_shows_how_to_start():
-    text = help_of(*MAIN)
+def test_the_command_names_its_verbs_and_shows_how_to_start(said_by_process):
+    code, output, errors = said_by_process("--help")
+    assert (code, errors) == (0, "")
+    text = " ".join(output.split())
     assert all(verb in text for verb in VERBS)
     assert "catstream track walk.mp4 --box 120,80,64,48" in text
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_says_what_it_does(verb):
-    assert help_of(*MAIN, verb).startswith(f"Usage: catstream {verb}")
+def test_every_verb_says_what_it_does(help_of, verb):
+    assert help_of(verb).startswith(f"Usage: catstream {verb}")
 
 
-def test_track_says_what_it_writes_and_how_it_is_stopped():
-    text = help_of(*MAIN, "track")
+def test_track_says_what_it_writes_and_how_it_is_stopped(help_of):
+    text = help_of("track")
     for word in ("NAME.txt", "NAME_confidence.value", "NAME_time.txt", "tracks.csv", "NAME.mp4", "Ctrl-C", "EXAMPLES"):
         assert word in text
 
 
-def test_a_verb_that_does_not_exist_is_refused():
-    run = subprocess.run([sys.executable, *MAIN, "trakc"], capture_output=True, text=True, timeout=60)
-    assert run.returncode == 2
-    assert "No such command 'trakc'" in run.stderr
+def test_a_verb_that_does_not_exist_is_refused(said_by_process):
+    code, _, errors = said_by_process("trakc")
+    assert code == 2
+    assert "No such command 'trakc'" in errors
 
 
 @pytest.mark.parametrize("name", [*NAMES, "supervisor"])
 def test_every_process_says_what_it_does(name):
-    assert help_of("-m", "catstream.services", name).startswith(f"Usage: python -m catstream.services {name}")
+    command = [sys.executable, "-m", "catstream.services", name, "--help"]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout.startswith(f"Usage: python -m catstream.services {name}")
 
 
 #: Verbs that take long, and how one sees that they are at it.

@@ -30,9 +30,9 @@ def table(path):
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-def test_it_writes_five_files_with_a_row_a_frame(video, said, tmp_path):
+def test_it_writes_five_files_with_a_row_a_frame(video, said_by_process, tmp_path):
     source, box = video
-    code, _, errors = said("track", source, "--box", box, "--output", tmp_path, "--video")
+    code, _, errors = said_by_process("track", source, "--box", box, "--output", tmp_path, "--video")
     assert code == 0
     assert "60 messages sent, 60 stored" in errors
     assert sorted(file.name for file in tmp_path.iterdir()) == FILES
@@ -98,14 +98,14 @@ def started(process, results):
     return [child.pid for child in psutil.Process(process.pid).children()]
 
 
-def test_a_truncated_video_is_followed_up_to_the_break(video, said, tmp_path):
+def test_a_truncated_video_is_followed_up_to_the_break(video, said_by_process, tmp_path):
     source, box = video
     broken = tmp_path / "broken.mpg"
     whole = encoded(source, tmp_path / "whole.mpg")
     broken.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     good = readable(broken)
     assert 0 < good < 60
-    code, _, errors = said("track", broken, "--box", box, "--output", tmp_path / "out")
+    code, _, errors = said_by_process("track", broken, "--box", box, "--output", tmp_path / "out")
     assert code == 1
     assert f"breaks at frame {good}" in one_line(errors)
     assert len((tmp_path / "out" / "broken.txt").read_text().splitlines()) == good

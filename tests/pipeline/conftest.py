@@ -9,15 +9,13 @@ from contextlib import ExitStack
 import psutil
 import pytest
 
-from catstream.video.demo import write
-
-FRAMES, SIZE = 160, (320, 240)
+FRAMES = 160
 
 
 @pytest.fixture(scope="session")
-def video(tmp_path_factory):
+def video(demo_video):
     """A short demo video, and the object's box in each of its frames."""
-    path, boxes = write(tmp_path_factory.mktemp("video"), FRAMES, SIZE)
+    path, boxes = demo_video(FRAMES)
     return str(path), boxes
 
 

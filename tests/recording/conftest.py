@@ -10,7 +10,6 @@ from catstream.detection.detector import Detector
 from catstream.recording.file import RecordingWriter, run_of
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
-from catstream.video.demo import write
 from catstream.video.source import open_source
 from catstream.wire.endpoint import Endpoint, private_folder
 
@@ -18,9 +17,9 @@ SETTINGS = Settings(coreset_size=16)
 
 
 @pytest.fixture(scope="session")
-def said(tmp_path_factory):
+def said(demo_video):
     """Tracks, features and models of a lockstep run of 50 frames, in the order in which they came."""
-    path, boxes = write(tmp_path_factory.mktemp("video"), 50, (320, 240))
+    path, boxes = demo_video(50)
     detector, compressor, trainer = Detector(SETTINGS), Compressor(SETTINGS), Trainer(SETTINGS)
     messages = []
     with open_source(str(path)) as frames:

@@ -15,7 +15,6 @@ from catstream.errors import VideoError
 from catstream.messages import Track
 from catstream.sinks import parquet
 from catstream.sinks.sink import SUFFIXES, open_sink
-from catstream.video.demo import write
 from catstream.video.results import ResultsWriter
 from catstream.video.source import open_source
 
@@ -83,8 +82,8 @@ def test_a_database_is_exported_as_parquet(filled, tmp_path):
     assert table["h"] == [40.0, None, 40.0]
 
 
-def test_a_video_has_the_frames_of_its_tracks(tmp_path):
-    source, _ = write(tmp_path, 8, (320, 240))
+def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
+    source, _ = demo_video(8)
     sink = open_sink(tmp_path / "walk.mp4", str(source), slice(1, 8, 2))  # frames 1, 3, 5, 7, counted 0 to 3
     for track in TRACKS:
         sink.write(track)

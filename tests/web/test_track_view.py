@@ -7,11 +7,9 @@ import sys
 
 import httpx
 
-from catstream.video.demo import write
 
-
-def test_the_first_box_comes_from_the_page_and_the_run_goes_on_to_its_end(folder, tmp_path, until):
-    source, boxes = write(tmp_path, 40, (320, 240))
+def test_the_first_box_comes_from_the_page_and_the_run_goes_on_to_its_end(demo_video, folder, tmp_path, until):
+    source, boxes = demo_video(40)
     words = ["track", source, "--view", "0", "--output", tmp_path / "out", "--set", f"endpoint={folder}"]
     with (
         subprocess.Popen(
