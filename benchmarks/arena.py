@@ -11,7 +11,6 @@ import asyncio
 import os
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -23,6 +22,7 @@ from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.messages import End, Position, Track
 from catstream.services.loop import REFUSED
+from catstream.services.start import service_command
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
 from catstream.wire.channels import CHANNELS
@@ -246,7 +246,7 @@ class Arena:
         return "; ".join(f"{name}: {said[-1] if said else 'nothing'}" for name, said in lines.items())
 
     def _start(self, name: str) -> None:
-        command: list[Any] = [sys.executable, "-m", "catstream.services", "--parent", os.getpid(), name]
+        command: list[Any] = service_command("--parent", str(os.getpid()), name)
         for pair in (*self._settings.changed(), f"endpoint={self._places[name]}"):
             command += ["--set", pair]
         if name == "detector":

@@ -27,7 +27,7 @@ from catstream.video.demo import write
 from catstream.video.results import tracks
 
 _REST = 200  # frames beyond the last kill: a fast pipeline goes on while a kill is on its way
-TRACK = [sys.executable, "-c", "from catstream.cli import main; main()", "track"]
+TRACK = [sys.executable, "-P", "-c", "from catstream.cli import main; main()", "track"]
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:

@@ -27,6 +27,7 @@ from catstream.detection.detector import Detector
 from catstream.errors import ServiceError
 from catstream.evaluation.datasets import Sequence
 from catstream.messages import End, Features
+from catstream.services.start import service_command
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 from catstream.wire.endpoint import Endpoint, private_folder
@@ -143,7 +144,7 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
     """The same through the compressor's process: a row for each fifth of the messages."""
     rows = []
     with private_folder() as folder:
-        command = [sys.executable, "-m", "catstream.services", "compressor"]
+        command = service_command("compressor")
         options = ["--set", f"endpoint={folder}", "--state", folder / "state"]
         with (
             subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL) as process,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from table import Table, command, publish
 from catstream.box import Box
 from catstream.detection.detector import Detector
 from catstream.messages import End, Features, Position
+from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint, private_folder
@@ -62,7 +62,7 @@ def loopback() -> Iterator[str]:
 
 def delivered(endpoint: str, features: Features, messages: int) -> float:
     """Seconds until the last of some messages is acknowledged."""
-    receiver = multiprocessing.get_context("spawn").Process(target=receive, args=(endpoint,), daemon=True)
+    receiver = SPAWN.Process(target=receive, args=(endpoint,), daemon=True)
     receiver.start()
     with Sender("features", Endpoint.parse(endpoint), WINDOW) as sender:
         while sender.position() is None:  # not there yet

@@ -1,4 +1,4 @@
-"""`python -m catstream.services NAME`: THE LIST of processes, a command each.
+"""`python -P -m catstream.services NAME`: THE LIST of processes, a command each.
 
 Each can be started by hand, in any order, on any endpoint; `catstream track` starts them all.
 """
@@ -32,13 +32,13 @@ def main(context: click.Context, parent: int | None, pulse: int | None) -> None:
     """The processes of a catstream pipeline.
 
     They meet at an endpoint: a folder that holds their sockets, or tcp://127.0.0.1:PORT. All need
-    the same settings.
+    the same settings. With -P, no file in the current folder is imported.
 
     \b
       mkdir -m 700 run
-      python -m catstream.services compressor --set endpoint=run &
-      python -m catstream.services trainer    --set endpoint=run &
-      python -m catstream.services detector   --set endpoint=run walk.mp4 --box 120,80,64,48
+      python -P -m catstream.services compressor --set endpoint=run &
+      python -P -m catstream.services trainer    --set endpoint=run &
+      python -P -m catstream.services detector   --set endpoint=run walk.mp4 --box 120,80,64,48
     """
     context.obj = None if parent is None else Parent(parent, pulse)
 
@@ -102,8 +102,13 @@ def supervisor(settings: Settings, source: str, **options: Any) -> None:
     sys.exit(supervisor.main(source, settings, **options))
 
 
-if __name__ == "__main__":
+def start() -> None:
+    """Be the process that the command line asks for; one line for an error."""
     try:
-        main(prog_name="python -m catstream.services")
+        main(prog_name="python -P -m catstream.services")
     except CatstreamError as error:
         sys.exit(f"catstream: {error}")
+
+
+if __name__ == "__main__":
+    start()

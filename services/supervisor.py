@@ -8,7 +8,6 @@ import os
 import random
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -20,6 +19,7 @@ from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.services.loop import BROKEN, REFUSED
 from catstream.services.pulse import Pulse
+from catstream.services.start import environment, service_command
 from catstream.settings import Settings
 from catstream.video.frames import without_password
 from catstream.video.source import WHOLE, is_live
@@ -238,7 +238,7 @@ class Supervisor:
         child.pulse, child.hung = Pulse(), False
         child.turns, child.silent, child.stopped = 0.0, 0.0, 0.0
         watched = ["--parent", str(os.getpid()), "--pulse", str(child.pulse.handle)]
-        command = [sys.executable, "-m", "catstream.services", *watched, child.name]
+        command = service_command(*watched, child.name)
         for pair in self._settings.changed():
             command += ["--set", pair]
         if child.name == "detector":
@@ -252,10 +252,9 @@ class Supervisor:
         if child.name == "compressor" and self._record is not None:
             command += ["--record", str(self._record)]
         child.seen = time.monotonic()
-        own = {name: value for name, value in os.environ.items() if not name.startswith("CATSTREAM_")}
         child.process = subprocess.Popen(
             command,
-            env=own,
+            env=environment(),
             stdin=subprocess.DEVNULL,
             stderr=child.log,
             pass_fds=[child.pulse.handle],

@@ -103,7 +103,7 @@ def test_the_health_check_hears_its_process_and_notices_silence(name):
 
 def test_the_image_is_pinned_runs_the_processes_and_is_nobody_in_particular():
     assert "pip install --require-hashes -r requirements.lock" in IMAGE
-    assert 'ENTRYPOINT ["python", "-m", "catstream.services"]' in IMAGE
+    assert 'ENTRYPOINT ["python", "-P", "-m", "catstream.services"]' in IMAGE
     last = IMAGE.rpartition("FROM ")[2]
     assert re.search(r"^USER (?!root)\w+$", last, re.MULTILINE)
     assert last.index("USER ") < last.index("import catstream"), "the kernels belong to who runs them"

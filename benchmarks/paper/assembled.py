@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import starts_of
 from catstream.evaluation.peers import one_thread
 from catstream.evaluation.runs import Run
+from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
@@ -50,7 +50,7 @@ def follow_all(
     starts, jobs = (1, 1) if options.quick else (options.starts, options.jobs)
     tasks = [(recipes, sequence, start) for sequence in sequences for start in starts_of(sequence, starts)]
     runs: dict[str, list[Run]] = {name: [] for name in recipes}
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=SPAWN) as pool:
         for found in (map if jobs == 1 else pool.map)(follow_each, *zip(*tasks, strict=True)):
             for run in found:
                 runs[run.tracker].append(run)

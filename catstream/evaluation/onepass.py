@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.peers import PEERS, Peer, one_thread
 from catstream.evaluation.runs import Run, claim, label, load, save
 from catstream.services.loop import die_with
+from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.tracker import Tracker
 
@@ -136,8 +136,7 @@ def _work(tasks: list[Any], output: Path | None, jobs: int) -> Iterator[Run | Ca
     if jobs == 1:
         yield from (_follow(output, *task) for task in tasks)
         return
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_serve, initargs=(os.getpid(),)) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=_serve, initargs=(os.getpid(),)) as pool:
         try:
             # Long ones first, so that none is left running alone at the end.
             tasks = sorted(tasks, key=lambda task: task[3] - len(task[2]))

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import signal
-from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 
-__all__ = ["SPAWN", "start"]
+from catstream.services.start import SPAWN
 
-#: How they begin: anew, with nothing of this process but what they are handed.
-SPAWN = multiprocessing.get_context("spawn")
+__all__ = ["SPAWN", "start"]
 
 
 def start(process: BaseProcess) -> None:
     """Start a process that Ctrl-C does not reach: it is for this one, which then ends them in order."""
-    resource_tracker.ensure_running()  # by itself it starts with the first process, and unblocks the signal
+    SPAWN.get_context()  # starts the resource tracker: with the first process it would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits what is blocked
     try:
         process.start()

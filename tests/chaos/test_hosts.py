@@ -49,7 +49,7 @@ def start(video, hosts, tmp_path):
         if name == "viewer":
             watch = ["watch", "tracks", "--json", "--endpoint", endpoint, "--keys", tmp_path / "viewer"]
             return hosts.start(name, Path(sys.executable).with_name("catstream"), *watch, stdout=subprocess.PIPE)
-        return hosts.start(name, sys.executable, "-m", "catstream.services", name, *common, *own[name])
+        return hosts.start(name, sys.executable, "-P", "-m", "catstream.services", name, *common, *own[name])
 
     return begin
 

@@ -52,10 +52,10 @@ def test_a_verb_that_does_not_exist_is_refused(said_by_process):
 
 @pytest.mark.parametrize("name", [*NAMES, "supervisor"])
 def test_every_process_says_what_it_does(name):
-    command = [sys.executable, "-m", "catstream.services", name, "--help"]
+    command = [sys.executable, "-P", "-m", "catstream.services", name, "--help"]
     run = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (run.returncode, run.stderr) == (0, "")
-    assert run.stdout.startswith(f"Usage: python -m catstream.services {name}")
+    assert run.stdout.startswith(f"Usage: python -P -m catstream.services {name}")
 
 
 #: Verbs that take long, and how one sees that they are at it.

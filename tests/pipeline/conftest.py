@@ -34,12 +34,12 @@ def alive():
 
 @pytest.fixture
 def service():
-    """Starts `python -m catstream.services ...`; what still runs after the test is killed."""
+    """Starts `python -P -m catstream.services ...`; what still runs after the test is killed."""
     with ExitStack() as stack:
 
         def start(*arguments):
             process = subprocess.Popen(
-                [sys.executable, "-m", "catstream.services", *map(str, arguments)],
+                [sys.executable, "-P", "-m", "catstream.services", *map(str, arguments)],
                 stderr=subprocess.PIPE,
                 text=True,
             )

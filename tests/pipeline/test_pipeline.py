@@ -80,7 +80,7 @@ def test_three_processes_run_while_it_is_open_and_none_afterwards(video, alive):
         assert set(pids) == set(NAMES)
         for name, pid in pids.items():
             command = psutil.Process(pid).cmdline()
-            assert "catstream.services" in command
+            assert "catstream.services" in " ".join(command)
             assert name in command
     assert not any(map(alive, pids.values()))
     assert not pipeline.pids

@@ -1,0 +1,123 @@
+"""Starts the processes of catstream, so that no file in the current folder is run.
+
+Python puts the current folder first on `sys.path` for `python -m` and `python -c`: a `zmq.py` in it would be imported
+in place of the library. A child here gets the `sys.path` of its parent without the current folder, so it imports the
+same catstream and the same libraries as its parent, and nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker, spawn
+from multiprocessing.context import SpawnContext, SpawnProcess
+from pathlib import Path
+from typing import Any
+
+from catstream import errors
+
+__all__ = ["SPAWN", "environment", "import_path", "service_command"]
+
+
+def service_command(*arguments: str) -> list[str]:
+    """The command that starts `catstream.services` with these arguments, in the variables that `environment` gives.
+
+    Raises
+    ------
+    ServiceError
+        If no Python interpreter is known.
+    """
+    # Folders that only the interpreter knows come last; `-P` and no PYTHONPATH keep the current folder off its list.
+    start = (
+        f"import sys; sys.path[:] = dict.fromkeys({import_path()!r} + sys.path); "
+        "from catstream.services.__main__ import start; start()"
+    )
+    return [_interpreter(), "-P", "-c", start, *arguments]
+
+
+def environment() -> dict[str, str]:
+    """The variables of a child: without those that are settings, and with no current folder in `PYTHONPATH`."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("CATSTREAM_")}
+    return kept | {"PYTHONPATH": _python_path()}
+
+
+class _Process(SpawnProcess):
+    """A process of `multiprocessing` that looks for no module in the current folder."""
+
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:
+        with _safe_path():
+            return SpawnProcess._Popen(process_obj)
+
+
+class _Context(SpawnContext):
+    """The start method "spawn", for processes that look for no module in the current folder."""
+
+    Process = _Process
+
+    def get_context(self, method: str | None = None) -> Any:
+        """As of any context; called for each lock and queue, which would start the resource tracker as it is."""
+        with _safe_path():
+            resource_tracker.ensure_running()
+        return super().get_context(method)
+
+
+#: For processes that run a function of this program: worker pools, and the readers of a load test.
+SPAWN = _Context()
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Set variables of this process while `multiprocessing` starts a child, which offers no other way."""
+    names = ("PYTHONSAFEPATH", "PYTHONPATH")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(zip(names, ("1", _python_path()), strict=True))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _python_path() -> str:
+    """`PYTHONPATH` without the current folder."""
+    return os.pathsep.join(_without_the_current_folder(os.environ.get("PYTHONPATH", "").split(os.pathsep)))
+
+
+def import_path() -> list[str]:
+    """`sys.path` without the current folder."""
+    return _without_the_current_folder(sys.path)
+
+
+def _without_the_current_folder(entries: list[str]) -> list[str]:
+    """Absolute folders among these, and the one that catstream itself was imported from, wherever that is."""
+    home = Path(errors.__file__).parents[1]
+    try:
+        here = Path.cwd()
+    except FileNotFoundError:  # it was removed, and there is nothing to import from it
+        here = home
+    kept = []
+    for entry in entries:
+        folder = here / entry
+        if folder == home or (Path(entry).is_absolute() and folder.resolve() != here.resolve()):
+            kept.append(str(folder))
+    return kept
+
+
+def _interpreter() -> str:
+    """Path of the Python interpreter: a program that embeds Python may be `sys.executable` itself, or have none."""
+    given = os.fsdecode(spawn.get_executable() or "")
+    if given and (given != sys.executable or "py" in Path(given).name):
+        return given
+    beside = Path(sys.prefix, "bin", f"python{sys.version_info.major}.{sys.version_info.minor}")
+    if not beside.exists():
+        raise errors.ServiceError(
+            f"no Python interpreter to start processes with, sys.executable is {sys.executable!r}: "
+            "name one with multiprocessing.set_executable(PATH)"
+        )
+    return str(beside)

@@ -1,0 +1,80 @@
+"""No file in the current folder is run, whichever verb is started there."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from catstream.cli import VERBS
+from catstream.video.demo import render
+
+cv2 = pytest.importorskip("cv2")
+
+CATSTREAM = Path(sys.executable).with_name("catstream")
+FRAMES = 12
+
+#: Modules that the processes import: of libraries, of the standard library, of catstream, and of the start of Python.
+TRAPS = [
+    *("av", "click", "cv2", "msgpack", "msgspec", "numba", "numpy", "psutil", "rich", "safetensors", "scipy", "zmq"),
+    *("asyncio", "json", "logging", "multiprocessing", "random", "select", "signal", "socket", "subprocess", "typing"),
+    *("catstream/__init__", "services/__init__", "sitecustomize", "usercustomize"),
+]
+
+EVERY_VERB = """
+import sys
+from click.testing import CliRunner
+from catstream.cli import group
+for verb in sys.argv[1:]:
+    assert CliRunner().invoke(group, [verb, "--help"]).exit_code == 0, verb
+"""
+
+PROGRAM = """
+import sys, catstream
+if __name__ == "__main__":
+    with catstream.Pipeline(sys.argv[1], map(float, sys.argv[2].split(','))) as pipeline:
+        assert len(list(pipeline)) == int(sys.argv[3])
+"""
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """A short sequence with truth, and the box in its first frame."""
+    folder, boxes = tmp_path_factory.mktemp("set") / "walk", []
+    (folder / "img").mkdir(parents=True)
+    for number, (image, box) in enumerate(render(FRAMES, (160, 120))):
+        cv2.imwrite(str(folder / "img" / f"{number + 1:04d}.png"), image)
+        boxes.append(str(box))
+    (folder / "groundtruth_rect.txt").write_text("\n".join(boxes) + "\n")
+    return folder, boxes[0]
+
+
+@pytest.fixture
+def traps(tmp_path):
+    """A folder with a trap for each module; each writes a file if it is imported."""
+    folder = tmp_path / "traps"
+    for name in TRAPS:
+        path = folder / f"{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("import pathlib; pathlib.Path(__file__ + '.sprung').touch()\n")
+    return folder
+
+
+@pytest.mark.parametrize("verb", ["track", "demo", "evaluate", "loadtest", "program", "all others"])
+def test_no_file_in_the_current_folder_is_run(verb, sequence, traps, tmp_path):
+    (tmp_path / "program.py").write_text(PROGRAM)
+    (folder, box), out = sequence, tmp_path / "out"
+    load = ["--rate", "20", "--duration", "1", "--size", "160x120", "--subscribers", "1"]
+    command = {
+        "track": [CATSTREAM, "track", folder / "img", "--box", box, "--output", out],
+        "demo": [CATSTREAM, "demo", "--frames", "4", "--output", out],
+        "evaluate": [CATSTREAM, "evaluate", folder, "--starts", "2", "--jobs", "2", "--output", out],
+        "loadtest": [CATSTREAM, "loadtest", *load],
+        "program": [sys.executable, tmp_path / "program.py", folder / "img", box, str(FRAMES)],
+        "all others": [sys.executable, "-P", "-c", EVERY_VERB, *VERBS],
+    }[verb]
+    done = subprocess.run(command, cwd=traps, capture_output=True, text=True, timeout=240, check=False)
+    assert not [str(path.relative_to(traps)) for path in traps.rglob("*.sprung")]
+    assert done.returncode == 0, done.stderr
