@@ -12,6 +12,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from catstream import kalman
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
@@ -94,3 +95,4 @@ class Tracker:
         sample = self.compressor.take(features)
         if sample is not None:
             self.detector.adopt(self.trainer.train(sample))
+            kalman.prepare()  # a later model brings the motion

@@ -8,6 +8,7 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
+from catstream import kalman
 from catstream.box import Box
 from catstream.detection.detector import Detector
 from catstream.errors import ProtocolError, VideoError
@@ -76,6 +77,7 @@ def main(
         if recorded:
             line.wait_for_listener()
         if resume:
+            kalman.prepare()  # while the others say where they are
             line.resume(detector, learned)
         elif learned is not None:
             detector.seek(learned.model, learned.box)
@@ -104,6 +106,8 @@ def main(
                     found = _follow(detector, frame, helm.orders)
                 track, features = found
                 line.send(replace(track, pts=frame.pts), features)
+                if track.model_version:
+                    kalman.prepare()  # a later model brings the motion
                 line.previews.show(track.frame, frame.image, track.box)
                 if not frames.live:
                     line.wait(detector)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from catstream import kalman
 from catstream.messages import End
 from catstream.services.loop import Process
 from catstream.training.trainer import Trainer
@@ -28,6 +29,7 @@ def main(process: Process) -> None:
             if message is not None and not end and message.version != version:
                 process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
+                kalman.prepare()  # a later sample brings the centres
                 version, trained = message.version, trained + 1
             models.welcome()
             process.beat(counters, now=end)

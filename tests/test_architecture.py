@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"errors"},
     {"box", "storage"},
-    {"messages", "settings", "ridge", "html"},
+    {"messages", "settings", "ridge", "kalman", "html"},
     {"detection", "compression", "training", "wire", "video", "adapters"},
     {"learned"},
     {"tracker", "subscription", "steering", "recording", "sinks", "state"},
@@ -32,6 +32,7 @@ HOMES = {
     "numpy": ["catstream", "services"],
     "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
     "cv2": ["catstream/detection", "catstream/video", "catstream/evaluation/peers.py", "services/__main__.py"],
+    "filterpy": ["catstream/kalman.py"],
     "numba": ["catstream/detection/compiled.py"],
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
     "safetensors": ["catstream/storage.py"],
@@ -52,7 +53,7 @@ HOMES = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"sklearn", "av", "scipy", "pyarrow", "supervision"}
+SLOW = {"sklearn", "av", "scipy", "filterpy", "pyarrow", "supervision"}
 
 #: What a stage does not touch: it could run on a desert island.
 MAINLAND = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from catstream.kalman import TRANSITION, constant_velocity
 from catstream.messages import Motion
 
 __all__ = ["CentreFilter"]
 
-_TRANSITION = np.eye(4) + np.eye(4, k=2)  # (x, y, vx, vy): each position moves on by its velocity
-_COASTING = _TRANSITION @ np.diag([1, 1, 0.8, 0.8])  # out of sight: 0.8 + 0.8**2 + ... = 4 frames' way, then rest
-_OBSERVED = np.eye(2, 4)  # of which x and y are measured
+_COASTING = TRANSITION @ np.diag([1, 1, 0.8, 0.8])  # out of sight: 0.8 + 0.8**2 + ... = 4 frames' way, then rest
 _JUMP = 6.0  # standard deviations beyond which a measured centre is no motion, but another place
 _UNKNOWN_SPEED = 100.0  # variance of a velocity not seen yet, in pushes of a frame
 
@@ -43,9 +42,8 @@ class CentreFilter:
     """
 
     def __init__(self, motion: Motion, centre: tuple[float, float]) -> None:
-        self._mean, self._covariance = np.empty(4), np.empty((4, 4))
-        self.adopt(motion)
-        self._start(centre)
+        self._motion, self._seen = motion, True
+        self._kalman = constant_velocity(*_at_rest(centre, motion), motion.process, motion.observation)
 
     @property
     def motion(self) -> Motion:
@@ -55,35 +53,33 @@ class CentreFilter:
     @property
     def state(self) -> np.ndarray:
         """Mean above covariance, float64 (5, 4): with `motion`, all that it knows."""
-        return np.vstack([self._mean, self._covariance])
+        return np.vstack([self._kalman.x, self._kalman.P])
 
     @classmethod
     def resumed(cls, motion: Motion, state: np.ndarray, seen: bool) -> CentreFilter:
         """A filter that goes on from another one's state, bit for bit; `seen` as the object was in its last frame."""
         self = cls(motion, (0.0, 0.0))
-        self._mean, self._covariance, self._seen = state[0], state[1:], seen
+        self._kalman.x, self._kalman.P, self._seen = state[0], state[1:], seen
         return self
 
     @property
     def centre(self) -> tuple[float, float]:
         """Best estimate of x and y, in pixels."""
-        return float(self._mean[0]), float(self._mean[1])
+        return float(self._kalman.x[0]), float(self._kalman.x[1])
 
     @property
     def velocity(self) -> tuple[float, float]:
         """Best estimate of the way along x and y, in pixels a frame."""
-        return float(self._mean[2]), float(self._mean[3])
+        return float(self._kalman.x[2]), float(self._kalman.x[3])
 
     @property
     def deviation(self) -> float:
         """Standard deviation of the centre along its less certain direction, in pixels."""
-        return float(np.sqrt(np.linalg.eigvalsh(self._covariance[:2, :2])[-1]))
+        return float(np.sqrt(np.linalg.eigvalsh(self._kalman.P[:2, :2])[-1]))
 
     def predict(self) -> tuple[float, float]:
         """Go on by a frame: the centre to expect in it."""
-        transition = _TRANSITION if self._seen else _COASTING
-        self._mean = transition @ self._mean
-        self._covariance = transition @ self._covariance @ transition.T + self._motion.process
+        self._kalman.predict(F=TRANSITION if self._seen else _COASTING)
         return self.centre
 
     def update(self, centre: tuple[float, float] | None) -> None:
@@ -91,26 +87,19 @@ class CentreFilter:
         self._seen = centre is not None
         if centre is None:
             return
-        noise = self._motion.observation
-        error = np.array(centre) - _OBSERVED @ self._mean
-        shared = self._covariance @ _OBSERVED.T
-        inverse = np.linalg.inv(_OBSERVED @ shared + noise)
-        if np.sqrt(error @ inverse @ error) > _JUMP:
-            self._start(centre)
-            return
-        gain = shared @ inverse
-        left = np.eye(4) - gain @ _OBSERVED
-        self._mean = self._mean + gain @ error
-        # Joseph's form: it stays symmetric and positive.
-        self._covariance = left @ self._covariance @ left.T + gain @ noise @ gain.T
+        self._kalman.update(np.array(centre))
+        if self._kalman.mahalanobis > _JUMP:
+            self._kalman.x, self._kalman.P = _at_rest(centre, self._motion)
 
     def adopt(self, motion: Motion) -> None:
         """Go on from here with other covariances."""
         self._motion = motion
+        self._kalman.Q, self._kalman.R = motion.process, motion.observation
 
-    def _start(self, centre: tuple[float, float]) -> None:
-        self._seen = True
-        self._mean = np.array([*centre, 0.0, 0.0])
-        self._covariance = np.zeros((4, 4))
-        self._covariance[:2, :2] = self._motion.observation
-        self._covariance[2:, 2:] = _UNKNOWN_SPEED * self._motion.process[2:, 2:]
+
+def _at_rest(centre: tuple[float, float], motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """State of an object that was only just seen, and its covariance."""
+    covariance = np.zeros((4, 4))
+    covariance[:2, :2] = motion.observation
+    covariance[2:, 2:] = _UNKNOWN_SPEED * motion.process[2:, 2:]
+    return np.array([*centre, 0.0, 0.0]), covariance

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from catstream.kalman import OBSERVED, TRANSITION, constant_velocity
 from catstream.messages import Motion
 
 __all__ = ["FEWEST", "OBSERVATION_FLOOR", "PROCESS_FLOOR", "learn_motion"]
@@ -17,9 +18,6 @@ __all__ = ["FEWEST", "OBSERVATION_FLOOR", "PROCESS_FLOOR", "learn_motion"]
 FEWEST = 8  #: centres that 13 free parameters can be learned from
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
 OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels
-
-_TRANSITION = np.eye(4) + np.eye(4, k=2)  # (x, y, vx, vy): each position moves on by its velocity
-_OBSERVED = np.eye(2, 4)  # of which x and y are measured
 
 
 def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
@@ -73,36 +71,23 @@ def _smooth(
 
     A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
     """
-    states, covariances = np.empty((len(centres), 4)), np.empty((len(centres), 4, 4))
-    for i, centre in enumerate(centres):
-        if i:
-            mean, covariance = _TRANSITION @ mean, _TRANSITION @ covariance @ _TRANSITION.T + motion.process
-        if np.isfinite(centre).all():
-            shared = covariance @ _OBSERVED.T
-            gain = shared @ np.linalg.inv(_OBSERVED @ shared + motion.observation)
-            mean = mean + gain @ (centre - _OBSERVED @ mean)
-            left = np.eye(4) - gain @ _OBSERVED
-            # Joseph's form: it stays symmetric and positive.
-            covariance = left @ covariance @ left.T + gain @ motion.observation @ gain.T
-        states[i], covariances[i] = mean, covariance
-    predicted = _TRANSITION @ covariances[:-1] @ _TRANSITION.T + motion.process
-    gains = covariances[:-1] @ _TRANSITION.T @ np.linalg.inv(predicted)
-    for i in reversed(range(len(gains))):
-        states[i] += gains[i] @ (states[i + 1] - _TRANSITION @ states[i])
-        covariances[i] += gains[i] @ (covariances[i + 1] - predicted[i]) @ gains[i].T
-    return states, covariances, covariances[1:] @ gains.transpose(0, 2, 1)
+    kalman = constant_velocity(mean, covariance, motion.process, motion.observation)
+    measured = [centre if np.isfinite(centre).all() else None for centre in centres]
+    states, covariances, _, _ = kalman.batch_filter(measured, update_first=True)
+    states, covariances, gains, _ = kalman.rts_smoother(states, covariances)
+    return states, covariances, covariances[1:] @ gains[:-1].transpose(0, 2, 1)
 
 
 def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lagged: np.ndarray) -> Motion:
     """Maximisation: mean outer products of the pushes and of the errors, the states' uncertainty included."""
-    push = states[1:] - states[:-1] @ _TRANSITION.T
-    together = (lagged @ _TRANSITION.T).sum(axis=0)
-    spread = covariances[1:].sum(axis=0) + _TRANSITION @ covariances[:-1].sum(axis=0) @ _TRANSITION.T
+    push = states[1:] - states[:-1] @ TRANSITION.T
+    together = (lagged @ TRANSITION.T).sum(axis=0)
+    spread = covariances[1:].sum(axis=0) + TRANSITION @ covariances[:-1].sum(axis=0) @ TRANSITION.T
     process = (push.T @ push + spread - together - together.T) / len(push)
 
     seen = np.isfinite(centres).all(axis=1)
-    error = centres[seen] - states[seen] @ _OBSERVED.T
-    observation = error.T @ error / len(error) + _OBSERVED @ covariances[seen].mean(axis=0) @ _OBSERVED.T
+    error = centres[seen] - states[seen] @ OBSERVED.T
+    observation = error.T @ error / len(error) + OBSERVED @ covariances[seen].mean(axis=0) @ OBSERVED.T
     return Motion(_floored(process, PROCESS_FLOOR), _floored(observation, OBSERVATION_FLOOR))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 
 from catstream.detection.motion import CentreFilter
 from catstream.messages import Motion
@@ -99,19 +98,14 @@ def test_adopted_covariances_change_the_trust_and_not_the_state(motion):
     assert distance(doubting.centre, (283, 139)) < 0.2 * distance(centre.centre, (283, 139))
 
 
-def test_it_is_the_kalman_filter_of_filterpy_without_its_second_of_imports(motion, rng):
-    """As one that dies resumes with a filter, the import would be a second more without a track."""
-    centre, oracle = moving(motion, 5), KalmanFilter(dim_x=4, dim_z=2)
-    oracle.F, oracle.H, oracle.Q, oracle.R = (
-        np.eye(4) + np.eye(4, k=2),
-        np.eye(2, 4),
-        motion.process,
-        motion.observation,
-    )
-    oracle.x, oracle.P = centre.state[0], centre.state[1:]
+def test_it_is_the_kalman_filter_of_the_textbook(motion, rng):
+    centre = moving(motion, 5)
+    F, H, Q, R = np.eye(4) + np.eye(4, k=2), np.eye(2, 4), motion.process, motion.observation
+    x, P = centre.state[0], centre.state[1:]
     for _ in range(50):
-        measured = tuple(np.add(centre.predict(), rng.normal(size=2)))
-        centre.update(measured)
-        oracle.predict()
-        oracle.update(np.array(measured))
-        np.testing.assert_allclose(centre.state, np.vstack([oracle.x, oracle.P]), rtol=1e-12, atol=1e-12)
+        z = np.add(centre.predict(), rng.normal(size=2))
+        centre.update(tuple(z))
+        x, P = F @ x, F @ P @ F.T + Q
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+        x, P = x + K @ (z - H @ x), (np.eye(4) - K @ H) @ P
+        np.testing.assert_allclose(centre.state, np.vstack([x, P]), rtol=1e-9, atol=1e-9)
