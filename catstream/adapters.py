@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from catstream.extras import need
 from catstream.messages import Track
 
 __all__ = ["to_supervision"]
@@ -19,13 +20,12 @@ def to_supervision(track: Track) -> Any:
 
     Raises
     ------
-    ImportError
-        Where supervision is not installed; says how to get it.
+    MissingExtraError
+        If supervision is not installed; says how to get it.
     """
-    try:
-        from supervision import Detections
-    except ImportError as error:
-        raise ImportError(f"to_supervision needs the extra: pip install 'catstream[supervision]' ({error})") from error
+    need("supervision")
+    from supervision import Detections
+
     if track.box is None:
         return Detections.empty()
     x, y, w, h = track.box

@@ -8,6 +8,7 @@ line prints it as one line and exits with 1; a program catches
 __all__ = [
     "BoxError",
     "CatstreamError",
+    "MissingExtraError",
     "ProtocolError",
     "RecordingError",
     "RefusedError",
@@ -25,6 +26,10 @@ class CatstreamError(Exception):
 
 class SettingsError(CatstreamError, ValueError):
     """A setting that does not exist, or a value it cannot take."""
+
+
+class MissingExtraError(CatstreamError, ImportError):
+    """An optional dependency that is not installed; says how to install it."""
 
 
 class BoxError(CatstreamError, ValueError):

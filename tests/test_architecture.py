@@ -10,12 +10,14 @@ from pathlib import Path
 
 import pytest
 
+from catstream.extras import EXTRAS
+
 ROOT = Path(__file__).parents[1]
 
 #: From the ground up. A module imports from the floors below its own, and from its own folder.
 FLOORS = [
     {"errors"},
-    {"box", "storage"},
+    {"box", "storage", "extras"},
     {"messages", "settings", "ridge", "kalman", "html"},
     {"detection", "compression", "training", "wire", "video", "adapters"},
     {"learned"},
@@ -142,7 +144,6 @@ def test_every_dependency_has_a_home():
         "scikit-learn": "sklearn",
     }
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *extras["parquet"], *extras["supervision"]]
+    wanted = [*project["dependencies"], *(name for extra in EXTRAS for name in project["optional-dependencies"][extra])]
     names = {dependency.partition(">=")[0] for dependency in wanted}
     assert {distributions.get(name, name) for name in names} == set(HOMES)

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from catstream.extras import need
 from catstream.messages import Run
 from catstream.services.options import with_part
 from catstream.settings import Settings
@@ -60,7 +61,7 @@ def sink(
     if columns is not None:
         if not databases:
             raise click.UsageError("--parquet is made from a database: name a .sqlite file too")
-        parquet.require()
+        need("parquet")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     written, newest, reach, reason = 0, -1, 0, ""
     with subscribe(endpoint, "tracks", keys=keys) as tracks:

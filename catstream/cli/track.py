@@ -16,6 +16,7 @@ from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli import INTERRUPTED
+from catstream.extras import need
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
@@ -110,6 +111,8 @@ def track(
         notes=({"output": str(output.absolute())} if output is not None else {}) | ({"video": "yes"} if video else {}),
     )
     video, output = "video" in pipeline.notes, Path(pipeline.notes["output"]) if "output" in pipeline.notes else None
+    if view is not None:
+        need("view")
     if video and output is None:
         raise click.UsageError("--video needs --output, the folder to write it to")
     if video and pipeline.live:

@@ -15,6 +15,7 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.errors import BoxError, SettingsError
+from catstream.extras import install_command
 
 __all__ = ["OPENCV", "PEERS", "Peer", "one_thread"]
 
@@ -70,8 +71,7 @@ def _find(name: str) -> Callable[[], Any]:
         if create is not None:
             return create
     raise SettingsError(
-        f"OpenCV {OPENCV} has no tracker {name!r}: install the contrib modules of OpenCV 4, "
-        'pip install "catstream[peers]"'
+        f"OpenCV {OPENCV} has no tracker {name!r}: install the contrib modules of OpenCV 4, {install_command('peers')}"
     )
 
 

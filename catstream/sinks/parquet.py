@@ -5,29 +5,13 @@ from __future__ import annotations
 import sqlite3
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from catstream.errors import VideoError
+from catstream.extras import need
 
-__all__ = ["export", "require"]
+__all__ = ["export"]
 
 _ROWS = 65536  # in memory at once
-
-
-def require() -> Any:
-    """The library that writes Parquet.
-
-    Raises
-    ------
-    VideoError
-        Where it is not installed.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise VideoError("Parquet needs the extra: pip install 'catstream[parquet]'") from None
-    return pyarrow
 
 
 def export(database: Path, path: Path) -> int:
@@ -40,9 +24,14 @@ def export(database: Path, path: Path) -> int:
     Raises
     ------
     VideoError
-        Where the database cannot be read or the file not be written, or pyarrow is not installed.
+        If the database cannot be read or the file cannot be written.
+    MissingExtraError
+        If pyarrow is not installed.
     """
-    arrow = require()
+    need("parquet")
+    import pyarrow as arrow
+    import pyarrow.parquet
+
     kinds = {"INTEGER": arrow.int64(), "REAL": arrow.float64(), "TEXT": arrow.string()}
     part, rows = path.with_name(path.name + ".part"), 0
     try:

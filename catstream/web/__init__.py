@@ -1,1 +1,5 @@
 """The web page of a running pipeline: look at it, steer it, measure it."""
+
+from catstream.extras import need
+
+need("view")

@@ -1,0 +1,46 @@
+"""Optional dependencies: the extras of pyproject.toml, and the error for one that is not installed."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+from catstream.errors import MissingExtraError
+
+__all__ = ["EXTRAS", "install_command", "need"]
+
+#: Extra -> the feature that needs it, and the modules that the feature imports.
+EXTRAS = {
+    "view": ("the web page", ("prometheus_client", "starlette", "uvicorn")),
+    "loadtest": ("the load test", ("hdrh", "psutil")),
+    "parquet": ("a Parquet file", ("pyarrow",)),
+    "supervision": ("to_supervision", ("supervision",)),
+}
+
+
+def need(extra: str) -> None:
+    """Check that the modules of an extra can be imported, without importing them.
+
+    Raises
+    ------
+    MissingExtraError
+        If one of them is not installed; says the command that installs the extra.
+    """
+    feature, modules = EXTRAS[extra]
+    missing = [module for module in modules if find_spec(module) is None]
+    if missing:
+        packages = " and ".join(missing)
+        verb = "is" if len(missing) == 1 else "are"
+        raise MissingExtraError(f"{feature} needs {packages}, which {verb} not installed: {install_command(extra)}")
+
+
+def install_command(extra: str) -> str:
+    """The command that adds an extra to the catstream that is installed in this environment.
+
+    It is right for a checkout too: pip keeps the catstream that is there, and installs what the extra adds.
+    """
+    beside = Path(sys.executable).with_name("pip")
+    pip = "pip" if shutil.which("pip") == str(beside) else f"{sys.executable} -m pip"
+    return f'{pip} install "catstream[{extra}]"'

@@ -1,0 +1,61 @@
+"""Optional dependencies: what `pip install catstream` leaves out, and what is said about it."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from catstream.errors import MissingExtraError
+from catstream.extras import EXTRAS, install_command, need
+
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+OPTIONAL = PROJECT["optional-dependencies"]
+
+#: Blocks the modules of all extras, then imports all that following a video needs.
+BASE = f"""
+import sys
+for module in {[module for _, modules in EXTRAS.values() for module in modules]}:
+    sys.modules[module] = None
+import catstream
+catstream.Tracker, catstream.Pipeline, catstream.subscribe, catstream.control
+from catstream.cli import VERBS, verb
+from catstream.services.__main__ import main
+import catstream.evaluation.runs, catstream.evaluation.report
+for name in VERBS:
+    verb(name)
+"""
+
+
+def test_following_and_the_help_of_every_verb_need_no_extra():
+    subprocess.run([sys.executable, "-c", BASE], check=True)
+
+
+@pytest.mark.parametrize(("package", "extra"), [("catstream.web", "view"), ("catstream.loadtest", "loadtest")])
+def test_a_package_whose_extra_is_missing_says_the_command(monkeypatch, package, extra):
+    monkeypatch.setitem(sys.modules, EXTRAS[extra][1][0], None)
+    for name in [name for name in sys.modules if name == package or name.startswith(f"{package}.")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(MissingExtraError, match=rf'{EXTRAS[extra][0]} needs .* "catstream\[{extra}\]"'):
+        importlib.import_module(package)
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_an_extra_that_is_installed_says_nothing(extra):
+    need(extra)
+
+
+def test_the_command_is_of_this_environment(monkeypatch):
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert install_command("view") == f'{sys.executable} -m pip install "catstream[view]"'
+
+
+def test_all_brings_every_extra_but_the_one_that_replaces_opencv():
+    (everything,) = OPTIONAL["all"]
+    names = set(everything.removeprefix("catstream[").removesuffix("]").split(","))
+    assert names == set(OPTIONAL) - {"all", "dev", "peers"}
+    assert set(EXTRAS) <= names
