@@ -127,7 +127,8 @@ class Pipeline:
         if self._record is not None and self._record.exists() and self._kept is None:
             raise RecordingError(f"{record} is there already: give another name, or remove it")
         # The detector opens the source once more: a camera shows its picture to one at a time.
-        with open_source(self.source, part=self.part) as first:
+        image_rate, skip_damaged = self.settings.image_rate, self.settings.skip_damaged
+        with open_source(self.source, part=self.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
         if self._box is not None:

@@ -66,6 +66,19 @@ class Settings:
         ),
     ] = 25
     seed: Annotated[int, _about("Seed of everything random.", ge=0)] = 0
+    image_rate: Annotated[
+        float,
+        _about(
+            "Frames per second of a folder or a pattern of images, which have no clock of their own.", gt=0, le=1000
+        ),
+    ] = 25.0
+    skip_damaged: Annotated[
+        bool,
+        _about(
+            "Read a video file on after a damaged place: frames that cannot be decoded are left out and counted. "
+            "Without it, the run ends there."
+        ),
+    ] = False
     window: Annotated[
         int,
         _about("Features messages that may be sent and not yet stored.", ge=1, le=65536),

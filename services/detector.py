@@ -85,7 +85,17 @@ def main(
         first, step = max(detector.seq - 1, 0), part.step or 1
         process.allow(_OPEN_SECONDS + ((part.start or 0) + first * step) * _SKIP_SECONDS)
         process.allow_each((step - 1) * _SKIP_SECONDS)
-        frames = stack.enter_context(open_source(source, first, part=part, since=since, idle=line.idle))
+        frames = stack.enter_context(
+            open_source(
+                source,
+                first,
+                part=part,
+                since=since,
+                idle=line.idle,
+                image_rate=process.settings.image_rate,
+                skip_damaged=process.settings.skip_damaged,
+            )
+        )
         line.source = frames
         coming = frames if frames.live else stack.enter_context(closing(ahead(frames)))
         reason, failed = "the source came to its end", False

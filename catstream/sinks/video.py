@@ -28,9 +28,10 @@ class VideoSink:
     def __init__(self, path: Path, source: str, part: slice) -> None:
         if is_live(source):
             raise VideoError(f"a video of {source} needs its frames once more, and those of a live source are gone")
-        self._frames = open_source(source, part=part)
+        # The pipeline ends at a damaged place unless it skips those: either way these are its frames.
+        self._frames = open_source(source, part=part, skip_damaged=True)
         try:
-            self._video = AnnotatedVideo(path, self._frames.rate, self._frames.size)
+            self._video = AnnotatedVideo(path, self._frames.rate, self._frames.size, sound=self._frames.sound)
         except VideoError:
             self._frames.close()
             raise
@@ -39,7 +40,7 @@ class VideoSink:
         """Draw a track over its frame."""
         for frame in self._frames:
             if frame.number == track.frame:
-                self._video.write(frame.image, track)
+                self._video.write(frame.image, track, frame.time)
                 return
         raise VideoError(f"the source has no frame {track.frame}: is it what the pipeline follows?")
 

@@ -15,15 +15,15 @@ __all__ = ["AnnotatedVideo", "draw", "thumbnail"]
 
 #: Blue, green, red.
 _COLOURS = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
-_WHITE, _GREY, _ORANGE = (245, 245, 245), (110, 110, 110), (40, 140, 255)
+_WHITE, _GREY, _DARK, _ORANGE = (245, 245, 245), (110, 110, 110), (32, 32, 32), (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
-#: Images narrower than this are enlarged by a whole factor, so that the text can be read.
-_READABLE = 320
+#: Height of the line of text below a picture, in pixels of one that is 640 wide; never less than three quarters of it.
+_LINE, _LEAST_UNIT = 26, 0.75
 
 
 def draw(image: np.ndarray, track: Track) -> np.ndarray:
-    """Draw box, state, score and model version over a copy of a frame.
+    """Draw the box over a copy of a frame, and write state, score and model version below it.
 
     Parameters
     ----------
@@ -32,16 +32,18 @@ def draw(image: np.ndarray, track: Track) -> np.ndarray:
 
     Returns
     -------
-    uint8 (k h, k w, 3), where k is 1 unless the image is narrower than 320 pixels
+    uint8 (h + k, w, 3), the frame above k rows of text: pixels keep their place, and none is covered by the text
     """
-    zoom = _zoom(image.shape[1])
-    canvas = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC) if zoom > 1 else image.copy()
-    unit = canvas.shape[1] / 640  # lengths below are pixels of an image 640 wide
+    height, width = image.shape[:2]
+    unit = max(width / 640, _LEAST_UNIT)
+    canvas = np.zeros((height + _line(width), width, 3), np.uint8)
+    picture = canvas[:height]
+    picture[:] = image
     colour = _COLOURS[track.state]
     if track.box is not None:
-        x, y, w, h = (value * zoom for value in track.box)
-        _frame(canvas, (x, y), (x + w, y + h), colour, unit)
-    _strip(canvas, track, colour, max(unit, 0.75))
+        x, y, w, h = track.box
+        _frame(picture, (x, y), (x + w, y + h), colour, width / 640)
+    _write_line(canvas[height:], track, colour, unit)
     return canvas
 
 
@@ -69,8 +71,9 @@ def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int)
     return cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
 
 
-def _zoom(width: int) -> int:
-    return max(1, -(-_READABLE // width))
+def _line(width: int) -> int:
+    """Rows of text below a picture of this width."""
+    return round(_LINE * max(width / 640, _LEAST_UNIT))
 
 
 def _frame(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float) -> None:
@@ -85,52 +88,59 @@ def _frame(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float) -
             cv2.polylines(canvas, [corner], False, colour, max(2, round(3 * unit)), cv2.LINE_AA)
 
 
-def _strip(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> None:
-    """A dark line of text along the bottom: state, score as bar and number, model and frame."""
+def _write_line(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> None:
+    """State, score as a bar and as a number, model and frame; in a narrow picture only the first of these."""
     height, width = canvas.shape[:2]
-    tall = round(26 * unit)
-    canvas[-tall:] = canvas[-tall:] // 4
-    middle, line = height - tall // 2, height - round(9 * unit)
+    canvas[:] = _DARK
+    middle, line, thick = height // 2, height - round(9 * unit), max(1, round(unit))
 
-    def write(text: str, left: int, shade: Any) -> None:
-        cv2.putText(canvas, text, (left, line), _FONT, 0.45 * unit, shade, max(1, round(unit)), cv2.LINE_AA)
+    def long(text: str) -> int:
+        return cv2.getTextSize(text, _FONT, 0.45 * unit, thick)[0][0]
+
+    def write(text: str, left: int) -> None:
+        cv2.putText(canvas, text, (left, line), _FONT, 0.45 * unit, _WHITE, thick, cv2.LINE_AA)
 
     cv2.circle(canvas, (round(14 * unit), middle), round(5 * unit), colour, cv2.FILLED, cv2.LINE_AA)
-    write(track.state, round(26 * unit), _WHITE)
-    left, long, half = round(132 * unit), round(90 * unit), max(2, round(3 * unit))
-    full = round(long * min(max(track.score, 0.0), 1.0))
-    cv2.rectangle(canvas, (left, middle - half), (left + long, middle + half), _GREY, cv2.FILLED)
-    cv2.rectangle(canvas, (left, middle - half), (left + full, middle + half), colour, cv2.FILLED)
-    write(f"{track.score:.2f}", left + long + round(8 * unit), _WHITE)
+    write(track.state, round(26 * unit))
+    bar, right, half, score = round(132 * unit), round(222 * unit), max(2, round(3 * unit)), f"{track.score:.2f}"
+    number = right + round(8 * unit)
+    if number + long(score) > width:
+        return
+    filled = bar + round((right - bar) * min(max(track.score, 0.0), 1.0))
+    cv2.rectangle(canvas, (bar, middle - half), (right, middle + half), _GREY, cv2.FILLED)
+    cv2.rectangle(canvas, (bar, middle - half), (filled, middle + half), colour, cv2.FILLED)
+    write(score, number)
     end = f"model {track.model_version}   frame {track.frame}"
-    (wide, _), _ = cv2.getTextSize(end, _FONT, 0.45 * unit, max(1, round(unit)))
-    write(end, width - wide - round(10 * unit), _WHITE)
+    start = width - long(end) - round(10 * unit)
+    if start > number + long(score):
+        write(end, start)
 
 
 class AnnotatedVideo:
     """An MP4 of frames with their tracks drawn in; a context manager.
 
-    See `catstream.video.writer.VideoWriter`, which it writes with.
+    It is written with `catstream.video.writer.VideoWriter`, which see.
 
     Parameters
     ----------
     path : of the video to write
-    rate : frames a second
-    size : (width, height) of the frames that will come
+    rate : frames per second, on average
+    size : (width, height) of the frames that will come, in pixels
+    sound : video file whose sound is copied, None for no sound
 
     Raises
     ------
     VideoError
-        Where the file cannot be written, before any work is done.
+        If the file cannot be written, before any work is done.
     """
 
-    def __init__(self, path: str | Path, rate: float, size: tuple[int, int]) -> None:
-        zoom = _zoom(size[0])
-        self._writer = VideoWriter(path, rate, (size[0] * zoom, size[1] * zoom))
+    def __init__(self, path: str | Path, rate: float, size: tuple[int, int], *, sound: Path | None = None) -> None:
+        width, height = size
+        self._writer = VideoWriter(path, rate, (width, height + _line(width)), sound=sound)
 
-    def write(self, image: np.ndarray, track: Track) -> None:
-        """Add a frame, uint8 (h, w, 3) of the size announced, with its track."""
-        self._writer.write(draw(image, track))
+    def write(self, image: np.ndarray, track: Track, time: float | None = None) -> None:
+        """Add a frame, uint8 (h, w, 3) of the size announced, with its track; `time` as `VideoWriter.write` has it."""
+        self._writer.write(draw(image, track), time)
 
     def close(self) -> None:
         """Finish the file and give it its name."""

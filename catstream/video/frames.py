@@ -6,13 +6,14 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 __all__ = ["RATE", "Frame", "Source", "Upright", "reason", "without_password"]
 
-#: Frames a second of a source that does not say: images have no clock.
+#: Frames per second of a source without a clock, if none is given.
 RATE = 25.0
 
 
@@ -36,22 +37,28 @@ class Source(ABC):
     """Frames in order, once, and what is known of them before they are read.
 
     name    what results are called: the stem of a file, the name of a folder
-    frames  how many the source says it has, or None
-    rate    frames a second
+    rate    frames per second
     size    (width, height) of the first frame in pixels
     live    whether frames pass by whether they are read or not
+    sound   video file whose sound belongs to the frames; None if there is none
 
     Close it, or use it in a `with`.
     """
 
     live = False
+    sound: Path | None = None
 
-    def __init__(self, name: str, frames: int | None, rate: float, size: tuple[int, int]) -> None:
-        self.name, self.frames, self.rate, self.size = name, frames, rate, size
+    def __init__(self, name: str, rate: float, size: tuple[int, int]) -> None:
+        self.name, self.rate, self.size = name, rate, size
+
+    @property
+    def frames(self) -> int | None:
+        """Number of frames that the source has; None if that cannot be known, as of a live source."""
+        return None
 
     @property
     def counters(self) -> dict[str, float]:
-        """What a source that may lose frames counts: name -> number."""
+        """Counts of the frames that a source has lost: name -> number."""
         return {}
 
     def __iter__(self) -> Iterator[Frame]:

@@ -60,7 +60,7 @@ class LiveSource(Source):
     def __init__(
         self, text: str, start: int = 0, *, since: float | None = None, idle: Callable[[], bool] | None = None
     ) -> None:
-        super().__init__(_name(text), None, RATE, (0, 0))
+        super().__init__(_name(text), RATE, (0, 0))
         self.skipped = self.reopened = 0
         self._text, self._shown = text, without_password(text)
         self._number, self._zero, self._idle = start, since, idle

@@ -12,10 +12,12 @@ What the text may be:
     a pattern           images/%05d.png or images/*.png
     a camera            0 or /dev/video0
     a stream            rtsp://HOST/PATH, or http://HOST/PATH for MJPEG
+    a file:// address   file:///home/me/walk.mp4, as other programs copy it
 
-Files and images are read to their last frame and none is skipped. Where they
-break, their good frames come first and the `VideoError` after them. Cameras and
-streams are live: see `catstream.video.live`.
+Files and images are read to their last frame and none is skipped. If a file is
+damaged, its good frames come first and then a `VideoError`; with
+`skip_damaged` it is read on after the damaged place. Cameras and streams are
+live: see `catstream.video.live`.
 """
 
 from __future__ import annotations
@@ -24,10 +26,13 @@ import contextlib
 import re
 import sys
 from collections.abc import Callable, Iterator
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import cv2
+import numpy as np
 
 from catstream.errors import VideoError
 from catstream.video.frames import RATE, Frame, Source, Upright, reason
@@ -47,23 +52,61 @@ _LIVE = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+")
 _SHORT_SECONDS = 0.5
 
 
+#: Reading a container that fails so often in a row, without a packet between, has come to its end.
+_MOST_FAILURES = 3
+
+#: A file larger than this, in bytes, is not read through to count its frames.
+_MOST_COUNTED = 1 << 30
+
+
 class _Recording(Source):
-    """A source of which every frame is read. Opening decodes the first one.
+    """A source whose frames are all read. Its constructor decodes the first one.
+
+    Parameters
+    ----------
+    stream : the frames of `part`, from number `start` of them on
+    total : returns how many frames the whole source has, None if that cannot be known
+    rate : frames per second of the whole source
+    damage : of the file that `stream` reads
 
     Raises
     ------
     VideoError
-        From the constructor where there is no first frame, from the iterator
-        where the source breaks, after its good frames.
+        From the constructor if there is no first frame, from the iterator if the source is damaged, after its good
+        frames.
     """
 
-    def __init__(self, name: str, stream: Iterator[Frame], *, frames: int | None, rate: float) -> None:
-        self._stream = stream
+    def __init__(
+        self,
+        name: str,
+        stream: Iterator[Frame],
+        total: Callable[[], int | None],
+        part: slice,
+        start: int,
+        rate: float,
+        damage: _Damage | None = None,
+    ) -> None:
+        self._stream, self._total, self._part, self._damage = stream, total, part, damage
         self._first: Frame | None = next(stream, None)
         if self._first is None:
-            raise VideoError(f"{name} has no frame to start with: check the source and the first frame asked for")
+            wanted = range(sys.maxsize)[part][start:]
+            end = " on" if part.stop is None else f" to before {wanted.stop}"
+            raise VideoError(
+                f"{name} has {total() or 'no'} frames, numbered from 0, and none to follow from frame {wanted.start}"
+                f"{end}: give an earlier first frame, or another source"
+            )
         height, width = self._first.image.shape[:2]
-        super().__init__(name, frames, rate, (width, height))
+        super().__init__(name, rate / (part.step or 1), (width, height))
+
+    @cached_property
+    def frames(self) -> int | None:
+        total = self._total()
+        return len(range(total)[self._part]) if total else None
+
+    @property
+    def counters(self) -> dict[str, float]:
+        """`damaged`: how many frames could not be decoded and were left out."""
+        return {"damaged": self._damage.frames} if self._damage is not None and self._damage.frames else {}
 
     def __next__(self) -> Frame:
         if self._first is not None:
@@ -94,6 +137,8 @@ def open_source(
     part: slice = WHOLE,
     since: float | None = None,
     idle: Callable[[], bool] | None = None,
+    image_rate: float = RATE,
+    skip_damaged: bool = False,
 ) -> Source:
     """Open what `text` names, see the module.
 
@@ -107,11 +152,14 @@ def open_source(
     idle : called ten times a second while a live source gives no frame; where it returns True, iterating ends.
         Who gives one waits for the first frame too, however long it takes: opening then never fails, and the
         size is known with the first frame
+    image_rate : frames per second of images, which have no clock
+    skip_damaged : read a video file on after a damaged place. The frames that cannot be decoded are left out, the
+        next good one takes the next number, and its time is the true one
 
     Raises
     ------
     VideoError
-        Where there is nothing, or nothing readable; says what was expected.
+        If there is nothing, or nothing readable; says what was expected.
     """
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
         raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
@@ -121,17 +169,33 @@ def open_source(
         from catstream.video.live import LiveSource  # here, as files do without its threads
 
         return LiveSource(str(text), start, since=since, idle=idle)
-    path = Path(text)
+    path = _path(text)
+    images = partial(_images, part=part, start=start, rate=image_rate)
+    video = partial(_video, part=part, start=start, skip_damaged=skip_damaged)
     try:
         if path.is_dir():
-            return _folder(path, part, start)
+            return _folder(path, images, video)
         if path.is_file():
-            return _video(path, part, start)
+            return video(path)
         if re.search(r"%0?\d*d|[*?\[]", path.name):
-            return _images(path.parent.resolve().name, image_files(path), part, start)
+            return images(path.parent.resolve().name, image_files(path))
     except OSError as error:
         raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {_HELP}") from None
     raise VideoError(f"there is no video or folder {str(text)!r}: {_HELP}")
+
+
+def _path(text: str | Path) -> Path:
+    if str(text) == "-":
+        raise VideoError(
+            "a pipe cannot be read again after a process was restarted, so standard input is no source: "
+            "write the video to a file, or serve it as a stream that can be opened again"
+        )
+    if str(text).startswith("file://"):
+        address = urlsplit(str(text))
+        if address.netloc not in ("", "localhost"):
+            raise VideoError(f"{str(text)!r} names a file of another machine: copy it here, or give file:///PATH")
+        return Path(unquote(address.path))
+    return Path(text)
 
 
 def image_files(path: Path) -> list[Path]:
@@ -162,28 +226,27 @@ def natural_order(path: Path) -> list[Any]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _folder(path: Path, part: slice, start: int) -> Source:
+def _folder(path: Path, images: Callable[..., Source], video: Callable[..., Source]) -> Source:
     name = path.resolve().name
     for folder in (*(path / inner for inner in _FOLDERS), path):
         if folder.is_dir() and any(file.suffix.lower() in _IMAGES for file in folder.iterdir()):
-            return _images(name, image_files(folder), part, start)
+            return images(name, image_files(folder))
     videos = sorted(file for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
     if len(videos) == 1:
-        return _video(videos[0], part, start)
+        return video(videos[0])
     held = f"{len(videos)} videos" if videos else "neither images nor a video"
     raise VideoError(f"the folder {str(path)!r} holds {held}: {_HELP}")
 
 
-def _images(name: str, files: list[Path], part: slice, start: int) -> Source:
-    wanted = range(len(files))[part]
-    rate = RATE / wanted.step
-    return _Recording(name, _read_images(files, wanted, start), frames=len(wanted), rate=rate)
+def _images(name: str, files: list[Path], *, part: slice, start: int, rate: float) -> Source:
+    frames = _read_images(files, range(len(files))[part], start, rate)
+    return _Recording(name, frames, lambda: len(files), part, start, rate)
 
 
-def _read_images(files: list[Path], wanted: range, start: int) -> Iterator[Frame]:
+def _read_images(files: list[Path], wanted: range, start: int, rate: float) -> Iterator[Frame]:
     shape: tuple[int, ...] | None = None
     for count, number in enumerate(wanted[start:], start):
-        image = cv2.imread(str(files[number]), cv2.IMREAD_COLOR)
+        image = _read_image(files[number])
         if image is None:
             raise VideoError(f"cannot read the image {str(files[number])!r} (frame {number}): replace or remove it")
         if shape is not None and image.shape != shape:
@@ -192,10 +255,19 @@ def _read_images(files: list[Path], wanted: range, start: int) -> Iterator[Frame
                 f"{image.shape[1]}x{image.shape[0]}, those before it {shape[1]}x{shape[0]}"
             )
         shape = image.shape
-        yield Frame(count, number / RATE, image)
+        yield Frame(count, number / rate, image)
 
 
-def _video(path: Path, part: slice, start: int) -> Source:
+def _read_image(path: Path) -> np.ndarray | None:
+    """An image as uint8 (h, w, 3), None if it cannot be read. OpenCV's own warnings are not printed."""
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.imread(str(path), cv2.IMREAD_COLOR)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def _video(path: Path, *, part: slice, start: int, skip_damaged: bool) -> Source:
     import av  # here, as it costs 0.1 s and folders do without
 
     try:
@@ -209,17 +281,33 @@ def _video(path: Path, part: slice, start: int) -> Source:
         raise VideoError(f"there is no video in {str(path)!r}: {_HELP}")
     stream = streams[0]
     rate = float(stream.average_rate or stream.guessed_rate or RATE)
-    wanted, frames = range(sys.maxsize)[part], len(range(stream.frames)[part]) or None
-    images = _read_video(path, container, rate, wanted, start)
-    return _Recording(path.stem, images, frames=frames, rate=rate / wanted.step)
+    stated, damage = stream.frames, _Damage(path, skip_damaged)
+    images = _read_video(path, container, rate, range(sys.maxsize)[part], start, damage)
+    source = _Recording(path.stem, images, lambda: stated or _counted(path, rate), part, start, rate, damage)
+    source.sound = path
+    return source
 
 
-def _read_video(path: Path, container: Any, rate: float, wanted: range, start: int) -> Iterator[Frame]:
+def _counted(path: Path, rate: float) -> int | None:
+    """Number of frames of a video whose container does not say it: its packets, which need not be decoded."""
+    import av
+
+    with av.open(str(path.absolute())) as container:
+        stream = container.streams.video[0]
+        if path.stat().st_size > _MOST_COUNTED:
+            return round(_stated_seconds(container, stream) * rate) or None
+        count = 0
+        with contextlib.suppress(av.FFmpegError):  # reading the frames says what is damaged
+            count = sum(1 for packet in container.demux(stream) if packet.size)
+        return count or None
+
+
+def _read_video(path: Path, container: Any, rate: float, wanted: range, start: int, damage: _Damage) -> Iterator[Frame]:
     stream = container.streams.video[0]
     stream.thread_type = "NONE"  # the processes are the parallelism
     number, time, zero, shape, upright = 0, 0.0, None, None, Upright()
     with container:
-        for frame in _good_frames(path, container, stream, rate):
+        for frame in _good_frames(container, stream, rate, damage):
             zero = frame.pts if zero is None else zero
             time = number / rate if frame.pts is None else float((frame.pts - zero) * stream.time_base)
             if number in wanted[start:]:
@@ -232,16 +320,44 @@ def _read_video(path: Path, container: Any, rate: float, wanted: range, start: i
                 shape = image.shape
                 yield Frame(wanted.index(number), time, image)
             number += 1
-            if number >= wanted.stop:  # what comes after the part may be broken
+            if number >= wanted.stop:  # what comes after the part may be damaged
                 return
 
 
-def _good_frames(path: Path, container: Any, stream: Any, rate: float) -> Iterator[Any]:
-    """Decoded frames up to the first that is damaged or missing, then a VideoError if there was one."""
+class _Damage:
+    """Decides what a damaged place in a video file means: reading ends there, or goes on at the next key frame.
+
+    frames  how many were left out there, as the time stamps tell
+    """
+
+    def __init__(self, path: Path, skip: bool) -> None:
+        self._path, self._skip = path, skip
+        self.frames = 0
+
+    def report(self, problem: str, good: int) -> None:
+        """Take note of a damaged place after so many good frames.
+
+        Raises
+        ------
+        VideoError
+            Unless damaged places are skipped.
+        """
+        if not self._skip:
+            raise VideoError(
+                f"{str(self._path)!r} breaks at frame {good} ({problem}): the frames before are good; "
+                "--skip-damaged (skip_damaged=True) goes on after the damaged place"
+            )
+
+
+def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> Iterator[Any]:
+    """Decoded frames that are whole, in order; `damage` is told of the places between them that are not."""
     import av
 
-    count, last, problem = 0, None, ""
+    count, last, since_damage, waits_for_key = 0, None, False, False
     for packet, problem in _packets(container, stream, rate):
+        if waits_for_key and packet is not None and packet.size and not packet.is_keyframe:
+            continue
+        waits_for_key = False
         frames: list[Any] = []
         if not problem:
             try:
@@ -252,29 +368,40 @@ def _good_frames(path: Path, container: Any, stream: Any, rate: float) -> Iterat
             with contextlib.suppress(av.FFmpegError):
                 frames = stream.codec_context.decode(None)
         for frame in frames:
-            late = last is not None and frame.pts is not None and (frame.pts - last) * stream.time_base * rate > 1.5
-            if frame.is_corrupt or (problem and late):
+            gap = 1.0
+            if last is not None and frame.pts is not None:
+                gap = float((frame.pts - last) * stream.time_base) * rate
+            if frame.is_corrupt or (problem and gap > 1.5):
                 problem = problem or "its picture is damaged"
                 break
-            last = frame.pts
+            if since_damage:
+                damage.frames += max(0, round(gap) - 1)
+            last, since_damage = frame.pts, False
             yield frame
             count += 1
         if problem:
-            raise VideoError(f"{str(path)!r} breaks at frame {count} ({problem}): the frames before are good")
+            damage.report(problem, count)
+            since_damage = waits_for_key = True
+            stream.codec_context.flush_buffers()
 
 
 def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, str]]:
-    """Packets up to and with the empty one at the end, and what is wrong, the empty text for nothing."""
+    """Packets, the last an empty one, each with what is wrong at its place: the empty text for nothing."""
     import av
 
-    end, stated = 0.0, _stated_seconds(container, stream)
+    end, failures, stated = 0.0, 0, _stated_seconds(container, stream)
     packets = container.demux(stream)
     while True:
         try:
             packet = next(packets)
         except av.FFmpegError as error:
+            failures += 1
             yield None, reason(error)
-            return
+            if failures == _MOST_FAILURES:
+                return
+            packets = container.demux(stream)  # it reads on where it is
+            continue
+        failures = 0
         if packet.dts is None and not packet.size:
             short = stated - end > max(_SHORT_SECONDS, 2 / rate)
             yield packet, f"it says it lasts {stated:.1f} s, and ends at {end:.1f} s" if short else ""

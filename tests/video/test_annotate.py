@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -24,21 +25,23 @@ def track(state: State = "present", box: Box | None = BOX, frame: int = 7) -> Tr
 def test_drawing_keeps_the_size_and_leaves_the_frame_alone(state, size):
     image = np.full((size[1], size[0], 3), 128, np.uint8)
     drawn = draw(image, track(state, None if state == "absent" else BOX))
-    assert drawn.shape == image.shape
+    assert drawn.shape[1:] == image.shape[1:]
     assert (image == 128).all()
     assert (drawn[25:35, 35:45] != 128).any() == (state != "absent")
-    assert (drawn[-4:] != 128).any()
+    assert (drawn[size[1] :] != 128).any()
 
 
-def test_small_frames_are_enlarged_by_a_whole_factor():
-    assert draw(np.zeros((50, 70, 3), np.uint8), track()).shape == (250, 350, 3)
+@pytest.mark.parametrize("size", [(70, 50), (352, 288)])
+def test_pixels_keep_their_place_and_the_text_covers_none_of_them(size):
+    image = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
+    assert (draw(image, track(box=None))[: size[1]] == image).all()
 
 
 @pytest.mark.parametrize(
     "box", [Box(-500, -500, 10, 10), Box(-50, 20, 900, 30), Box(630, 470, 40, 40), Box(5, 5, 0, 0)]
 )
 def test_boxes_anywhere_can_be_drawn(box):
-    assert draw(np.zeros((480, 640, 3), np.uint8), track(box=box)).shape == (480, 640, 3)
+    assert draw(np.zeros((480, 640, 3), np.uint8), track(box=box)).shape == (506, 640, 3)
 
 
 @pytest.mark.parametrize("size", [(640, 480), (321, 241), (99, 77)])
@@ -56,6 +59,46 @@ def test_the_video_has_each_frame_written_at_any_size(tmp_path, size):
         assert (height - shape[0], width - shape[1]) == (shape[0] % 2, shape[1] % 2)
         assert sum(1 for _ in source) == 9
     assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
+
+
+def test_frames_are_shown_at_the_times_that_they_have_in_the_source(tmp_path):
+    times = [2.0, 2.04, 2.5, 2.52, 9.0]
+    with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)) as video:
+        for frame, time in enumerate(times):
+            video.write(np.zeros((64, 64, 3), np.uint8), track(frame=frame), time)
+    with open_source(tmp_path / "out.mp4") as source:
+        assert [frame.time + 2 for frame in source] == pytest.approx(times, abs=0.001)
+
+
+@pytest.fixture
+def with_sound(tmp_path):
+    """A video of 4 s with a tone that begins after 2 s."""
+    path = tmp_path / "sound.mp4"
+    with av.open(str(path), "w") as container:
+        picture, tone = container.add_stream("mpeg4", rate=25), container.add_stream("aac", rate=16000, layout="mono")
+        picture.width = picture.height = 64
+        picture.pix_fmt = "yuv420p"
+        for _ in range(100):
+            container.mux(picture.encode(av.VideoFrame.from_ndarray(np.zeros((64, 64, 3), np.uint8), format="bgr24")))
+        for start in range(0, 64000, 1000):
+            wave = np.sin(np.arange(start, start + 1000) * 0.3) * (start >= 32000)
+            samples = av.AudioFrame.from_ndarray(wave[None].astype(np.float32), format="fltp", layout="mono")
+            samples.sample_rate, samples.pts = 16000, start
+            container.mux(tone.encode(samples))
+        container.mux([*picture.encode(None), *tone.encode(None)])
+    return path
+
+
+@pytest.mark.parametrize("first", [0, 25])
+def test_the_sound_of_the_source_is_kept_where_it_was(tmp_path, with_sound, first):
+    source = open_source(with_sound, part=slice(first, None))
+    with source, AnnotatedVideo(tmp_path / "out.mp4", source.rate, source.size, sound=source.sound) as video:
+        for frame in source:
+            video.write(frame.image, track(frame=frame.number), frame.time)
+    with av.open(str(tmp_path / "out.mp4")) as container:
+        heard = [(frame.time, np.abs(frame.to_ndarray()).max() > 0.5) for frame in container.decode(audio=0)]
+    assert min(time for time, loud in heard if loud) == pytest.approx(2 - first / 25, abs=0.15)
+    assert heard[-1][0] == pytest.approx(4 - first / 25, abs=0.15)
 
 
 def test_a_video_without_frames_leaves_nothing(tmp_path):

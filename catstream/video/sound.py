@@ -1,0 +1,80 @@
+"""The sound of a video file, copied as it is into a video whose picture is written anew."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from catstream.video.frames import reason
+
+__all__ = ["Sound"]
+
+_log = logging.getLogger(__name__)
+
+
+class Sound:
+    """Copies the first sound track of a file; does nothing if there is none that the new container can hold.
+
+    Parameters
+    ----------
+    path : of the file, None for no sound
+    container : `av.container.OutputContainer` to copy to, before its first packet
+    """
+
+    def __init__(self, path: Path | None, container: Any) -> None:
+        self._source: Any = None
+        if path is None:
+            return
+        import av
+
+        try:
+            source = av.open(str(path.absolute()))
+        except (av.FFmpegError, OSError) as error:
+            _log.warning("the sound of %s cannot be read (%s), and is left out", path, error.strerror)
+            return
+        try:
+            self._stream = source.streams.audio[0]
+            self._copy = container.add_stream_from_template(self._stream)
+        except IndexError:
+            source.close()
+            return
+        except ValueError as error:
+            _log.warning("the sound of %s is left out: %s", path, error)
+            source.close()
+            return
+        picture = source.streams.video[0]
+        self._zero = float((picture.start_time or 0) * picture.time_base)
+        self._source, self._container = source, container
+        self._packets = source.demux(self._stream)
+        self._next: Any = None
+
+    def copy(self, start: float, end: float) -> None:
+        """Copy what sounds from `start` up to `end`, in seconds of the source; calls follow one another in time."""
+        import av
+
+        while self._source is not None:
+            try:
+                packet = self._next or next(self._packets)
+            except (StopIteration, av.FFmpegError) as error:
+                if isinstance(error, av.FFmpegError):
+                    _log.warning("the sound ends at %.1f s: %s", end, reason(error))
+                self.close()
+                return
+            self._next = None
+            if packet.pts is None or packet.dts is None:
+                continue
+            time = float(packet.pts * packet.time_base) - self._zero
+            if time >= end:
+                self._next = packet
+                return
+            if time >= start:
+                shift = round((start + self._zero) / packet.time_base)
+                packet.pts, packet.dts, packet.stream = packet.pts - shift, packet.dts - shift, self._copy
+                self._container.mux(packet)
+
+    def close(self) -> None:
+        """Close the file that is copied from."""
+        if self._source is not None:
+            self._source.close()
+            self._source = None
