@@ -12,7 +12,7 @@ import click
 from catstream.box import Box
 from catstream.settings import PRESETS, Settings
 
-__all__ = ["with_given", "with_model", "with_object", "with_part", "with_settings"]
+__all__ = ["with_given", "with_model", "with_object", "with_part", "with_reading", "with_settings"]
 
 with_model = click.option(
     "--model", type=click.Path(path_type=Path), metavar="FILE", help="What `catstream save` wrote of the object."
@@ -55,6 +55,19 @@ def with_given(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def wrapped(file: Path | None, preset: str | None, pairs: tuple[str, ...], **options: Any) -> None:
         command(given=Settings.given(preset=preset, file=file, overrides=pairs), **options)
+
+    return wrapped
+
+
+def with_reading(command: Callable[..., None]) -> Callable[..., None]:
+    """Add `--fps` and `--skip-damaged`, the settings of how a file is read, to what the command gets as `given`."""
+
+    @click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default.")
+    @click.option("--skip-damaged", is_flag=True, help="Go on after a damaged place in a video file.")
+    @wraps(command)
+    def wrapped(given: dict[str, Any], fps: float | None, skip_damaged: bool, **options: Any) -> None:
+        rate = {} if fps is None else {"image_rate": fps}
+        command(given=given | rate | ({"skip_damaged": True} if skip_damaged else {}), **options)
 
     return wrapped
 

@@ -20,7 +20,7 @@ from catstream.extras import need
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
-from catstream.services.options import with_given, with_object, with_part
+from catstream.services.options import with_given, with_object, with_part, with_reading
 from catstream.video.results import ResultsWriter, last_position, tracks
 
 __all__ = ["track"]
@@ -40,6 +40,7 @@ _FOLDER = click.Path(path_type=Path)
 @with_object
 @with_part
 @with_given
+@with_reading
 def track(
     given: dict[str, Any],
     part: slice,
@@ -170,11 +171,14 @@ class _Sinks:
             from catstream.video.annotate import AnnotatedVideo
             from catstream.video.source import open_source
 
-            self._frames = stack.enter_context(open_source(pipeline.source, part=pipeline.part))
+            # A run ends at a damaged place unless it skips those: either way these are its frames.
+            self._frames = stack.enter_context(open_source(pipeline.source, part=pipeline.part, skip_damaged=True))
             path = output / f"{pipeline.name}.mp4"
-            self._video = stack.enter_context(AnnotatedVideo(path, pipeline.rate, pipeline.size))
+            self._video = stack.enter_context(
+                AnnotatedVideo(path, pipeline.rate, pipeline.size, sound=self._frames.sound)
+            )
             for found in tracks(output) if resume else ():  # a video cannot be written on: it is drawn again
-                self._video.write(next(self._frames).image, found)
+                self._video.write(next(self._frames).image, found, found.time)
 
     def write(self, found: Track) -> None:
         moment = time.perf_counter()
@@ -182,7 +186,7 @@ class _Sinks:
             self._results.write(found, moment - self._moment)
         self._moment = moment
         if self._video is not None:
-            self._video.write(next(self._frames).image, found)
+            self._video.write(next(self._frames).image, found, found.time)
 
 
 class _StateColumn(ProgressColumn):
@@ -248,6 +252,8 @@ class _Run:
                 f"live: {self._detector('skipped'):.0f} frames skipped, "
                 f"lost and opened again {self._detector('reopened'):.0f} times"
             )
+        if damaged := self._detector("damaged"):
+            lines.append(f"damaged: {damaged:.0f} frames could not be decoded, and were left out")
         if totals := self._pipeline.totals:
             lines.append(f"features: {totals['sent']} messages sent, {totals['stored']} stored in the coreset trees")
         if self._pipeline.restarts:

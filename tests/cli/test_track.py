@@ -111,6 +111,21 @@ def test_a_truncated_video_is_followed_up_to_the_break(video, said_by_process, t
     assert len((tmp_path / "out" / "broken.txt").read_text().splitlines()) == good
 
 
+def test_a_damaged_place_is_skipped_if_that_is_asked_for_and_counted(video, said, tmp_path):
+    source, box = video
+    damaged = tmp_path / "damaged.mpg"
+    data = bytearray(encoded(source, damaged).read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 3000] = bytes(3000)
+    damaged.write_bytes(data)
+    with open_source(damaged, skip_damaged=True) as whole:
+        good = sum(1 for _ in whole)
+    code, _, errors = said("track", damaged, "--box", box, "--output", tmp_path / "out", "--skip-damaged")
+    assert code == 0, errors
+    assert "frames could not be decoded, and were left out" in errors
+    assert readable(damaged) < len((tmp_path / "out" / "damaged.txt").read_text().splitlines()) == good < 60
+
+
 def test_an_image_of_another_size_ends_the_run_where_it_comes(video, said, tmp_path):
     source, box = video
     images = tmp_path / "walk"
