@@ -1,11 +1,12 @@
-"""The file of a recording: messages one after the other, readable up to the byte at which a crash cut it off.
+"""The file of a recording: messages one after the other, each readable though others are damaged or cut off.
 
     head      b"catrec", the version of the format (1 byte), a zero byte
     records   length of the message (uint32), CRC-32 of all that follows (uint32), the moment it was
               recorded (float64, seconds since 1970), its `seq` or `version` or 0 (uint64), the message as on the wire
 
 Everything is little-endian. The first message is the `Run`. Records are appended with one write each, so
-that a process that is killed leaves at most one torn record, at the end.
+that a process that is killed leaves at most one torn record, at the end. A reader that meets a damaged record
+goes on at the next whole one.
 
 Where `seq` of `Features` goes back, a restarted compressor went on from its checkpoint: they take the
 place of those that it had taken after that, and of what was learned from them.
@@ -14,7 +15,9 @@ place of those that it had taken after that, and of what was learned from them.
 from __future__ import annotations
 
 import fcntl
+import mmap
 import os
+import re
 import struct
 import time
 import zlib
@@ -40,6 +43,7 @@ _FACTS = struct.Struct("<dQ")
 _LARGEST = 64 << 20  # bytes of a message, as of `Features` on the wire
 _WORDS = {Features: "features", Model: "models", Track: "tracks", Health: "reports of health"}
 _OPENINGS = {opening(kind): kind for kind in KINDS}
+_ANY_OPENING = re.compile(b"|".join(map(re.escape, _OPENINGS)))
 
 
 def run_of(settings: Settings) -> Run:
@@ -133,8 +137,9 @@ class Recording:
     missing : features and tracks that should be there and are not, as `seq` tells; also before the first and after
         the last, where the end is there
     end : the pipeline's `End`, None where the recording ended before it
+    damaged : bytes between whole records that are none, and are left out
     torn : bytes at the end that are no whole record, and are left out
-    size : bytes of what is whole
+    size : bytes up to the end of the last whole record
 
     Raises
     ------
@@ -149,9 +154,10 @@ class Recording:
         tracks: set[int] = set()
         self._taken: list[tuple[int, int]] = []  # seq and place of the features that the trees hold
         self._models: list[tuple[int, int]] = []  # seq of the last features it learned from, and place
-        self.size = len(_HEAD)
+        self.size, self.damaged = len(_HEAD), 0
         with self._open() as file:
             for place, _, number, data in self._records(file):
+                self.damaged += place - self.size
                 kind = _kind(data)
                 if kind is Features:
                     _go_back(self._taken, number)
@@ -182,8 +188,9 @@ class Recording:
         """What is in it and what is not, for a person."""
         counts = ", ".join(f"{self.counts[kind]} {word}" for kind, word in _WORDS.items())
         lost = [f"{number} {_WORDS[kind]}" for kind, number in self.missing.items() if number]
+        damaged = f"; {self.damaged} damaged bytes are left out" * bool(self.damaged)
         torn = f"; {self.torn} torn bytes at its end are left out" * bool(self.torn)
-        return f"{counts}, {self.size / 1e6:.0f} MB; {' and '.join(lost) or 'none'} missing{torn}"
+        return f"{counts}, {self.size / 1e6:.0f} MB; {' and '.join(lost) or 'none'} missing{damaged}{torn}"
 
     @property
     def settings(self) -> Settings:
@@ -233,16 +240,32 @@ class Recording:
     @staticmethod
     def _records(file: BinaryIO) -> Iterator[tuple[int, float, int, bytes]]:
         """Place, moment, number and bytes of each whole record, from where the file is."""
-        while True:
-            place = file.tell()
+        place: int | None = file.tell()
+        while place is not None:
+            file.seek(place)
             head = file.read(_LENGTHS.size + _FACTS.size)
             if len(head) < _LENGTHS.size + _FACTS.size:
                 return
             length, check = _LENGTHS.unpack_from(head)
             data = file.read(length) if length <= _LARGEST else b""
-            if len(data) != length or zlib.crc32(data, zlib.crc32(head[_LENGTHS.size :])) != check:
-                return
-            yield place, *_FACTS.unpack_from(head, _LENGTHS.size), data
+            if len(data) == length and zlib.crc32(data, zlib.crc32(head[_LENGTHS.size :])) == check:
+                yield place, *_FACTS.unpack_from(head, _LENGTHS.size), data
+                place += len(head) + length
+            else:
+                place = _next_whole(file, place)
+
+
+def _next_whole(file: BinaryIO, damaged: int) -> int | None:
+    """Place of the first whole record after a damaged one, None if there is none: found by how messages begin."""
+    head = _LENGTHS.size + _FACTS.size
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for found in _ANY_OPENING.finditer(data, damaged + 1 + head):
+            place = found.start() - head
+            length, check = _LENGTHS.unpack_from(data, place)
+            end = found.start() + length
+            if length <= _LARGEST and end <= len(data) and zlib.crc32(data[place + _LENGTHS.size : end]) == check:
+                return place
+    return None
 
 
 def _go_back(places: list[tuple[int, int]], seq: int) -> None:

@@ -43,7 +43,7 @@ class Sound:
             _log.warning("the sound of %s is left out: %s", path, error)
             source.close()
             return
-        picture = source.streams.video[0]
+        picture: Any = source.streams.video[0]
         self._zero = float((picture.start_time or 0) * picture.time_base)
         self._source, self._container = source, container
         self._packets = source.demux(self._stream)

@@ -1,4 +1,4 @@
-"""The file of a recording: what was written is read, up to the byte at which a crash cut it off."""
+"""The file of a recording: what was written is read, but for what a crash cut off or a disk damaged."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from catstream.box import Box
 from catstream.errors import RecordingError
@@ -69,15 +71,22 @@ def test_what_was_torn_before_the_settings_is_no_recording(written, size):
         Recording(path)
 
 
-def test_a_changed_byte_ends_what_is_believed(written):
-    path = written([track(seq) for seq in range(1, 10)])
-    data = bytearray(path.read_bytes())
-    data[-200] ^= 1
-    path.write_bytes(data)
-    recording = Recording(path)
-    assert 0 < recording.counts[Track] < 9
-    assert recording.torn > 0
-    assert "torn bytes at its end are left out" in str(recording)
+@given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+def test_a_changed_bit_costs_its_own_message_and_no_other(tmp_path_factory, share, bit):
+    path = tmp_path_factory.mktemp("changed") / "run.rec"
+    with RecordingWriter(path, run_of(Settings())) as writer:
+        begin = path.stat().st_size
+        for seq in range(1, 10):
+            writer.write(track(seq))
+    content = bytearray(path.read_bytes())
+    size = (len(content) - begin) // 9
+    place = int(share * 9 * size)
+    content[begin + place] ^= 1 << bit
+    path.write_bytes(content)
+    recording, changed = Recording(path), place // size + 1
+    assert read(path)[1:] == [track(seq) for seq in range(1, 10) if seq != changed]
+    assert (recording.damaged, recording.torn) == ((0, size) if changed == 9 else (size, 0))
+    assert f"{size} {'torn' if changed == 9 else 'damaged'} bytes" in str(recording)
 
 
 def test_it_goes_on_after_the_last_whole_record(written):
