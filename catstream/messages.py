@@ -256,12 +256,14 @@ class Health:
     time      seconds since the epoch
     counters  what it counts: name -> number
     trouble   what is wrong with it, for a person to read; empty where nothing is
+    source    that the pipeline follows, without user and password; only the detector knows it
     """
 
     process: str
     time: float
     counters: dict[str, float] = field(default_factory=dict)
     trouble: str = ""
+    source: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from catstream.services.helm import Helm, Orders
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
 from catstream.video.ahead import ahead
-from catstream.video.frames import Frame, Source
+from catstream.video.frames import Frame, Source, without_password
 from catstream.video.source import WHOLE, open_source
 from catstream.wire.sockets import Publisher, Sender, Subscriber
 
@@ -29,6 +29,7 @@ _FAREWELL_SECONDS = 10.0
 _OPEN_SECONDS = 60.0  # that opening the source may take, and learning the first frame
 _SKIP_SECONDS = 0.1  # that decoding a frame may take which is passed over
 _HELD_SECONDS = 0.02  # from one look at the commands to the next while a frame is held
+_LONGEST_SOURCE = 1000  # characters of it that are told with the health
 _OWNER_SECONDS = 0.5  # the owner may listen no more
 
 _log = logging.getLogger(__name__)
@@ -61,6 +62,7 @@ def main(
     state : folder in which what was commanded is kept, for a detector after this one
     part, since : as `open_source` takes them
     """
+    process.source = _shown(source)
     with ExitStack() as stack:
         learned = Learned.load(model) if model is not None else None
         file = state / "orders.json" if state is not None else None
@@ -130,6 +132,18 @@ def main(
         process.broken = failed
         if failed:
             _log.error("%s", reason)
+
+
+def _shown(source: str) -> str:
+    """A source as anyone may read it: of an address neither user, password nor query, in which cameras take them too.
+
+    >>> _shown("http://me:secret@10.0.0.7/video.mjpg?pwd=secret")
+    'http://10.0.0.7/video.mjpg'
+    """
+    text = without_password(source)
+    if "://" in text:
+        text = text.partition("?")[0]
+    return text.encode(errors="replace").decode()[:_LONGEST_SOURCE]  # the name of a file may be no text
 
 
 def _follow(detector: Detector, frame: Frame, orders: Orders) -> tuple[Track, Features]:

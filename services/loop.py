@@ -48,7 +48,7 @@ class Process:
     """What a process has, whichever it is.
 
     settings, endpoint : as all processes of this pipeline have them
-    trouble : what is wrong, for a person; told with its health
+    trouble, source : what is wrong, for a person, and the source that is followed; told with its health
     broken : whether the stream ended before it should, as its `End` tells
     """
 
@@ -56,7 +56,7 @@ class Process:
         self.name = name
         self.settings = settings
         self.endpoint = Endpoint.parse(settings.endpoint, settings.keys)
-        self.trouble = ""
+        self.trouble = self.source = ""
         self.broken = False
         # All but the detector turn in a time that grows with the coreset size.
         factor = 1.0 if name == "detector" else max(1.0, (settings.coreset_size / _QUICK_SIZE) ** 2)
@@ -88,7 +88,7 @@ class Process:
             self._pulse.allow(_CLOSE_SECONDS)
         if now or time.monotonic() - self._beat >= 1:
             self._beat = time.monotonic()
-            self._health.send(Health(self.name, time.time(), counters() | refusals(), self.trouble))
+            self._health.send(Health(self.name, time.time(), counters() | refusals(), self.trouble, self.source))
         else:
             self._health.welcome()
 

@@ -98,6 +98,7 @@ class _Pages:
                     spoken = monotonic()
                     yield ":\n\n"
                 await asyncio.sleep(_TURN_SECONDS)
+            yield f"data: {json.dumps(self._feed.board.news(seen) | {'closed': True}, separators=(',', ':'))}\n\n"
 
     async def picture(self, request: Request) -> Response:
         preview = self._feed.board.picture(request.path_params["frame"])

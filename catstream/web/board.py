@@ -30,51 +30,64 @@ _PICTURES = 8  # a page that asks for the last but one still gets it
 class Board:
     """Takes messages, and tells each page what is new to it.
 
+    What it shows is of one pipeline. At the first track or health of another one it forgets all of the one before; until
+    then it keeps the last picture and figures.
+
     standing, reason : of the pipeline
-    tracks : how many came
+    endpoint, source : where it runs, and the source that it follows
     health : what each process said last
     heard : when each was heard last, of those that are not silent since
     """
 
     def __init__(self) -> None:
+        self.endpoint = self._attached = ""
+        self._revisions: Counter[str] = Counter(pipeline=1)  # told first: a page clears what it shows of another
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin with a pipeline of which nothing is known."""
         self.standing: Standing = "waiting"
-        self.reason = ""
-        self.endpoint = ""
-        self.tracks = 0
+        self.reason = self.source = ""
         self.track: Track | None = None
         self.health: dict[str, Health] = {}
         self.heard: dict[str, float] = {}
         self.learned_after: float | None = None
         self.film = Film()
         self.pictures: OrderedDict[int, Preview] = OrderedDict()
+        self._trees: dict[str, float] = {}  # what the compressor counted last
+        self._sent = 0.0  # frames that the detector has followed
         self._model: Model | None = None
-        self._revisions: Counter[str] = Counter()
+        self._since = 0  # first frame of the object that is followed
         self._points: deque[tuple[float | None, ...]] = deque(maxlen=_POINTS)
         self._pointed = self._ended = float("-inf")  # when the last point was made, and when the pipeline ended
         self._moments: deque[float] = deque()
         self._arrived: OrderedDict[int, float] = OrderedDict()
 
+    def attach(self, endpoint: str) -> None:
+        """What comes from now on comes from here; what is shown stays until something comes."""
+        self._attached = endpoint
+        if self.standing == "waiting":
+            self.endpoint = endpoint
+            self._changed("status")
+
     def take(self, message: Any, now: float) -> None:
         """Take a message that came at a moment `now`, seconds of any clock that only goes forward."""
+        if self._is_of_another(message, now):
+            self._forget()
+            self._changed("pipeline", "status", "track", "picture", "trees", "film")
         match message:
             case Track():
                 self._follow(message, now)
             case Model():
                 self._learn(message, now)
             case Health():
-                self.health[message.process] = message
-                heard = self.heard | {message.process: now}
-                self.heard = {name: last for name, last in heard.items() if now - last <= SILENCE_SECONDS}
-                if self.standing in ("waiting", "gone") or now - self._ended > _FAREWELL_SECONDS:
-                    self.standing, self.reason = "running", ""
-                self._point(now)
-                self._changed("status", "trees")
+                self._hear(message, now)
             case Preview():
                 self._look(message)
             case Features():
                 if self.film.learn(message):
                     self._changed("film")
-            case End():
+            case End() if self.standing != "ended":
                 self.standing, self.reason, self._ended = "ended", message.reason, now
                 self._changed("status")
 
@@ -86,7 +99,7 @@ class Board:
             self.reason = reason
         self.health.clear()
         self.heard.clear()
-        self._changed("status", "trees")
+        self._changed("status")
 
     def rate(self, now: float) -> float:
         """Frames a second, over the last two."""
@@ -118,11 +131,41 @@ class Board:
                 seen[name] = revision
         return parts
 
+    def _is_of_another(self, message: Any, now: float) -> bool:
+        """Whether a message shows that another pipeline is there than the one that is shown."""
+        if not isinstance(message, Track | Health):
+            return False
+        if self._attached != self.endpoint:
+            self.endpoint = self._attached
+            return True
+        if isinstance(message, Track):  # a restarted detector goes on, or began before the first model
+            over = self.track is not None and message.seq < self.track.seq and not message.model_version
+            return over or self.standing == "ended"
+        if message.process != "detector" or self.standing not in ("ended", "gone"):
+            return False
+        late = self.standing == "ended" and now - self._ended > _FAREWELL_SECONDS
+        return late or message.counters.get("sent", 0.0) < self._sent
+
+    def _hear(self, health: Health, now: float) -> None:
+        self.health[health.process] = health
+        heard = self.heard | {health.process: now}
+        self.heard = {name: last for name, last in heard.items() if now - last <= SILENCE_SECONDS}
+        if health.process == "compressor":
+            self._trees = health.counters
+        elif health.process == "detector":
+            self.source, self._sent = health.source, health.counters.get("sent", 0.0)
+        if self.standing in ("waiting", "gone"):
+            self.standing, self.reason = "running", ""
+        self._point(now)
+        self._changed("status", "trees")
+
     def _follow(self, track: Track, now: float) -> None:
-        if self.standing != "running" or (self.track and track.model_version < self.track.model_version):
-            self._begin()
+        if self.standing != "running":
+            self.standing, self.reason = "running", ""
+            self._changed("status")
+        if self.track is not None and track.model_version < self.track.model_version:
+            self._begin(track.frame)
         self.track = track
-        self.tracks += 1
         self._moments.append(now)
         self._arrived[track.frame] = now
         if len(self._arrived) > _FRAMES:
@@ -130,16 +173,17 @@ class Board:
         self._point(now)
         self._changed("track")
 
-    def _begin(self) -> None:
-        """Another run, or another object: what was learned before is of no meaning to it."""
-        self.standing, self.reason, self.track = "running", "", None
-        self.film, self.learned_after = Film(), None
+    def _begin(self, frame: int) -> None:
+        """Another object is followed from this frame on: what was learned before is of no meaning to it."""
+        self._since, self.film, self.learned_after = frame, Film(), None
         self._arrived.clear()
-        if self._model is not None:
+        if self._model is not None and self._model.frame >= frame:  # it came before the track
             self.film.adopt(self._model)
-        self._changed("status", "film")
+        self._changed("film")
 
     def _learn(self, model: Model, now: float) -> None:
+        if model.frame < self._since:  # of the object before
+            return
         self._model = model
         self.film.adopt(model)
         if (arrived := self._arrived.get(model.frame)) is not None:
@@ -173,6 +217,7 @@ class Board:
             "standing": self.standing,
             "reason": self.reason,
             "endpoint": self.endpoint,
+            "source": self.source,
             "processes": sorted(self.heard),
             "paused": bool(self.counter("detector", "paused")),
             "waiting": bool(self.counter("detector", "waiting")),
@@ -185,8 +230,14 @@ class Board:
             return None
         return {"frame": track.frame, "time": track.time, "state": track.state, "version": track.model_version}
 
-    def _picture_part(self, _: int) -> dict[str, Any]:
-        preview = next(reversed(self.pictures.values()))
+    def _pipeline_part(self, _: int) -> int:
+        """Which one is shown, counted: where another is, all parts come anew."""
+        return self._revisions["pipeline"]
+
+    def _picture_part(self, _: int) -> dict[str, Any] | None:
+        preview = next(reversed(self.pictures.values()), None)
+        if preview is None:
+            return None
         return {"frame": preview.frame, "width": preview.width, "height": preview.height, "box": preview.box}
 
     def _points_part(self, new: int) -> list[list[float | None]]:
@@ -194,9 +245,9 @@ class Board:
 
     def _trees_part(self, _: int) -> dict[str, Any]:
         return {
-            "leaves": {tree: self.counter("compressor", f"{tree}_leaves") for tree in TREES},
-            "bytes": self.counter("compressor", "bytes"),
-            "rows": self.counter("compressor", "rows"),
+            "leaves": {tree: self._trees.get(f"{tree}_leaves") for tree in TREES},
+            "bytes": self._trees.get("bytes"),
+            "rows": self._trees.get("rows"),
         }
 
     def _film_part(self, _: int) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from time import monotonic
 
 from catstream.errors import CatstreamError
+from catstream.messages import End
 from catstream.subscription import subscribe
 from catstream.web.board import SILENCE_SECONDS, Board
 from catstream.wire.endpoint import find
@@ -18,9 +19,11 @@ __all__ = ["Feed"]
 _log = logging.getLogger(__name__)
 
 _PAUSE_SECONDS = 0.5
+_LAST_SECONDS = 2.0  # that the last messages may take after the end
 
-#: What is taken always, and what only while somebody looks: it costs the pipeline something.
-_ALWAYS, _WATCHED = ("tracks", "models", "health"), ("previews", "features")
+#: What shows that a pipeline is there, what is taken once it is, and what only while somebody looks: it costs the
+#: pipeline something.
+_SIGNS, _ALWAYS, _WATCHED = ("tracks", "health"), ("models",), ("previews", "features")
 
 
 class Feed:
@@ -45,7 +48,7 @@ class Feed:
         self.place = self.keys = ""
         self.viewers = 0
         self.closed = False
-        self._watched = asyncio.Event()
+        self._watched, self._seen = asyncio.Event(), asyncio.Event()
 
     @contextlib.contextmanager
     def watching(self) -> Iterator[None]:
@@ -64,7 +67,8 @@ class Feed:
         while True:
             try:
                 place = find(self._endpoint, self._keys)
-                self.place = self.board.endpoint = str(place)
+                self.place = str(place)
+                self.board.attach(self.place)
                 self.keys = str(place.keys.folder) if place.keys else ""  # the only one has its keys noted
                 await self._attached()
             except CatstreamError as error:
@@ -77,27 +81,37 @@ class Feed:
 
     async def _attached(self) -> None:
         """Until the pipeline ends, or is silent."""
-        tasks = [asyncio.create_task(self._take(channel)) for channel in (*_ALWAYS, *_WATCHED)]
+        self._seen.clear()
+        tasks = [asyncio.create_task(self._take(channel)) for channel in (*_SIGNS, *_ALWAYS, *_WATCHED)]
         try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
-                task.result()
+                self.board.take(task.result(), monotonic())
+            # It ended: the last health, with what the trees have become, and the last picture may still come.
+            await asyncio.wait(rest, timeout=_LAST_SECONDS)
         finally:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _take(self, channel: str) -> None:
-        """Until the pipeline ends; what is for viewers only while there are any."""
+    async def _take(self, channel: str) -> End | None:
+        """Until the pipeline ends; what is for viewers only while there are any.
+
+        What says nothing of which pipeline it is from is taken once one is seen: until then, it may be the last message
+        of the pipeline before, at the same endpoint.
+        """
         timeout = SILENCE_SECONDS if channel == "health" else None
         while True:
+            if channel not in _SIGNS:
+                await self._seen.wait()
             if channel in _WATCHED:
                 await self._watched.wait()
             with subscribe(self.place, channel, timeout=timeout, keys=self.keys) as messages:  # type: ignore[call-overload]
                 async for message in messages:
                     self.board.take(message, monotonic())
+                    if self.board.standing == "running":
+                        self._seen.set()
                     if channel in _WATCHED and not self.viewers:
                         break
                 else:
-                    self.board.take(messages.end, monotonic())
-                    return
+                    return messages.end

@@ -83,12 +83,88 @@ def test_a_process_that_is_silent_is_not_among_those_that_are_heard(board):
     assert board.news(told)["status"]["processes"] == []
 
 
-def test_the_last_words_of_a_pipeline_are_not_taken_for_the_next_one(board):
+def test_the_last_health_of_a_pipeline_is_not_taken_for_the_next_one(board):
+    board.take(Health("detector", 1.0, {"sent": 7.0}), 9.0)
     board.take(End(2, "the source came to its end"), 10.0)
-    board.take(Health("compressor", 1.0, {}), 10.5)
+    board.take(Health("detector", 1.0, {"sent": 8.0}), 10.5)
+    board.take(Health("compressor", 1.0, {}), 20.0)
     assert board.standing == "ended"
-    board.take(Health("compressor", 2.0, {}), 20.0)
+    board.take(Health("detector", 2.0, {"sent": 9.0}), 20.0)
     assert board.standing == "running"
+
+
+def test_the_trees_are_shown_as_the_last_health_said_after_the_end_too(board):
+    board.take(End(2, "the source came to its end"), 10.0)
+    board.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 200.0}), 10.1)
+    board.lost("no pipeline is running")
+    trees = board.news({})["trees"]
+    assert (trees["leaves"]["object"], trees["rows"]) == (3.0, 200.0)
+
+
+def followed(board, facts, endpoint):
+    """Show a page all of a pipeline; what the page was told."""
+    told = {}
+    board.attach(endpoint)
+    board.take(Health("detector", 1.0, {"sent": 9.0}, source="first.mp4"), 0.0)
+    board.take(Health("compressor", 1.0, {"object_leaves": 3.0}), 0.0)
+    for frame in (50, 51):
+        board.take(facts.track(frame, version=5), frame / 10)
+        board.take(facts.model(5, frame=50), frame / 10)
+        board.take(facts.features(frame, wrong=1.0), frame / 10)
+        board.take(facts.preview(frame), frame / 10)
+    assert board.news(told)["film"]["shots"]
+    return told
+
+
+FIRST_SIGNS = {
+    "its health at another endpoint": ("b", False, lambda _: Health("detector", 2.0, {"sent": 20.0}, source="second.mp4")),
+    "its track at another endpoint": ("b", False, lambda facts: facts.track(70, version=9)),
+    "its track at the same endpoint after the end": ("a", True, lambda facts: facts.track(70, version=9)),
+    "its health at the same endpoint after the end": ("a", True, lambda _: Health("detector", 2.0, {"sent": 0.0})),
+    "its first track at the same endpoint": ("a", False, lambda facts: facts.track(0, version=0)),
+}
+
+
+@pytest.mark.parametrize(("endpoint", "ended", "sign"), FIRST_SIGNS.values(), ids=FIRST_SIGNS)
+def test_nothing_of_a_pipeline_is_left_once_another_one_is_seen(board, facts, endpoint, ended, sign):
+    told = followed(board, facts, "a")
+    if ended:
+        board.take(End(52, "the source came to its end"), 6.0)
+    board.attach(endpoint)
+    assert board.endpoint == "a"
+    assert not set(board.news(told)) - {"status"}, "nothing goes before the other one is seen"
+    board.take(sign(facts), 6.1)
+    parts = board.news(told)
+    assert list(parts)[0] == "pipeline", "a page clears what it shows before it takes the rest"
+    assert (parts["status"]["standing"], parts["status"]["endpoint"]) == ("running", endpoint)
+    assert parts["status"]["source"] != "first.mp4"
+    assert parts["film"]["shots"] == []
+    assert parts["picture"] is None
+    assert not any(parts["trees"]["leaves"].values())
+    assert len(parts.get("points", [])) <= 1
+    assert board.picture(51) is None
+
+
+def test_frames_of_another_pipeline_are_not_measured_by_the_model_of_the_one_before(board, facts):
+    followed(board, facts, "a")
+    board.attach("b")
+    board.take(facts.track(0, version=0, state="bootstrapping"), 6.0)
+    board.take(facts.features(0, wrong=1.0), 6.0)
+    board.take(facts.preview(0), 6.0)
+    assert board.film.frames == 0
+
+
+def test_frames_of_another_object_are_not_measured_by_the_model_of_the_one_before(board, facts):
+    followed(board, facts, "a")
+    board.take(facts.track(60, version=0, state="bootstrapping"), 6.0)
+    board.take(facts.model(6, frame=55), 6.0)
+    board.take(facts.features(60, wrong=1.0), 6.0)
+    board.take(facts.preview(60), 6.0)
+    assert board.film.frames == 0
+    board.take(facts.model(7, frame=61), 6.0)
+    board.take(facts.features(61, wrong=1.0), 6.0)
+    board.take(facts.preview(61), 6.0)
+    assert board.film.frames == 1
 
 
 def test_another_run_begins_another_film(board, facts):

@@ -51,7 +51,7 @@ EXAMPLES = {
     "features": Features(
         3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5), array(1), BEARINGS
     ),
-    "health": Health("trainer", 1.7e9, {"version": 4.0}),
+    "health": Health("detector", 1.7e9, {"sent": 4.0}, "the disk is full", "walk.mp4"),
     "model": Model(4, 20, array(5), -0.25, MOTION, array(5)),
     "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2, BEARINGS),
     "preview": Preview(2, 1280, 720, Box(4.5, 3.0, 20.0, 10.0), b"\xff\xd8\xff\xe0 and so on"),

@@ -25,10 +25,16 @@ export class Charts {
 
   clear() {
     this.points = [];
+    for (const chart of this.charts) {
+      chart.drawing.replaceChildren();
+      chart.drawing.setAttribute("aria-label", `${chart.title}: nothing yet`);
+      chart.right.textContent = "–";
+    }
   }
 
   /** Take points of [second, score, frames a second, latency, model, present]. */
   add(points) {
+    if (!points.length) return;
     this.points.push(...points);
     const now = this.points.at(-1)[0];
     while (this.points[0][0] < now - SECONDS) this.points.shift();

@@ -8,6 +8,11 @@ export class Film {
     Object.assign(this, { element, measured, shots: new Map() });
   }
 
+  clear() {
+    this.shots = new Map();
+    this.element.replaceChildren();
+  }
+
   show({ frames, shots }) {
     this.measured.textContent = frames
       ? `The ${shots.length} most of ${frames.toLocaleString("en")} frames that came as pictures with a model to measure by, a second apart.`

@@ -13,6 +13,8 @@ const stage = new Stage($("#stage"), $("#picture"), { pause, follow, changed: sh
 let status = { standing: "waiting" };
 let track = null;
 let paused = false;
+let closed = false; // whether the server of this page said that it ends
+let silent = false; // whether it does not answer
 
 /** Have a command carried out; returns the answer, null where it was refused, which is said. */
 async function steer(verb, more = {}) {
@@ -73,29 +75,61 @@ function showPaused(now) {
 }
 
 function showState() {
-  const running = status.standing === "running";
+  const running = status.standing === "running" && !silent;
   const lost = running && status.lost_seconds > 0;
   const waiting = running && status.waiting;
   let state = running ? (track && !waiting ? track.state : "waiting") : status.standing;
   let words = { waiting: "waiting", gone: "pipeline gone", ended: "ended" }[state] || state;
-  if (lost) [state, words] = ["gone", `source lost for ${Math.round(status.lost_seconds)} s`];
+  if (silent && status.standing !== "ended") [state, words] = ["gone", "page stopped"];
+  else if (lost) [state, words] = ["gone", `source lost for ${Math.round(status.lost_seconds)} s`];
   else if (waiting) words = "waiting for a box";
   else if (running && paused) words = `paused, ${words}`;
   const pill = $("#state");
   pill.dataset.state = state;
   if (pill.lastElementChild.textContent !== words) pill.lastElementChild.textContent = words;
-  const skipped = status.skipped === null || status.skipped === undefined ? "" : `, ${status.skipped} frames skipped`;
-  $("#about").textContent = status.endpoint ? `${status.endpoint}${skipped}` : "";
-  let veil = "";
-  if (status.standing === "waiting") veil = status.reason || "Waiting for a pipeline";
-  if (status.standing === "gone") veil = "The pipeline is gone. This page waits for it.";
-  if (status.standing === "ended") veil = `The end: ${status.reason}. This page waits for the next one.`;
-  if (running && !stage.hasPicture) veil = "Waiting for a picture";
-  $("#veil").textContent = veil;
+  showSource();
+  $("#veil").textContent = veil(running);
+  $("#stage").classList.toggle("over", status.standing === "ended" && stage.hasPicture);
   for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
 }
 
+/** The name of the source; its whole address and the endpoint of the pipeline as the tooltip. */
+function showSource() {
+  const source = status.source || "";
+  const name = source.includes("://") ? source : source.split("/").filter(Boolean).at(-1) || source;
+  const shown = /^\d+$/.test(name) ? `camera ${name}` : name || status.endpoint || "";
+  const skipped = status.skipped === null || status.skipped === undefined ? "" : `, ${status.skipped} frames skipped`;
+  $("#about").textContent = shown ? `${shown}${skipped}` : "";
+  $("#about").title = source && status.endpoint ? `${source}, followed by the pipeline at ${status.endpoint}` : "";
+  document.title = shown ? `${shown} – catstream` : "catstream";
+}
+
+/** What is said over the picture, and why it stands still. */
+function veil(running) {
+  if (status.standing === "ended") {
+    const page = closed ? "The server of this page has ended too" : silent ? "The server of this page does not answer" : "";
+    return `The end: ${status.reason}. ${page ? `${page}: this is the last it showed.` : "This page waits for the next one."}`;
+  }
+  if (closed) return "The server of this page was stopped: this is the last it showed. The pipeline may go on.";
+  if (silent) return "The server of this page does not answer. This page tries again.";
+  if (status.standing === "waiting") return status.reason || "Waiting for a pipeline";
+  if (status.standing === "gone") return "The pipeline is gone. This page waits for it.";
+  return running && !stage.hasPicture ? "Waiting for a picture" : "";
+}
+
 const show = {
+  pipeline() { // all that is shown is of another one
+    stage.clear();
+    charts.clear();
+    film.clear();
+    track = null;
+    say("");
+    $("#frame").textContent = "";
+  },
+  closed() {
+    closed = true;
+    showState();
+  },
   status(part) {
     if (part.standing !== "running" && status.standing === "running") stage.cancel(false);
     status = part;
@@ -103,12 +137,12 @@ const show = {
   },
   track(part) {
     track = part;
-    if (!part) return;
+    if (!part) return showState();
     $("#frame").textContent = `frame ${part.frame}, ${part.time.toFixed(1)} s, model ${part.version}`;
     showState();
   },
   picture(part) {
-    stage.show(part).then(showState);
+    if (part) stage.show(part).then(showState);
   },
   points: (part) => charts.add(part),
   trees: (part) => trees.show(part),
@@ -117,12 +151,17 @@ const show = {
 
 function listen() {
   const events = new EventSource("/events");
-  events.onopen = () => charts.clear();
+  events.onopen = () => {
+    closed = silent = false;
+    showState();
+  };
   events.onmessage = (event) => {
     for (const [name, part] of Object.entries(JSON.parse(event.data))) show[name](part);
   };
   events.onerror = () => {
-    show.status({ ...status, standing: "waiting", reason: "The server of this page does not answer. This page tries again." });
+    silent = true;
+    stage.cancel(false);
+    showState();
     if (events.readyState !== EventSource.CLOSED) return;
     events.close();
     setTimeout(async () => {

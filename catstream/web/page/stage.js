@@ -12,6 +12,7 @@ export class Stage {
     Object.assign(this, { element, canvas, actions });
     this.picture = this.bitmap = this.box = this.start = this.still = null;
     this.drawing = this.loading = false;
+    this.turn = 0; // how many pipelines were shown before
     element.addEventListener("pointerdown", (event) => this.press(event));
     element.addEventListener("pointermove", (event) => this.drag(event));
     element.addEventListener("pointerup", () => this.release());
@@ -23,18 +24,31 @@ export class Stage {
     return this.bitmap !== null;
   }
 
+  /** Show nothing: another pipeline is there. */
+  clear() {
+    this.cancel(false);
+    this.bitmap?.close();
+    this.picture = this.bitmap = this.next = null;
+    this.turn += 1;
+    this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
+  }
+
   /** Show a picture, unless one is on its way: then it is the next. */
   async show(picture) {
     this.next = picture;
     if (this.loading) return;
     this.loading = true;
     while (this.next) {
-      const wanted = this.next;
+      const [wanted, turn] = [this.next, this.turn];
       this.next = null;
       const response = await fetch(`/pictures/${wanted.frame}.jpg`).catch(() => null);
       if (!response?.ok || (this.still && this.still.frame < wanted.frame)) continue; // it stands still
       const bitmap = await createImageBitmap(await response.blob()).catch(() => null);
       if (!bitmap) continue;
+      if (turn !== this.turn) { // of the pipeline before
+        bitmap.close();
+        continue;
+      }
       this.bitmap?.close();
       [this.picture, this.bitmap] = [wanted, bitmap];
       this.draw();

@@ -5,7 +5,10 @@ import { figure, make } from "./svg.js";
 
 const TREES = { object: "accent", background: "blue", loss: "violet", extent: "green" };
 const MEANING = {
-  object: "the object", background: "the background", loss: "what is the object", extent: "what fits the object",
+  object: ["Object", "what the object has looked like"],
+  background: ["Background", "what is around it"],
+  loss: ["Object or background", "both, with the score that each should get: the score is learned from these"],
+  extent: ["Size and shape", "boxes that fit the object, and boxes too large, small, wide or narrow: the box is learned from these"],
 };
 const [HEIGHT, EDGE] = [120, 8];
 const CLOSEST = 7; // pixels between two nodes of a level that is still drawn
@@ -16,7 +19,10 @@ export class Trees {
     this.trees = Object.entries(TREES).map(([name, tone]) => {
       const drawing = make("svg", { role: "img" });
       const parts = figure("tree", "", tone, drawing);
-      parts.left.append(Object.assign(document.createElement("b"), { textContent: MEANING[name] }));
+      const [label, meaning] = MEANING[name];
+      parts.left.textContent = label;
+      parts.left.className = "label";
+      parts.caption.append(Object.assign(document.createElement("small"), { textContent: meaning }));
       element.append(parts.element);
       return { name, drawing, ...parts, leaves: -1 };
     });

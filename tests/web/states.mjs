@@ -1,0 +1,98 @@
+// The page in each of its states, light and dark: what axe finds wrong with it, and what it says, as JSON.
+//   node states.mjs URL CHROMIUM PROFILE PICTURE [SCREENSHOTS]; the stream of events is a stand-in, the rest is the page
+
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+import { chromium } from "playwright-core";
+
+const [url, executablePath, profile, picture, screenshots] = process.argv.slice(2);
+const axe = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
+const options = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+  "--disable-component-update", "--disable-sync"];
+const DESKTOP = { width: 1200, height: 900 }, PHONE = { width: 390, height: 844 };
+const PAGES = process.env.EVERY_SIZE
+  ? [["light", DESKTOP], ["dark", PHONE], ["light", PHONE], ["dark", DESKTOP]] : [["light", DESKTOP], ["dark", PHONE]];
+
+const status = {
+  standing: "running", reason: "", endpoint: "/tmp/catstream-a1", source: "/videos/walk.mp4", processes: [], paused: false,
+  waiting: false, lost_seconds: 0, skipped: null,
+};
+const track = (state) => ({ frame: 210, time: 8.4, state, version: 12 });
+const box = [120, 90, 60, 50];
+const points = [...Array(40).keys()].map((n) => [n / 4, Math.sin(n / 6) / 2 + 0.5, 60 + n, 0.2, Math.floor(n / 4), n < 30]);
+const all = {
+  pipeline: 1, status, track: track("present"), picture: { frame: 210, width: 320, height: 240, box }, points,
+  trees: { leaves: { object: 13, background: 22, loss: 9, extent: 0 }, bytes: 4e6, rows: 5120 },
+  film: { frames: 90, shots: [20, 90, 160].map((frame) => ({ frame, time: frame / 25, taught: 1 + frame / 40, box, width: 320, height: 240 })) },
+};
+const changed = (more, state = "present") => ({ status: { ...status, ...more }, track: track(state) });
+
+//: What the page is told in each state, after it was told all; what is done there; in that order.
+const STATES = {
+  "no pipeline": { pipeline: 0, status: { ...status, standing: "waiting", source: "", endpoint: "", reason: "no pipeline of yours is running" },
+    track: null, picture: null, trees: { leaves: {}, bytes: null, rows: null }, film: { frames: 0, shots: [] } },
+  "waiting for a box": { ...all, ...changed({ waiting: true }), track: null },
+  bootstrapping: { ...all, ...changed({}, "bootstrapping") },
+  present: { ...all },
+  absent: changed({}, "absent"),
+  "paused, present": changed({ paused: true }),
+  "paused, absent": changed({ paused: true }, "absent"),
+  lost: changed({ lost_seconds: 12, skipped: 40 }, "absent"),
+  gone: changed({ standing: "gone" }),
+  "another pipeline": { pipeline: 2, status: { ...status, source: "rtsp://10.0.0.7/stream1", endpoint: "run" }, track: null, picture: null,
+    trees: { leaves: {}, bytes: null, rows: null }, film: { frames: 0, shots: [] } },
+  drawing: { ...all },
+  stopping: {},
+  "the end": changed({ standing: "ended", reason: "the source came to its end" }),
+  "the end, and of the server": { closed: true },
+};
+const doing = {
+  drawing: async (page) => {
+    await page.waitForFunction(() => document.querySelector("#veil").textContent === "");
+    const view = await page.locator("#picture").boundingBox();
+    await page.mouse.move(view.x + view.width / 3, view.y + view.height / 3);
+    await page.mouse.down();
+    await page.mouse.move(view.x + view.width / 2, view.y + view.height / 2);
+    await page.mouse.up();
+    await page.waitForSelector("#follow:not([disabled])");
+  },
+  stopping: async (page) => {
+    await page.click("#cancel");
+    await page.click("#stop");
+  },
+  "the end": (page) => page.click("#sure button:not(.danger)"),
+  "the end, and of the server": (page) => page.evaluate(() => events.onerror()),
+};
+
+const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args: options });
+const seen = [];
+try {
+  for (const [scheme, viewport] of PAGES) {
+    const page = await browser.newPage();
+    await page.setViewportSize(viewport);
+    await page.emulateMedia({ colorScheme: scheme, reducedMotion: "reduce" });
+    await page.addInitScript(() => {
+      window.EventSource = class { constructor() { window.events = this; } close() {} };
+    });
+    await page.route("**/pictures/*", (route) => route.fulfill({ path: picture, contentType: "image/jpeg" }));
+    await page.route("**/control", (route) => route.fulfill({ json: { done: true, reason: "paused after frame 210", frame: 210, version: 12 } }));
+    await page.goto(url);
+    await page.evaluate(axe);
+    for (const [name, parts] of Object.entries(STATES)) {
+      await page.evaluate((told) => events.onmessage({ data: JSON.stringify(told) }), parts);
+      await doing[name]?.(page);
+      const { violations } = await page.evaluate(() => axe.run());
+      seen.push({ state: name, scheme, pill: await page.locator("#state").innerText(), veil: await page.locator("#veil").textContent(),
+        about: await page.locator("#about").textContent(), frame: await page.locator("#frame").textContent(),
+        shots: await page.locator(".film li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
+        wide: await page.evaluate(() => document.documentElement.scrollWidth - innerWidth),
+        violations: violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html, any }) => `${html} ${any[0]?.message ?? ""}`).join("; ")}`) });
+      if (screenshots) await page.screenshot({ path: `${screenshots}/${name}-${scheme}-${viewport.width}.png`, fullPage: name === "present" });
+    }
+    await page.close();
+  }
+  console.log(JSON.stringify(seen));
+} finally {
+  await browser.close();
+}
+process.exit(0);
