@@ -49,7 +49,7 @@ HOMES = {
     "hdrh": ["catstream/loadtest/latencies.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],
-    "uvicorn": ["catstream/web/server.py"],
+    "uvicorn": ["catstream/web/server.py", "catstream/web/connections.py"],
     "prometheus_client": ["catstream/web/metrics.py"],
     "rich": ["catstream/cli"],
 }

@@ -117,7 +117,11 @@ def followed(board, facts, endpoint):
 
 
 FIRST_SIGNS = {
-    "its health at another endpoint": ("b", False, lambda _: Health("detector", 2.0, {"sent": 20.0}, source="second.mp4")),
+    "its health at another endpoint": (
+        "b",
+        False,
+        lambda _: Health("detector", 2.0, {"sent": 20.0}, source="second.mp4"),
+    ),
     "its track at another endpoint": ("b", False, lambda facts: facts.track(70, version=9)),
     "its track at the same endpoint after the end": ("a", True, lambda facts: facts.track(70, version=9)),
     "its health at the same endpoint after the end": ("a", True, lambda _: Health("detector", 2.0, {"sent": 0.0})),
