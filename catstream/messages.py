@@ -11,7 +11,7 @@ the coreset size, frames count from 0.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -206,18 +206,31 @@ class Model:
     extent: np.ndarray | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Track:
     """Where the object is in one frame, detector -> anyone.
 
-    seq            1, 2, 3 ...: a gap means that this subscriber missed some
-    frame          number of the frame
-    time           seconds since the start of the source, of a live one since that of the run
-    state          "bootstrapping" until the first model, then "present" or "absent"
-    box            where, in pixels of the frame; None while absent
-    score          confidence: about 0 on background, about 1 on the object
-    model_version  the model that scored it, 0 before the first
-    pts            time stamp of the frame in a live stream, seconds of a clock of the stream's own; None of a file
+    Attributes
+    ----------
+    seq : int
+        1, 2, 3 ...: a gap means that this subscriber missed some.
+    frame : int
+        Number of the frame.
+    time : float
+        Seconds since the start of the source, of a live one since that of the run.
+    state : str
+        "bootstrapping" until the first model, then "present" or "absent".
+    box : Box or None
+        Where it is, in pixels of the frame; None while absent.
+    score : float
+        Confidence: about 0 on background, about 1 on the object.
+    model_version : int
+        The model that scored it, 0 before the first.
+    pts : float or None
+        Time stamp of the frame in a live stream, seconds of a clock of the stream's own; None of a file.
+
+    >>> Track(13, 12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
+    Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
     """
 
     seq: int
@@ -228,6 +241,32 @@ class Track:
     score: float
     model_version: int
     pts: float | None = None
+
+    def __repr__(self) -> str:
+        box = None if self.box is None else f"({', '.join(f'{side:.1f}' for side in self.box)})"
+        return (
+            f"Track(frame={self.frame}, time={self.time:.3f}, state={self.state!r}, box={box}, score={self.score:.2f}, "
+            f"model_version={self.model_version})"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields by name, of plain types for JSON: a box is a list [x, y, w, h], or None.
+
+        `catstream sink FILE.ndjson` writes the same.
+
+        >>> Track(13, 12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
+        True
+        """
+        return {
+            "seq": int(self.seq),
+            "frame": int(self.frame),
+            "time": float(self.time),
+            "state": self.state,
+            "box": None if self.box is None else [float(side) for side in self.box],
+            "score": float(self.score),
+            "model_version": int(self.model_version),
+            "pts": None if self.pts is None else float(self.pts),
+        }
 
 
 @dataclass(frozen=True, slots=True)

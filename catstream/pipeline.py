@@ -1,16 +1,17 @@
 """The pipeline: detector, compressor and trainer as processes of this machine, and their tracks in order.
 
-with catstream.Pipeline("walk.mp4", (120, 80, 64, 48)) as pipeline:
-    for track in pipeline:
-        print(track.frame, track.state, track.box)
+for track in catstream.Pipeline("walk.mp4", (120, 80, 64, 48)):
+    print(track.frame, track.state, track.box)
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -26,67 +27,97 @@ from catstream.state import Origin, began, held, position
 from catstream.video.frames import without_password
 from catstream.video.source import WHOLE, is_live, open_source
 from catstream.wire.endpoint import meeting_place, private_folder
+from catstream.wire.readable import readable
 from catstream.wire.sockets import Receiver, Subscriber
 
 __all__ = ["Pipeline"]
 
 _CHECK_SECONDS = 0.1
 _FAREWELL_SECONDS = 12.0
+_TURN_SECONDS = 0.01
+
+_ONCE = "a pipeline runs once, and this one has run: make another Pipeline to follow the source again"
+_CLOSED = ExitStack()  # in place of that of a pipeline that is over
 
 _log = logging.getLogger(__name__)
 
 
 class Pipeline:
-    """Runs the processes while it is open; iterate it for one `Track` a frame, none missing.
+    """Follows an object with three processes, and gives one `Track` a frame, none missing.
 
-    A process that dies is restarted, and the run goes on. Who takes tracks slowly slows a
-    file down: the detector waits. A live source never waits: the frames that pass meanwhile are
-    skipped and counted. It has no end, and is opened again whenever it is lost.
+    Iterate it, with `for` or `async for`: the processes are started, and stopped at the end of the loop. Use it in a
+    `with` or `async with` to have its endpoint and its counters too, and to iterate it piece by piece. A pipeline runs
+    once; make another one to follow the source again.
+
+    A process that dies is restarted, and the run goes on. A slow consumer slows a file down: the detector waits. A
+    live source never waits: the frames that pass meanwhile are skipped and counted. It has no end, and is opened again
+    whenever it is lost.
 
     Parameters
     ----------
-    source : a video file, a folder of images, a pattern, a camera, a stream: see `catstream.video.source`
-    box : x, y, w, h of the object in the first frame, in pixels; with neither this nor a model the
-        first frame is held, or those of a live source pass by, until `catstream.control` sets a box
-    settings : or names and values of those that are not by default; where a run goes on, of those that are to be others
-    model : file that `catstream save` wrote: the object is searched for, absent until it is found, and
-        learning goes on from there
-    part : which frames of a file or folder there are to follow, `slice(100, 200, 2)` for 100, 102 ... 198
-    record : file to write all that travels to, see `catstream.recording`; no features are missing there
-    state : folder to keep what was learned in, so that a power cut does not end the run: once a second, and at the end
-    resume : folder of an earlier run to go on with, where it was. Source, box, part and settings are
-        kept there too: give those only that are to be others
-    notes : names and texts to keep there, for whoever goes on
+    source : str
+        A video file, a folder of images, a pattern such as `images/%05d.png`, a camera (`0`), or a stream
+        (`rtsp://...`).
+    box : str or four numbers
+        x, y, w, h of the object in the first frame, in pixels: `(120, 80, 64, 48)` or `"120,80,64,48"`. With neither
+        this nor a model the first frame is held, or those of a live source pass by, until `catstream.control` sets a
+        box.
+    settings : Settings or mapping of str
+        Those that are not the defaults. If a run goes on, those that are to be different.
+    model : path
+        File that `catstream save` wrote. The object is searched for, is absent until it is found, and learning goes on
+        from there.
+    part : slice
+        The frames of a file or folder to follow: `slice(100, 200, 2)` for 100, 102 ... 198.
+    record : path
+        File to record all messages to, see `catstream replay`. No features are missing in it.
+    state : path
+        Folder to keep what was learned in, once a second and at the end, so that a power cut does not end the run.
+    resume : path
+        Folder of an earlier run to go on with, from the frame that it had reached. Source, box, part and settings are
+        kept there too.
+    after : Position
+        With `resume`: the last track that the caller has. The run goes on with the next one. If None, it goes on after
+        the last frame that was learned from: tracks of the last second may come again.
+    notes : mapping of str to str
+        Texts to keep with the state, for the program that goes on.
 
     Attributes
     ----------
-    name, frames, rate, size, live : of the source, as `catstream.video.frames.Source` has them
-    source, part, notes : as they were given, or kept
-    after : where a run that is resumed goes on, to be set before it is entered: after the last track that the caller
-        has. Where None, after the last frame that was learned from: tracks of the last second may come again
+    name : str
+        Of the source.
+    frames : int or None
+        How many the source has, None if that is not known.
+    rate : float
+        Frames a second of the source.
+    size : tuple of int
+        Width and height of a frame.
+    live : bool
+        Whether the source is a camera or a stream.
+    source, part, notes
+        As they were given, or kept.
 
     Raises
     ------
     BoxError, VideoError
-        From the constructor, for a box that is not in the frame or a source that cannot be read.
+        From the constructor, if the box is not in the frame or the source cannot be read.
     RecordingError
-        From the constructor, where the file to record to is there already.
+        From the constructor, if the file to record to exists.
     SettingsError
-        From the constructor, for settings that the source cannot be followed with: a live one in lockstep.
+        From the constructor, if the source cannot be followed with these settings: a live one in lockstep.
     ServiceError, ProtocolError
-        From the constructor, for a model that cannot be read; where nothing was kept in the folder to resume, or it
-        is damaged.
+        From the constructor, if the model cannot be read, or the folder to resume holds no run or a damaged one.
     ServiceError
-        On entering, where the endpoint or the folder of the state is in use. While iterating, where a process
-        cannot be kept alive.
+        At the start, if the endpoint or the folder of the state is in use, or if it has run already. While iterating,
+        if a process cannot be kept alive.
     VideoError
-        While iterating, where the source breaks, after its last good frame.
+        While iterating, if the source breaks, after its last good frame.
     """
 
     def __init__(
         self,
         source: str | None = None,
-        box: Sequence[float] | None = None,
+        box: str | Iterable[float] | None = None,
         settings: Settings | Mapping[str, Any] | None = None,
         *,
         model: str | os.PathLike[str] | None = None,
@@ -94,6 +125,7 @@ class Pipeline:
         record: str | os.PathLike[str] | None = None,
         state: str | os.PathLike[str] | None = None,
         resume: str | os.PathLike[str] | None = None,
+        after: Position | None = None,
         notes: Mapping[str, str] | None = None,
     ) -> None:
         if state is not None and resume is not None:
@@ -101,7 +133,11 @@ class Pipeline:
         self._kept = Origin.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         self.part, self.notes = part, dict(notes or {})
-        self.after: Position | None = None
+        self._after = after
+        self._stack: ExitStack | None = None  # of all that is to be undone at the end, once it has started
+        self._endpoint = ""
+        self._supervisor: Supervisor | None = None
+        self._checked = 0.0
         if self._kept is not None:
             source = source or self._kept.source
             if box is None and model is None:
@@ -113,7 +149,7 @@ class Pipeline:
         if source is None:
             raise SettingsError("a new run needs a source: give one")
         self.source = str(source)
-        self._box = Box(*map(float, box)) if box is not None else None
+        self._box = Box.of(box) if box is not None else None
         self._record = None if record is None else Path(record)
         self._model = Path(model) if model is not None else None
         if self._box is not None and self._model is not None:
@@ -142,18 +178,21 @@ class Pipeline:
             self._kept.check(self._state, self._origin)
 
     def __enter__(self) -> Self:
+        if self._stack is not None:
+            raise ServiceError(_ONCE)
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
             source = without_password(self._origin.source)
             endpoint = stack.enter_context(meeting_place(self.settings.endpoint, folder, self.settings.keys, source))
-            self.endpoint = str(endpoint)
-            state = stack.enter_context(self._begun(self._state)) if self._state is not None else None
+            state = self._state
+            if state is not None:
+                stack.enter_context(_begun(state, self._kept, self._origin))
             start = self._start(state) if state is not None and self._kept is not None else Position()
             self._box = start.box or self._box
             self._results = stack.enter_context(Receiver("results", endpoint, start, self.settings.window))
             self._reports = stack.enter_context(Subscriber("health", endpoint))
-            settings = replace(self.settings, endpoint=self.endpoint)
-            self._supervisor = Supervisor(
+            settings = replace(self.settings, endpoint=str(endpoint))
+            supervisor = Supervisor(
                 self.source,
                 self._origin.box,
                 settings,
@@ -166,31 +205,116 @@ class Pipeline:
                 resume=self._kept is not None,
                 since=time.monotonic() - max(0.0, time.time() - self._origin.started),
             )
-            stack.callback(self._supervisor.stop)
-            stack.callback(self._listen)  # also to what came since the last track, before Ctrl-C
-            self._stack = stack.pop_all()
+            stack.callback(supervisor.stop)
+            self._endpoint, self._supervisor, self._stack = str(endpoint), supervisor, stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self.close()
+
+    async def __aenter__(self) -> Self:
+        return self.__enter__()  # it starts processes and waits for none; they are to end with this thread
+
+    async def __aexit__(self, *_: object) -> None:
+        await asyncio.shield(asyncio.to_thread(self.close))
+
+    def close(self) -> None:
+        """Stop the processes, each in order; what was learned is stored first. It cannot be started again."""
+        stack, self._stack = self._stack, _CLOSED
+        if stack is not None and stack is not _CLOSED:
+            with stack:
+                self._listen()  # also to what came since the last track, before Ctrl-C
+
+    def __del__(self) -> None:
+        if getattr(self, "_stack", None) not in (None, _CLOSED):
+            warnings.warn(f"{self!r} was not closed: use it in a `with`", ResourceWarning, source=self, stacklevel=1)
+            self.close()
+
+    def __repr__(self) -> str:
+        life = "new" if self._stack is None else "closed" if self._stack is _CLOSED else f"at {self._endpoint}"
+        return f"<catstream.Pipeline of {without_password(self.source)!r}, {life}>"
 
     def __iter__(self) -> Iterator[Track]:
-        checked = 0.0
-        while self._end is None:
-            message = self._results.receive(_CHECK_SECONDS)
-            if isinstance(message, Track):
-                self._results.acknowledge(Position(message.seq, message.frame, message.box or self._box))
-                self._box = message.box or self._box
-                yield message
-            elif isinstance(message, End):
-                self._results.acknowledge(Position(message.seq))
-                self._end = message
-            if time.monotonic() - checked > _CHECK_SECONDS:
-                checked = time.monotonic()
-                self._watch()
-        self._wait()
-        if self._end.failed:
+        return self._run() if self._stack is None else self._tracks()
+
+    def __aiter__(self) -> AsyncIterator[Track]:
+        return self._run_async() if self._stack is None else self._tracks_async()
+
+    def _run(self) -> Iterator[Track]:
+        with self:
+            yield from self._tracks()
+
+    async def _run_async(self) -> AsyncIterator[Track]:
+        async with self:
+            async for track in self._tracks_async():
+                yield track
+
+    def _tracks(self) -> Iterator[Track]:
+        """The tracks that come from now on."""
+        while not self._over():
+            if (track := self._take(_CHECK_SECONDS)) is not None:
+                yield track
+        for _ in self._farewell():
+            time.sleep(_TURN_SECONDS)
+        self._raise_failure()
+
+    async def _tracks_async(self) -> AsyncIterator[Track]:
+        """The same, for an event loop: nothing here waits but in `await`."""
+        while not self._over():
+            if (track := self._take(0)) is not None:
+                yield track
+            elif self._end is None:
+                await readable([self._results], _CHECK_SECONDS)
+        for _ in self._farewell():
+            await asyncio.sleep(_TURN_SECONDS)
+        self._raise_failure()
+
+    def _over(self) -> bool:
+        if self._stack is _CLOSED:
+            raise ServiceError(_ONCE)
+        return self._end is not None
+
+    def _take(self, seconds: float) -> Track | None:
+        """The next track if it comes in time; looks after the processes too."""
+        message = self._results.receive(seconds)
+        if isinstance(message, Track):
+            self._results.acknowledge(Position(message.seq, message.frame, message.box or self._box))
+            self._box = message.box or self._box
+        elif isinstance(message, End):
+            self._results.acknowledge(Position(message.seq))
+            self._end = message
+        if time.monotonic() - self._checked > _CHECK_SECONDS:
+            self._checked = time.monotonic()
+            self._watch()
+        return message if isinstance(message, Track) else None
+
+    def _raise_failure(self) -> None:
+        if self._end is not None and self._end.failed:
             raise VideoError(self._end.reason)
+
+    @property
+    def endpoint(self) -> str:
+        """Where the processes meet, for `catstream.subscribe` and `catstream.control`.
+
+        Raises
+        ------
+        ServiceError
+            If it was not started yet.
+        """
+        if not self._endpoint:
+            raise ServiceError("a pipeline has no endpoint before it has started: use it in a `with`")
+        return self._endpoint
+
+    @property
+    def after(self) -> Position | None:
+        """After which track a run that is resumed goes on: see the parameter. It is fixed once it has started."""
+        return self._after
+
+    @after.setter
+    def after(self, position: Position | None) -> None:
+        if self._stack is not None:
+            raise ServiceError("the pipeline has started: say after which track it goes on before that")
+        self._after = position
 
     @property
     def totals(self) -> dict[str, int]:
@@ -209,13 +333,13 @@ class Pipeline:
 
     @property
     def pids(self) -> dict[str, int]:
-        """Process id by name."""
-        return self._supervisor.pids
+        """Process id by name, of those that run."""
+        return self._supervisor.pids if self._supervisor is not None else {}
 
     @property
     def restarts(self) -> int:
         """How often a process died and was restarted."""
-        return self._supervisor.restarts
+        return self._supervisor.restarts if self._supervisor is not None else 0
 
     @property
     def lost_seconds(self) -> float:
@@ -233,34 +357,21 @@ class Pipeline:
         told = self.health.get("detector", {})
         return next((name for name in ("waiting", "paused") if told.get(name)), "")
 
-    @contextmanager
-    def _begun(self, folder: Path) -> Iterator[Path]:
-        """Hold the folder of the state, and say there how the pipeline was started."""
-        with held(folder) as state:
-            if self._kept is None and began(state):
-                raise ServiceError(
-                    f"a pipeline was kept in {str(folder)!r} already: go on with it (--resume {folder}), "
-                    "or give another folder"
-                )
-            if self._origin != self._kept:
-                self._origin.save(state)
-            yield state
-
     def _start(self, state: Path) -> Position:
         """After which track to go on."""
-        if self.after is not None and not self.live:
-            return self.after
+        if self._after is not None and not self.live:
+            return self._after
         # The frames of a live source cannot be had again: what was learned from is not lost, though no track tells.
         learned = position(state, self.settings)
-        return max(learned, self.after or learned, key=lambda start: start.seq)
+        return max(learned, self._after or learned, key=lambda start: start.seq)
 
     def _watch(self) -> None:
         self._listen()
-        self._supervisor.check()
+        self._children.check()
         if self.live:  # when it is lost, why, and when it is back
-            for line in self._supervisor.news("detector"):
+            for line in self._children.news("detector"):
                 _log.warning("%s", line)
-        if self._supervisor.finished:
+        if self._children.finished:
             raise ServiceError("the processes ended before the video did: this should not happen, please report it")
 
     def _listen(self) -> None:
@@ -270,11 +381,32 @@ class Pipeline:
                 _log.warning("%s: %s", health.process, health.trouble)
             self._health[health.process] = health
 
-    def _wait(self) -> None:
-        """For the detector to hear that its end is stored, though it may have to be told twice, and to end."""
+    def _farewell(self) -> Iterator[None]:
+        """Turns until the detector has heard that its end is stored, though it may have to be told twice, and ended."""
         deadline = time.monotonic() + _FAREWELL_SECONDS
-        while not self._supervisor.finished and time.monotonic() < deadline:
-            self._results.receive(0.01)
+        while not self._children.finished and time.monotonic() < deadline:
+            yield
+            self._results.receive(0)
             self._listen()
-            self._supervisor.check()
+            self._children.check()
         self._listen()
+
+    @property
+    def _children(self) -> Supervisor:
+        if self._supervisor is None:
+            raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
+        return self._supervisor
+
+
+@contextmanager
+def _begun(folder: Path, kept: Origin | None, origin: Origin) -> Iterator[None]:
+    """Hold the folder of the state, and write there how the pipeline was started if that is new."""
+    with held(folder):
+        if kept is None and began(folder):
+            raise ServiceError(
+                f"a pipeline was kept in {str(folder)!r} already: go on with it (--resume {folder}), "
+                "or give another folder"
+            )
+        if origin != kept:
+            origin.save(folder)
+        yield

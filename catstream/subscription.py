@@ -11,7 +11,6 @@ The pipeline never waits for who is attached: a slow one misses tracks, and `mis
 
 from __future__ import annotations
 
-import asyncio
 import select
 from time import monotonic
 from typing import Generic, Literal, Self, TypeVar, overload
@@ -20,6 +19,7 @@ from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint, find
+from catstream.wire.readable import readable
 from catstream.wire.sockets import Subscriber
 
 __all__ = ["Gaps", "Subscription", "knock", "subscribe"]
@@ -137,19 +137,7 @@ class Subscription(Generic[Message]):
         while (message := self._take()) is None:
             if self._ended():
                 raise StopAsyncIteration
-            loop, came = asyncio.get_running_loop(), asyncio.Event()
-            handles = [socket.fileno() for socket in (self._messages, self._ends)]
-            seconds = self._left(patience)
-            for handle in handles:
-                loop.add_reader(handle, came.set)
-            try:
-                async with asyncio.timeout(seconds):
-                    await came.wait()
-            except TimeoutError:
-                pass
-            finally:
-                for handle in handles:
-                    loop.remove_reader(handle)
+            await readable([self._messages, self._ends], self._left(patience))
         return message
 
     def _take(self) -> Message | None:

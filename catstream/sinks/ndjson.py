@@ -1,9 +1,8 @@
-"""Newline-delimited JSON: an object a line, with the fields of `Track`; a box is [x, y, w, h] or null."""
+"""Newline-delimited JSON: an object a line, as `Track.to_dict` gives it; a box is [x, y, w, h] or null."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 
 from catstream.messages import Track
 from catstream.sinks.lines import LineSink
@@ -16,4 +15,4 @@ class NdjsonSink(LineSink):
 
     def line(self, track: Track) -> str:
         """The fields of a track."""
-        return json.dumps(asdict(track))
+        return json.dumps(track.to_dict())

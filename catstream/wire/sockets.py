@@ -185,6 +185,10 @@ class _Socket:
             if event == until:
                 break
 
+    def fileno(self) -> int:
+        """Readable when something may have come since this socket was last asked whether a message is here."""
+        return self._socket.fd
+
     def close(self) -> None:
         """Send what is on its way, then close; the address is free for the next one."""
         if not self._listens and not self._socket.closed:
@@ -483,10 +487,6 @@ class Subscriber(_Socket):
             self._socket.conflate = True
         self._socket.subscribe(b"" if only is None else opening(only))  # the publisher sends nothing else
         self._connect()
-
-    def fileno(self) -> int:
-        """Readable when something may have come since `pending` was last asked."""
-        return self._socket.fd
 
     def pending(self) -> bool:
         """Whether a message is here."""

@@ -34,7 +34,7 @@ for verb in sys.argv[1:]:
 PROGRAM = """
 import sys, catstream
 if __name__ == "__main__":
-    with catstream.Pipeline(sys.argv[1], map(float, sys.argv[2].split(','))) as pipeline:
+    with catstream.Pipeline(sys.argv[1], sys.argv[2]) as pipeline:
         assert len(list(pipeline)) == int(sys.argv[3])
 """
 

@@ -1,0 +1,29 @@
+"""Waits for sockets in an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from typing import Protocol
+
+__all__ = ["readable"]
+
+
+class _HasFileno(Protocol):
+    def fileno(self) -> int: ...
+
+
+async def readable(sockets: Sequence[_HasFileno], seconds: float | None) -> None:
+    """Return once something may have come at one of these sockets, or after so many seconds; None for any time."""
+    loop, came = asyncio.get_running_loop(), asyncio.Event()
+    handles = [socket.fileno() for socket in sockets]
+    for handle in handles:
+        loop.add_reader(handle, came.set)
+    try:
+        async with asyncio.timeout(seconds):
+            await came.wait()
+    except TimeoutError:
+        pass
+    finally:
+        for handle in handles:
+            loop.remove_reader(handle)

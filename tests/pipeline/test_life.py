@@ -1,0 +1,139 @@
+"""A pipeline in a program: with `with` and without, more than once, and in an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+
+import pytest
+
+from catstream.errors import ServiceError
+from catstream.pipeline import Pipeline
+from catstream.settings import Settings
+
+SETTINGS = Settings(window=4)
+PART = slice(0, 20)
+
+
+@pytest.fixture
+def pipeline(video):
+    """A new one, of a few frames."""
+    path, boxes = video
+    return Pipeline(path, str(boxes[0]), SETTINGS, part=PART)
+
+
+def test_it_is_iterated_without_with_and_leaves_no_process(pipeline):
+    assert [track.frame for track in pipeline] == list(range(20))
+    assert pipeline.totals == {"sent": 20, "stored": 20}
+    assert not pipeline.pids
+    with pytest.raises(ServiceError, match="a pipeline runs once"):
+        next(iter(pipeline))
+
+
+def test_a_loop_that_is_left_ends_the_run(pipeline, alive):
+    pids = []
+    for _ in pipeline:
+        pids = list(pipeline.pids.values())
+        break
+    gc.collect()
+    assert len(pids) == 3
+    assert not any(map(alive, pids))
+
+
+def test_in_a_with_it_is_iterated_piece_by_piece_and_afterwards_no_more(pipeline):
+    with pipeline:
+        first = next(iter(pipeline))
+        assert [first.frame, *(track.frame for track in pipeline)] == list(range(20))
+        with pytest.raises(ServiceError, match="a pipeline runs once"), pipeline:
+            pass
+    for again in (lambda: next(iter(pipeline)), pipeline.__enter__):
+        with pytest.raises(ServiceError, match="make another Pipeline"):
+            again()
+
+
+def test_before_it_has_started_it_says_what_it_has_not(pipeline):
+    assert (pipeline.pids, pipeline.restarts, pipeline.health) == ({}, 0, {})
+    with pytest.raises(ServiceError, match="no endpoint before it has started"):
+        _ = pipeline.endpoint
+
+
+def test_where_it_goes_on_is_said_before_it_starts(pipeline):
+    with pipeline, pytest.raises(ServiceError, match="before that"):
+        pipeline.after = None
+
+
+def test_one_that_is_never_closed_is_warned_of_and_ends(video, alive):
+    path, boxes = video
+    forgotten = Pipeline(path, boxes[0], SETTINGS, part=PART).__enter__()
+    pids = list(forgotten.pids.values())
+    with pytest.warns(ResourceWarning, match="was not closed"):
+        forgotten = None
+    assert forgotten is None
+    assert not any(map(alive, pids))
+
+
+@pytest.mark.parametrize("enter", [True, False])
+def test_an_event_loop_goes_on_while_tracks_are_waited_for(pipeline, enter):
+    async def follow():
+        return [track.frame async for track in pipeline]
+
+    async def run():
+        turns = asyncio.create_task(count())
+        if enter:
+            async with pipeline:
+                frames = await follow()
+        else:
+            frames = await follow()
+        turns.cancel()
+        return frames
+
+    ticks = 0
+
+    async def count():
+        nonlocal ticks
+        while True:
+            await asyncio.sleep(0)
+            ticks += 1
+
+    assert asyncio.run(run()) == list(range(20))
+    assert ticks > 20
+    assert not pipeline.pids
+
+
+def test_a_task_that_is_cancelled_ends_the_run_in_order(video, alive):
+    pids = []
+
+    async def follow():
+        async with Pipeline(video[0], settings=SETTINGS) as waiting:  # without a box no track comes
+            pids.extend(waiting.pids.values())
+            begun.set()
+            async for _ in waiting:
+                raise AssertionError
+
+    async def run():
+        task = asyncio.create_task(follow())
+        await begun.wait()
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    begun = asyncio.Event()
+    asyncio.run(run())
+    assert len(pids) == 3
+    assert not any(map(alive, pids))
+
+
+def test_a_track_prints_well_and_is_ready_for_json(pipeline):
+    track = next(iter(pipeline))
+    assert repr(track).startswith("Track(frame=0, time=0.000, state='bootstrapping', box=(")
+    assert json.loads(json.dumps(track.to_dict())) == {
+        "seq": 1,
+        "frame": 0,
+        "time": 0.0,
+        "state": "bootstrapping",
+        "box": list(track.box),
+        "score": track.score,
+        "model_version": 0,
+        "pts": None,
+    }
