@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from catstream.box import Box
+from catstream.detection import COMPILING
 from catstream.errors import RecordingError, ServiceError, SettingsError, VideoError
 from catstream.learned import Learned
 from catstream.messages import End, Health, Position, Track
@@ -368,8 +369,8 @@ class Pipeline:
     def _watch(self) -> None:
         self._listen()
         self._children.check()
-        if self.live:  # when it is lost, why, and when it is back
-            for line in self._children.news("detector"):
+        for line in self._children.news("detector"):
+            if self.live or line == COMPILING:  # of a live source: when it is lost, why, and when it is back
                 _log.warning("%s", line)
         if self._children.finished:
             raise ServiceError("the processes ended before the video did: this should not happen, please report it")

@@ -11,6 +11,7 @@ import os
 for _library in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
+import logging
 import sys
 from functools import partial
 from pathlib import Path
@@ -40,6 +41,7 @@ def main(context: click.Context, parent: int | None, pulse: int | None) -> None:
       python -P -m catstream.services trainer    --set endpoint=run &
       python -P -m catstream.services detector   --set endpoint=run walk.mp4 --box 120,80,64,48
     """
+    logging.basicConfig(format=f"{context.invoked_subcommand}: %(message)s", level=logging.INFO)
     context.obj = None if parent is None else Parent(parent, pulse)
 
 

@@ -120,7 +120,6 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
     its exit code: 0 at the end of the stream or after SIGTERM, `BROKEN` where the source broke, `REFUSED` for an error
     that names its cause, and that would come again
     """
-    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
     if parent is not None:
         die_with(parent.pid)
     try:

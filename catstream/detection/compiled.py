@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import getpass
+import logging
 import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numba
+from numba.core.event import Event, Listener, install_listener
+
+from catstream.detection import COMPILING
 
 __all__ = ["kernel"]
+
+_log = logging.getLogger(__name__)
 
 
 def kernel(signature: str) -> Callable:
@@ -18,7 +24,32 @@ def kernel(signature: str) -> Callable:
 
     Arithmetic may be reordered and nothing is checked: no index beyond the end, no division by 0.
     """
-    return numba.njit(signature, cache=True, nogil=True, fastmath=True, error_model="numpy")
+    compiler = numba.njit(signature, cache=True, nogil=True, fastmath=True, error_model="numpy")
+
+    def compiled(function: Callable) -> Callable:
+        with install_listener("numba:compile", _ANNOUNCER):
+            kernel: Callable = compiler(function)
+        return kernel
+
+    return compiled
+
+
+class _Announcer(Listener):
+    """Logs `COMPILING` when the first kernel that is not in the cache is about to be compiled."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, _: Event) -> None:
+        if not self._said:
+            self._said = True
+            _log.warning(COMPILING)
+
+    def on_end(self, _: Event) -> None:
+        pass
+
+
+_ANNOUNCER = _Announcer()
 
 
 def _cache_folder() -> str:

@@ -5,17 +5,18 @@ import subprocess
 import sys
 from pathlib import Path
 
-from catstream.detection import compiled
+from catstream.detection import COMPILING, compiled
 
 
-def test_a_second_start_needs_no_compiler(tmp_path):
+def test_a_first_start_says_that_it_compiles_and_a_second_needs_no_compiler(tmp_path):
     script = "from catstream.detection import hog; print(sum(hog._count.stats.cache_hits.values()))"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    hits = [
-        int(subprocess.run([sys.executable, "-c", script], env=environment, check=True, capture_output=True).stdout)
+    starts = [
+        subprocess.run([sys.executable, "-c", script], env=environment, check=True, capture_output=True, text=True)
         for _ in range(2)
     ]
-    assert hits == [0, 1]
+    assert [int(start.stdout) for start in starts] == [0, 1]
+    assert [start.stderr.splitlines() for start in starts] == [[COMPILING], []]
 
 
 def test_kernels_are_cached_elsewhere_where_the_package_cannot_be_written(tmp_path, monkeypatch):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 
+import numba
 import psutil
 import pytest
 
+from catstream.detection import COMPILING
 from catstream.errors import BoxError, ServiceError, VideoError
 from catstream.pipeline import Pipeline
 from catstream.services.supervisor import NAMES
@@ -193,3 +196,13 @@ def test_a_box_that_is_not_in_the_first_frame_is_refused_before_anything_starts(
 def test_a_source_that_is_not_there_is_refused_before_anything_starts(folder):
     with pytest.raises(VideoError, match="no video or folder"):
         Pipeline(str(folder / "none.mp4"), (0, 0, 10, 10))
+
+
+def test_a_first_start_that_compiles_says_so_to_the_user(video, tmp_path, monkeypatch, caplog):
+    without_one = shutil.ignore_patterns("cells.*.nbi")
+    shutil.copytree(numba.config.CACHE_DIR, tmp_path / "kernels", ignore=without_one)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    path, truth = video
+    with Pipeline(path, truth[0], part=slice(0, 5)) as pipeline:
+        assert len(list(pipeline)) == 5
+    assert caplog.messages == [COMPILING]
