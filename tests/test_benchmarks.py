@@ -2,6 +2,7 @@
 
 import json
 import math
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -13,11 +14,24 @@ SCRIPTS = sorted(path for path in BENCHMARKS.rglob("*.py") if "__main__" in path
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: str(path.relative_to(BENCHMARKS)))
-def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path):
+def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path, monkeypatch):
     figures = tmp_path / "figures.json"
-    command = [sys.executable, script, "--quick", "--json", figures]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(script), "--quick", "--json", str(figures)])
+    monkeypatch.setattr(sys, "path", [str(script.parent), *sys.path])  # as Python has it for a script
+    runpy.run_path(str(script), run_name="__main__")
+    assert_finite(figures)
+
+
+def test_a_benchmark_runs_as_a_process_of_its_own(tmp_path):
+    figures = tmp_path / "figures.json"
+    command = [sys.executable, BENCHMARKS / "kernels.py", "--quick", "--json", figures]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=150, check=False)
     assert done.returncode == 0, done.stderr
+    assert_finite(figures)
+
+
+def assert_finite(figures):
     tables = json.loads(figures.read_text())["tables"]
     assert tables
     for table in tables:
