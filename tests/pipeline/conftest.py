@@ -9,7 +9,7 @@ from contextlib import ExitStack
 import psutil
 import pytest
 
-FRAMES = 160
+FRAMES = 90
 
 
 @pytest.fixture(scope="session")

@@ -96,7 +96,7 @@ def test_a_process_that_is_killed_costs_no_frame(video, victim, alive):
     with Pipeline(path, boxes[0], SETTINGS) as pipeline:
         for track in pipeline:
             tracks.append(track)
-            if track.frame == 60:
+            if track.frame == 30:
                 killed = pipeline.pids[victim]
                 psutil.Process(killed).kill()
         pids = pipeline.pids
@@ -108,12 +108,12 @@ def test_a_process_that_is_killed_costs_no_frame(video, victim, alive):
 
 def test_a_part_is_followed_whole_though_the_detector_dies(video):
     path, boxes = video
-    part = slice(20, 140, 2)
+    part = slice(10, 80, 2)
     wanted, tracks = range(len(boxes))[part], []
-    with Pipeline(path, boxes[20], SETTINGS, part=part) as pipeline:
+    with Pipeline(path, boxes[10], SETTINGS, part=part) as pipeline:
         for track in pipeline:
             tracks.append(track)
-            if track.frame == 25:
+            if track.frame == 15:
                 os.kill(pipeline.pids["detector"], signal.SIGKILL)
         assert pipeline.frames == len(wanted)
     assert [track.frame for track in tracks] == list(range(len(wanted)))
@@ -126,13 +126,13 @@ def test_a_restarted_trainer_goes_on_learning(video, until):
         versions = []
         for track in pipeline:
             versions.append(track.model_version)
-            if track.frame == 60:
+            if track.frame == 30:
                 os.kill(pipeline.pids["trainer"], signal.SIGKILL)
             if pipeline.restarts and len(pipeline.pids) == 3:
                 break
         with Subscriber("models", Endpoint.parse(pipeline.endpoint)) as models:
             model = until(lambda: models.receive(0.1))
-    assert model.version > versions[60]
+    assert model.version > versions[30]
 
 
 def test_in_lockstep_the_tracks_are_those_of_one_process(video):
@@ -179,7 +179,7 @@ def test_who_attaches_late_gets_the_last_model(video, until):
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(window=4)) as pipeline:
         for track in pipeline:
-            if track.frame == 80:
+            if track.frame == 40:
                 break
         # Nobody takes tracks now: with a full window the detector waits, and no newer model comes.
         with Subscriber("models", Endpoint.parse(pipeline.endpoint)) as models:

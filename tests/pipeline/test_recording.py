@@ -20,7 +20,7 @@ def test_no_features_are_missing_and_every_model_comes_out_again(video, tmp_path
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(window=16), record=tmp_path / "run.rec") as pipeline:
         for track in pipeline:
-            if track.frame == 60:
+            if track.frame == 40:
                 for victim in victims:
                     os.kill(pipeline.pids[victim], signal.SIGKILL)
     recording = Recording(tmp_path / "run.rec")
@@ -43,7 +43,7 @@ def test_a_recording_that_is_there_is_not_written_over(video, tmp_path):
 def test_a_run_goes_on_where_its_recording_cannot(video, tmp_path, monkeypatch):
     path, boxes = video
     preload = tmp_path / "sitecustomize.py"
-    preload.write_text("import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (12 << 20, resource.RLIM_INFINITY))")
+    preload.write_text("import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (5 << 20, resource.RLIM_INFINITY))")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with Pipeline(path, boxes[0], Settings(coreset_size=8), record=tmp_path / "run.rec") as pipeline:
         assert len(list(pipeline)) == pipeline.frames

@@ -91,7 +91,8 @@ def test_all_that_are_asked_to_end_at_once_do_so_in_order_and_all_is_stored(vide
         "detector": ["--recorded", path, "--box", ",".join(map(str, boxes[0]))],
     }
     with Subscriber("tracks", Endpoint.parse(str(folder))) as tracks:
-        processes = [service(name, "--set", f"endpoint={folder}", *given) for name, given in arguments.items()]
+        place = ["--set", f"endpoint={folder}", "--set", "lockstep=true"]  # in which the video is long
+        processes = [service(name, *place, *given) for name, given in arguments.items()]
         until(lambda: isinstance(track := tracks.receive(0.1), Track) and track.frame >= 20)
         for process in processes:
             process.send_signal(signal.SIGTERM)
@@ -165,10 +166,10 @@ def test_a_process_that_hangs_is_noticed_and_replaced(video, victim):
     with Pipeline(path, boxes[0], Settings(window=16)) as pipeline:
         for track in pipeline:
             tracks.append(track.frame)
-            if track.frame == 60:
+            if track.frame == 30:
                 stopped = pipeline.pids[victim]
                 os.kill(stopped, signal.SIGSTOP)
-            if track.frame > 60 and victim == "trainer" and not pipeline.restarts:
+            if track.frame > 30 and victim == "trainer" and not pipeline.restarts:
                 time.sleep(0.1)  # it is not needed for the rest of the video: do not reach the end before it is missed
         assert pipeline.restarts >= 1
         assert not psutil.pid_exists(stopped)

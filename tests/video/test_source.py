@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from catstream.video.source import open_source
 CODECS = {".mp4": "libx264", ".mkv": "libx264", ".ts": "libx264", ".avi": "mjpeg", ".mpg": "mpeg2video"}
 
 
+@cache
 def numbered(number: int, width: int = 160, height: int = 120) -> np.ndarray:
     """Seven bits of the number as black and white fields, which survive lossy coding, over noise of its own."""
     image = np.random.default_rng(number).integers(60, 190, (height, width, 3), np.uint8)
@@ -31,6 +34,23 @@ def number_of(image: np.ndarray) -> int:
     return sum((int(image[8:16, 8 + 20 * bit : 16 + 20 * bit].mean() > 127) << bit) for bit in range(7))
 
 
+@cache
+def encoded(suffix: str, frames: int, options: frozenset[tuple[str, str]], rotation: int) -> bytes:
+    """A file of numbered frames, which many tests read."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f"a{suffix}")
+        with av.open(str(path), "w", options=dict(options)) as container:
+            stream: Any = container.add_stream(CODECS[suffix], rate=25)
+            stream.width, stream.height = 160, 120
+            stream.pix_fmt = "yuvj420p" if suffix == ".avi" else "yuv420p"
+            if rotation:
+                stream.set_display_rotation(rotation)
+            for number in range(frames):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+            container.mux(stream.encode(None))
+        return path.read_bytes()
+
+
 @pytest.fixture
 def video(tmp_path: Path) -> Callable[..., Path]:
     """Writes a video of numbered frames; the ending of its name says which kind."""
@@ -40,15 +60,7 @@ def video(tmp_path: Path) -> Callable[..., Path]:
         codec = CODECS[path.suffix]
         if codec not in av.codecs_available:
             pytest.skip(f"this FFmpeg cannot write {codec}")
-        with av.open(str(path), "w", options=options or {}) as container:
-            stream: Any = container.add_stream(codec, rate=25)
-            stream.width, stream.height = 160, 120
-            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-            if rotation:
-                stream.set_display_rotation(rotation)
-            for number in range(frames):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
-            container.mux(stream.encode(None))
+        path.write_bytes(encoded(path.suffix, frames, frozenset((options or {}).items()), rotation))
         return path
 
     return write
