@@ -30,8 +30,8 @@ _PICTURES = 8  # a page that asks for the last but one still gets it
 class Board:
     """Takes messages, and tells each page what is new to it.
 
-    What it shows is of one pipeline. At the first track or health of another one it forgets all of the one before; until
-    then it keeps the last picture and figures.
+    What it shows is of one pipeline. At the first track or health of another one it forgets all of the one before;
+    until then it keeps the last picture and figures.
 
     standing, reason : of the pipeline
     endpoint, source : where it runs, and the source that it follows

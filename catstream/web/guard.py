@@ -84,7 +84,7 @@ class Guard:
         if token is not None and len(token) < _SHORTEST_TOKEN:
             raise ServiceError(
                 f"a token of {len(token)} characters can be guessed: give {_SHORTEST_TOKEN} or more, "
-                "for example --token $(openssl rand -hex 16)"
+                "for example VIEW_TOKEN=$(openssl rand -hex 16)"
             )
         self._app, self._clock = app, clock
         self._secret = None if token is None else _secret(token)
@@ -155,7 +155,7 @@ class Guard:
         if wait := guesses.wait(now):
             return too_many(wait)
         guesses.take()
-        return PlainTextResponse("this is not the token that catstream view was started with\n", 401)
+        return PlainTextResponse("this is not the token that this page was started with\n", 401)
 
 
 async def body_of(request: Request) -> bytes | None:

@@ -50,8 +50,8 @@ class Server:
     ) -> None:
         if token is None and not is_loopback(host):
             raise ServiceError(
-                f"{host} can be reached from other machines, and who sees the page may steer: "
-                "give --token $(openssl rand -hex 16), or leave --host away"
+                f"{host} can be reached from other machines, and all who see the page may steer: give a token "
+                "(VIEW_TOKEN=$(openssl rand -hex 16)), or listen on 127.0.0.1"
             )
         self._feed = Feed(endpoint, keys)
         guard = Guard(create(self._feed), token)
@@ -113,7 +113,7 @@ def _listening(host: str, port: int) -> socket.socket:
     except OSError as error:
         listening.close()
         raise ServiceError(
-            f"cannot listen on {host}:{port} ({error.strerror}): give another --port or --host"
+            f"cannot listen on {host}:{port} ({error.strerror}): give another port or host"
         ) from None
     return listening
 

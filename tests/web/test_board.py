@@ -139,7 +139,7 @@ def test_nothing_of_a_pipeline_is_left_once_another_one_is_seen(board, facts, en
     assert not set(board.news(told)) - {"status"}, "nothing goes before the other one is seen"
     board.take(sign(facts), 6.1)
     parts = board.news(told)
-    assert list(parts)[0] == "pipeline", "a page clears what it shows before it takes the rest"
+    assert next(iter(parts)) == "pipeline", "a page clears what it shows before it takes the rest"
     assert (parts["status"]["standing"], parts["status"]["endpoint"]) == ("running", endpoint)
     assert parts["status"]["source"] != "first.mp4"
     assert parts["film"]["shots"] == []

@@ -1,0 +1,82 @@
+"""What the verbs that serve the web page share: where it listens, and the token that opens it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from catstream.errors import ServiceError
+
+__all__ = ["PORT", "Address", "AddressType", "with_token"]
+
+#: The port of the page if none is given.
+PORT = 8000
+
+_LARGEST_PORT = 65535
+
+
+class Address(NamedTuple):
+    """Where a page listens."""
+
+    host: str
+    port: int
+
+
+class AddressType(click.ParamType):
+    """[HOST:]PORT, of this machine alone if there is no host.
+
+    >>> [tuple(AddressType().convert(text, None, None)) for text in ("8080", "0.0.0.0:8000", "[::]:0")]
+    [('127.0.0.1', 8080), ('0.0.0.0', 8000), ('::', 0)]
+    """
+
+    name = "[HOST:]PORT"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Address:
+        host, _, port = str(value).rpartition(":")
+        if not (port.isascii() and port.isdigit() and int(port) <= _LARGEST_PORT):
+            self.fail(f"expected [HOST:]PORT, for example 8000 or 0.0.0.0:8000, got {value!r}", param, ctx)
+        return Address(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
+
+
+def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Adds the options --PREFIXtoken and --PREFIXtoken-file to a command, which takes one `token`: text or None."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @click.option(
+            f"--{prefix}token",
+            "given_token",
+            envvar="VIEW_TOKEN",
+            show_envvar=True,
+            metavar="TOKEN",
+            help="Token that opens the page; 16 characters or more.",
+        )
+        @click.option(
+            f"--{prefix}token-file",
+            "token_file",
+            envvar="VIEW_TOKEN_FILE",
+            show_envvar=True,
+            type=click.Path(path_type=Path),
+            metavar="FILE",
+            help="File that holds this token.",
+        )
+        @functools.wraps(command)
+        def with_one(*args: Any, given_token: str | None, token_file: Path | None, **others: Any) -> None:
+            command(*args, token=given_token or (_read(token_file) if token_file else None), **others)
+
+        return with_one
+
+    return decorate
+
+
+def _read(path: Path) -> str:
+    try:
+        token = path.read_text().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ServiceError(f"the token cannot be read from {str(path)!r}: {error}") from None
+    if not token:
+        raise ServiceError(f"there is no token in {str(path)!r}: write one there, for example openssl rand -hex 16")
+    return token
