@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 import cv2
 import numpy as np
 
-from catstream.messages import Track
+from catstream.box import Box
+from catstream.messages import Preview, Track
 from catstream.video.writer import VideoWriter
 
-__all__ = ["AnnotatedVideo", "draw", "thumbnail"]
+__all__ = ["AnnotatedVideo", "draw", "draw_preview", "thumbnail"]
 
 #: Blue, green, red.
 _COLOURS = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
@@ -45,6 +47,25 @@ def draw(image: np.ndarray, track: Track) -> np.ndarray:
         _frame(picture, (x, y), (x + w, y + h), colour, width / 640)
     _write_line(canvas[height:], track, colour, unit)
     return canvas
+
+
+def draw_preview(preview: Preview, track: Track | None) -> bytes:
+    """A preview with the track of its frame drawn in, and a line of text below, which is empty if there is no track.
+
+    Returns
+    -------
+    JPEG, of the same size with and without a track
+    """
+    image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return preview.jpeg
+    if track is None:
+        image = np.vstack([image, np.full((_line(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
+    else:
+        scale = image.shape[1] / preview.width
+        box = None if track.box is None else Box(*(side * scale for side in track.box))
+        image = draw(image, replace(track, box=box))
+    return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
 
 
 def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:

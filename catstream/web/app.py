@@ -3,6 +3,7 @@
 /                 the page
 /events           what is new, at most ten times a second, as server-sent events
 /pictures/N.jpg   the picture of frame N
+/live.mjpeg       the newest picture with its track drawn in, again and again, as MJPEG
 /control          POST {"verb": ..., "box": [x, y, w, h], "keep": ...}
 /metrics          for Prometheus
 /healthz          200 while this server runs
@@ -29,6 +30,7 @@ from starlette.staticfiles import StaticFiles
 from catstream.errors import CatstreamError, ProtocolError, RefusedError, SilenceError
 from catstream.messages import Answer
 from catstream.steering import Control
+from catstream.video.annotate import draw_preview
 from catstream.web import metrics
 from catstream.web.feed import Feed
 from catstream.web.guard import Bucket, body_of, too_many
@@ -60,6 +62,7 @@ def create(feed: Feed) -> Starlette:
         routes=[
             Route("/", pages.index),
             Route("/events", pages.events),
+            Route("/live.mjpeg", pages.live),
             Route("/pictures/{frame:int}.jpg", pages.picture),
             Route("/control", pages.control, methods=["POST"]),
             Route("/metrics", pages.metrics),
@@ -81,9 +84,34 @@ class _Pages:
         return FileResponse(_PAGE / "index.html")
 
     async def events(self, _: Request) -> Response:
-        if self._feed.viewers >= _VIEWERS:
-            return PlainTextResponse(f"{_VIEWERS} pages are open already\n", 503)
-        return StreamingResponse(self._news(), media_type="text/event-stream")
+        return self._full() or StreamingResponse(self._news(), media_type="text/event-stream")
+
+    async def live(self, _: Request) -> Response:
+        return self._full() or StreamingResponse(
+            self._annotated(), media_type="multipart/x-mixed-replace; boundary=picture"
+        )
+
+    def _full(self) -> Response | None:
+        """The answer if too many look already."""
+        if self._feed.viewers < _VIEWERS:
+            return None
+        return PlainTextResponse(f"{_VIEWERS} pages or live pictures are open already\n", 503)
+
+    async def _annotated(self) -> AsyncIterator[bytes]:
+        shown = None
+        with self._feed.watching():
+            yield b"--picture\r\n"
+            while not self._feed.closed:
+                newest = self._feed.board.newest
+                if newest is not None and newest != shown:
+                    shown = newest
+                    jpeg = await run_in_threadpool(draw_preview, *newest)
+                    # The line that ends a picture comes with it: many clients show a picture only after that.
+                    yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (
+                        len(jpeg),
+                        jpeg,
+                    )
+                await asyncio.sleep(_TURN_SECONDS)
 
     async def _news(self) -> AsyncIterator[str]:
         seen: dict[str, int] = {}

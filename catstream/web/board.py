@@ -24,6 +24,7 @@ _POINTS = 480  # two minutes
 _RATE_SECONDS = 2.0  # that frames a second are counted over
 _FRAMES = 4096  # whose arrival is remembered, until a model has learned from them
 _FAREWELL_SECONDS = 3.0  # that the processes may still be heard after the end
+_TRACKS = 256  # that are kept until the picture of their frame is here
 _PICTURES = 8  # a page that asks for the last but one still gets it
 
 
@@ -62,6 +63,7 @@ class Board:
         self._pointed = self._ended = float("-inf")  # when the last point was made, and when the pipeline ended
         self._moments: deque[float] = deque()
         self._arrived: OrderedDict[int, float] = OrderedDict()
+        self._tracks: OrderedDict[int, Track] = OrderedDict()  # the last ones, by frame
 
     def attach(self, endpoint: str) -> None:
         """What comes from now on comes from here; what is shown stays until something comes."""
@@ -117,6 +119,12 @@ class Board:
             return self.pictures[frame]
         return next((shot.preview for shot in self.film.shots if shot.frame == frame), None)
 
+    @property
+    def newest(self) -> tuple[Preview, Track | None] | None:
+        """The newest picture and the track of its frame, None for a track that did not come."""
+        preview = next(reversed(self.pictures.values()), None)
+        return None if preview is None else (preview, self._tracks.get(preview.frame))
+
     def news(self, seen: dict[str, int]) -> dict[str, Any]:
         """The parts that are new to a page, ready for JSON.
 
@@ -165,7 +173,9 @@ class Board:
             self._changed("status")
         if self.track is not None and track.model_version < self.track.model_version:
             self._begin(track.frame)
-        self.track = track
+        self.track = self._tracks[track.frame] = track
+        if len(self._tracks) > _TRACKS:
+            self._tracks.popitem(last=False)
         self._moments.append(now)
         self._arrived[track.frame] = now
         if len(self._arrived) > _FRAMES:
@@ -235,9 +245,9 @@ class Board:
         return self._revisions["pipeline"]
 
     def _picture_part(self, _: int) -> dict[str, Any] | None:
-        preview = next(reversed(self.pictures.values()), None)
-        if preview is None:
+        if self.newest is None:
             return None
+        preview, _ = self.newest
         return {"frame": preview.frame, "width": preview.width, "height": preview.height, "box": preview.box}
 
     def _points_part(self, new: int) -> list[list[float | None]]:

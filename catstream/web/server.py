@@ -112,9 +112,7 @@ def _listening(host: str, port: int) -> socket.socket:
         listening.listen(MOST // 2)
     except OSError as error:
         listening.close()
-        raise ServiceError(
-            f"cannot listen on {host}:{port} ({error.strerror}): give another port or host"
-        ) from None
+        raise ServiceError(f"cannot listen on {host}:{port} ({error.strerror}): give another port or host") from None
     return listening
 
 

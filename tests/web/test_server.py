@@ -9,8 +9,11 @@ import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from urllib.parse import urlsplit
 
+import cv2
+import numpy as np
 import pytest
 
 from catstream.errors import ServiceError
@@ -22,7 +25,7 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
 
 TOKEN = "correct-horse-battery"
-PATHS = ["/", "/events", "/pictures/1.jpg", "/metrics"]
+PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics"]
 
 
 @pytest.fixture
@@ -158,6 +161,31 @@ def test_pictures_are_asked_of_the_pipeline_only_while_somebody_looks(page, pipe
     frame = news(page, "picture", turn)["frame"]
     assert page.get(f"/pictures/{frame}.jpg").content == facts.preview(frame).jpeg
     until(lambda: turn() and not pipeline["previews"].heard)
+
+
+def test_the_live_picture_has_the_track_of_its_frame_drawn_in(page, pipeline, facts):
+    image = np.full((48, 64, 3), 128, np.uint8)
+    preview = replace(facts.preview(5), jpeg=cv2.imencode(".jpg", image)[1].tobytes())
+
+    def turns():
+        while not seen:
+            pipeline["detector"].send(Health("detector", time.monotonic(), {}))
+            pipeline["tracks"].send(facts.track(5))
+            pipeline["previews"].send(preview)
+            time.sleep(0.02)
+
+    seen, told = [], b""
+    with ThreadPoolExecutor(1) as pool, page.stream("GET", "/live.mjpeg") as live:
+        assert live.headers["content-type"] == "multipart/x-mixed-replace; boundary=picture"
+        pool.submit(turns)
+        for data in live.iter_bytes():
+            told += data
+            parts = [part.partition(b"\r\n\r\n")[2] for part in told.split(b"--picture\r\n")[1:-1]]
+            shown = [cv2.imdecode(np.frombuffer(part, np.uint8), cv2.IMREAD_COLOR) for part in parts]
+            if any(picture[:48].max() > 150 for picture in shown):  # the first may come before its track
+                seen.append(True)
+                break
+    assert {picture.shape[:2] for picture in shown} == {(68, 64)}, "one size, with a track and without"
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1", ""])
