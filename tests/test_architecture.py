@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -61,7 +61,6 @@ SLOW = {"sklearn", "av", "scipy", "filterpy", "pyarrow", "supervision"}
 MAINLAND = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
 
 FILES = sorted([*ROOT.glob("catstream/**/*.py"), *ROOT.glob("services/**/*.py")])
-MODULES = pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
 
 
 def dotted(path: Path) -> str:
@@ -98,40 +97,74 @@ def floor(name: str) -> int:
     raise AssertionError(f"{name} is on no floor: say in FLOORS which ones it may import from")
 
 
-@MODULES
-def test_imports_run_downward_only(path):
+def broken_by(rule: Callable[[Path], Iterator[str]]) -> str:
+    """What breaks a rule in any file, a line each."""
+    return "\n".join(f"{path.relative_to(ROOT)}: {wrong}" for path in FILES for wrong in rule(path))
+
+
+def upward(path: Path) -> Iterator[str]:
     own = unit(dotted(path))
-    if not own:
-        return  # the face shows what is inside
-    for module in imports(path):
+    for module in imports(path) if own else ():  # the face shows what is inside
         if module.partition(".")[0] != "catstream" or unit(module) == own:
             continue
-        assert unit(module), f"{path.name} imports from the face of the house: import from where the name is at home"
-        assert floor(unit(module)) < floor(own), f"{own} imports {module}, but imports run downward only"
+        if not unit(module):
+            yield "imports from the face of the house: import from where the name is at home"
+        elif floor(unit(module)) >= floor(own):
+            yield f"{own} imports {module}, but imports run downward only"
 
 
-@MODULES
-def test_each_foreign_library_has_one_home(path):
+def test_imports_run_downward_only():
+    assert not broken_by(upward)
+
+
+def strangers(path: Path) -> Iterator[str]:
     place = str(path.relative_to(ROOT))
     for library in {module.partition(".")[0] for module in imports(path)} - sys.stdlib_module_names - {"catstream"}:
-        assert library in HOMES, f"{place} imports {library}, which has no home yet: give it one in HOMES"
-        at_home = any(place == home or place.startswith(f"{home}/") for home in HOMES[library])
-        assert at_home, f"{place} imports {library}, which is at home in {' and '.join(HOMES[library])} only"
+        if library not in HOMES:
+            yield f"imports {library}, which has no home yet: give it one in HOMES"
+        elif not any(place == home or place.startswith(f"{home}/") for home in HOMES[library]):
+            yield f"imports {library}, which is at home in {' and '.join(HOMES[library])} only"
 
 
-@MODULES
-def test_slow_libraries_are_imported_where_they_are_used(path):
+def test_each_foreign_library_has_one_home():
+    assert not broken_by(strangers)
+
+
+def slow_at_the_top(path: Path) -> Iterator[str]:
     tree = ast.parse(path.read_text())
     top = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
-    slow = {module.partition(".")[0] for module in imports(path, top)} & SLOW
-    assert not slow, f"{path.name} imports {slow} at its top: others would wait for it, import it in the function"
+    for library in {module.partition(".")[0] for module in imports(path, top)} & SLOW:
+        yield f"imports {library} at its top: others would wait for it, import it in the function"
 
 
-@MODULES
-def test_a_stage_could_run_on_a_desert_island(path):
+def test_slow_libraries_are_imported_where_they_are_used():
+    assert not broken_by(slow_at_the_top)
+
+
+def touched(path: Path) -> Iterator[str]:
     if unit(dotted(path)) in {"detection", "compression", "training"}:
-        touched = set(imports(path)) & MAINLAND
-        assert not touched, f"{path.name} imports {touched}: sockets, threads, clocks and chance are handed to a stage"
+        for module in set(imports(path)) & MAINLAND:
+            yield f"imports {module}: sockets, threads, clocks and chance are handed to a stage"
+
+
+def test_a_stage_could_run_on_a_desert_island():
+    assert not broken_by(touched)
+
+
+@pytest.mark.parametrize(
+    ("rule", "place", "source"),
+    [
+        (upward, "catstream/wire/codec.py", "from catstream.pipeline import Pipeline"),
+        (upward, "catstream/wire/codec.py", "from catstream import Pipeline"),
+        (strangers, "catstream/box.py", "import nobody_knows_it"),
+        (strangers, "catstream/box.py", "import zmq"),
+        (slow_at_the_top, "catstream/box.py", f"import {min(SLOW)}"),
+        (touched, "catstream/training/trainer.py", "def f():\n    import socket"),
+    ],
+)
+def test_what_is_looked_for_is_found(rule, place, source, monkeypatch):
+    monkeypatch.setattr(Path, "read_text", lambda _: source)
+    assert list(rule(ROOT / place))
 
 
 def test_every_dependency_has_a_home():

@@ -12,7 +12,7 @@ import json
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 
@@ -27,7 +27,6 @@ from catstream.wire.channels import CHANNELS
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("**/*.md")])
-EVERY_PAGE = pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 
 _TABLE = re.compile(r"(<!-- settings: .*? -->\n).*?(<!-- /settings -->)", re.DOTALL)
 
@@ -133,49 +132,68 @@ def test_every_file_that_track_writes_is_explained(tmp_path):
         assert f"`{name}`" in page("docs/tutorial.md"), f"docs/tutorial.md does not say what is in {name}"
 
 
-@EVERY_PAGE
-def test_links_lead_somewhere(path):
+def wrong_on(check: Callable[[Path], Iterator[str]]) -> str:
+    """What is wrong on all pages, a line each."""
+    return "\n".join(f"{path.relative_to(ROOT)} {wrong}" for path in PAGES for wrong in check(path))
+
+
+def broken_links(path: Path) -> Iterator[str]:
     for link in re.findall(r"\]\(([^)\s]+)\)", prose(path)):
-        if "://" in link:
-            continue
         file, _, anchor = link.partition("#")
         target = (path.parent / file).resolve() if file else path
-        assert target.exists(), f"{path.name} links to {link}, which is not there"
-        assert not anchor or anchor in anchors(target), f"{path.name} links to {link}, but it has no such heading"
+        if "://" not in link and not target.exists():
+            yield f"links to {link}, which is not there"
+        elif "://" not in link and anchor and anchor not in anchors(target):
+            yield f"links to {link}, but it has no such heading"
 
 
-@EVERY_PAGE
-def test_commands_are_ones_that_exist(path):
-    """Their verbs, options and make's targets."""
+def test_links_lead_somewhere():
+    assert not wrong_on(broken_links)
+
+
+def wrong_commands(path: Path) -> Iterator[str]:
     targets = set(re.findall(r"^([a-z-]+):", page("Makefile"), re.MULTILINE))
     for program, *words in commands(path):
-        if program == "make":
-            assert words[0] in targets, f"{path.name} shows `make {words[0]}`, which is no target"
+        if program == "make" and words[0] not in targets:
+            yield f"shows `make {words[0]}`, which is no target"
         if program == "catstream":
-            name, *words = words
-            assert name in VERBS, f"{path.name} shows `catstream {name}`, which is no verb"
-            verb = verbs()[name]
-            if isinstance(verb, click.Group):
-                assert words[0] in verb.commands, (
-                    f"{path.name} shows `catstream {name} {words[0]}`, which is no command"
-                )
-                verb = verb.commands[words.pop(0)]
-            with click.Context(verb) as context:
-                known = {flag for option in verb.get_params(context) for flag in option.opts}
-            wrong = {word for word in words if word.startswith("--")} - known
-            assert not wrong, f"{path.name} shows `catstream {name}` with {wrong}, which it does not take"
+            yield from wrong_words(*words)
 
 
-@EVERY_PAGE
-def test_python_on_a_page_uses_names_that_exist(path):
-    for block in blocks(path, "python"):
-        tree = ast.parse(block)
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("catstream"):
-                for alias in node.names:
-                    assert hasattr(import_module(node.module or ""), alias.name), f"{path.name}: no {alias.name}"
-            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "catstream":
-                assert node.attr in catstream.__all__, f"{path.name}: there is no catstream.{node.attr}"
+def wrong_words(name: str, *words: str) -> Iterator[str]:
+    """Of a command of catstream."""
+    if name not in VERBS:
+        yield f"shows `catstream {name}`, which is no verb"
+        return
+    verb = verbs()[name]
+    if isinstance(verb, click.Group):
+        command, *words = words
+        if command not in verb.commands:
+            yield f"shows `catstream {name} {command}`, which is no command"
+            return
+        verb = verb.commands[command]
+    with click.Context(verb) as context:
+        known = {flag for option in verb.get_params(context) for flag in option.opts}
+    if wrong := {word for word in words if word.startswith("--")} - known:
+        yield f"shows `catstream {name}` with {wrong}, which it does not take"
+
+
+def test_commands_are_ones_that_exist():
+    """Their verbs, options and make's targets."""
+    assert not wrong_on(wrong_commands)
+
+
+def unknown_names(path: Path) -> Iterator[str]:
+    for node in (node for block in blocks(path, "python") for node in ast.walk(ast.parse(block))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("catstream"):
+            module = import_module(node.module or "")
+            yield from (f"imports {alias.name}" for alias in node.names if not hasattr(module, alias.name))
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "catstream":
+            yield from () if node.attr in catstream.__all__ else (f"uses catstream.{node.attr}",)
+
+
+def test_python_on_a_page_uses_names_that_exist():
+    assert not wrong_on(unknown_names)
 
 
 def test_the_tutorials_tracker_follows():
@@ -189,6 +207,15 @@ def test_every_test_that_a_page_names_exists():
     tests = "\n".join(path.read_text(encoding="utf-8") for path in ROOT.glob("tests/**/test_*.py"))
     for name in set(re.findall(r"`(test_\w+)`", everything())):
         assert f"def {name}(" in tests, f"docs/ name {name}, which is no test"
+
+
+def test_no_test_of_a_guarantee_is_slow():
+    """`make test` holds every promise."""
+    promised = set(re.findall(r"`(test_\w+)`", page("docs/guarantees.md")))
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.glob("tests/**/test_*.py"))
+    functions = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+    slow = {node.name for node in functions if any("slow" in ast.unparse(mark) for mark in node.decorator_list)}
+    assert not promised & slow
 
 
 def test_every_extra_that_a_page_names_can_be_installed():

@@ -7,6 +7,8 @@ import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
+import pytest
+
 from catstream.loadtest.chaos import Kill
 from catstream.loadtest.figures import to_json
 from catstream.loadtest.limits import Limit, broken
@@ -67,4 +69,10 @@ def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
 
 def test_json_holds_what_json_can(result):
     run = result([0.01] * 5, recoveries=[Recovery(Kill(101.0, 0, "trainer"), None, None)])
-    json.dumps(to_json(Trial([Limit("recovery", 1.0)], False, [Step(run, [])])), allow_nan=False)
+    text = json.dumps(to_json(Trial([Limit("recovery", 1.0)], False, [Step(run, [])])), allow_nan=False)
+    figures = json.loads(text)
+    assert figures["chaos"] == [{"stream": 0, "process": "trainer", "to_track": None, "to_model": None}]
+    assert figures["limits"] == {"recovery": {"value": 1.0, "held": False}}
+    (stream,) = figures["streams"]
+    assert stream["frames"] == 5
+    assert stream["track"]["max"] == pytest.approx(0.01, rel=0.01)

@@ -303,7 +303,11 @@ def test_two_pipelines_of_one_program_have_each_their_own_clients(place, keys, f
         assert stranger.receive(0.1) is None
 
 
-def test_sockets_with_keys_come_and_go_as_they_like(place):
+def test_sockets_with_keys_come_and_go_as_they_like(place, until):
     for _ in range(50):
         with Publisher("tracks", place()):
             pass
+    with Publisher("tracks", place()) as tracks, Subscriber("tracks", place()) as reader:
+        heard = []
+        until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.waiting())))
+    assert heard[0] == track(1)
