@@ -15,9 +15,9 @@ from pathlib import Path
 import cv2
 from rich.console import Console
 from rich.table import Table as Printed
-from threadpoolctl import threadpool_limits
 
 from catstream.errors import CatstreamError
+from catstream.threads import one_thread
 
 __all__ = ["Table", "command", "publish"]
 
@@ -56,9 +56,8 @@ def publish(tables: Iterable[Table], file: Path | None) -> None:
     """Print each table as it comes, and write all to a JSON file; linear algebra runs on one core meanwhile."""
     console = Console(width=None if sys.stdout.isatty() else 120)
     shown = []
-    cv2.setNumThreads(1)
     try:
-        with threadpool_limits(1):
+        with one_thread(opencv=True):
             for table in tables:
                 console.print(f"[bold]{table.title}[/]", _printed(table), sep="\n")
                 console.print(table.note, "", sep="\n", style="dim", markup=False, soft_wrap=True)

@@ -8,6 +8,7 @@ line prints it as one line and exits with 1; a program catches
 __all__ = [
     "BoxError",
     "CatstreamError",
+    "FrameError",
     "MissingExtraError",
     "ProtocolError",
     "RecordingError",
@@ -34,6 +35,10 @@ class MissingExtraError(CatstreamError, ImportError):
 
 class BoxError(CatstreamError, ValueError):
     """A box that is not in the frame or far larger than it, has no area, or is not a number."""
+
+
+class FrameError(CatstreamError, ValueError):
+    """An array that is not a frame: of another type, shape or size, or with values that are no brightness."""
 
 
 class VideoError(CatstreamError):

@@ -16,7 +16,7 @@ from catstream import storage
 from catstream.box import Box
 from catstream.compression import checkpoint
 from catstream.errors import ProtocolError, ServiceError
-from catstream.messages import Model, Motion, Sample
+from catstream.messages import Model, Sample
 from catstream.wire.codec import check
 
 __all__ = ["Learned"]
@@ -45,16 +45,11 @@ class Learned:
         ServiceError
             Where it cannot be written.
         """
-        model = self.model
         arrays, told = checkpoint.sample_state(self.sample)
-        arrays["weights"] = model.weights
-        if model.extent is not None:
-            arrays["extent"] = model.extent
-        if model.motion is not None:
-            arrays |= {"process": model.motion.process, "observation": model.motion.observation}
-        facts = {"kind": _KIND, "bias": model.bias, "box": list(self.box), "sample": told}
+        model, _ = checkpoint.model_state(self.model)
+        facts = {"kind": _KIND, "bias": self.model.bias, "box": list(self.box), "sample": told}
         try:
-            storage.write(path, arrays, facts)
+            storage.write(path, arrays | model, facts)
         except OSError as error:
             raise ServiceError(f"cannot write {str(path)!r} ({error}): give another file") from None
 
@@ -90,6 +85,5 @@ class Learned:
         sample = checkpoint.sample_of(arrays, facts["sample"])
         if sample is None:
             raise ValueError("it holds no sample")
-        motion = Motion(arrays["process"], arrays["observation"]) if "process" in arrays else None
-        model = Model(sample.version, 0, arrays["weights"], float(facts["bias"]), motion, arrays.get("extent"))
+        model = checkpoint.model_of(arrays, {"version": sample.version, "frame": 0, "bias": facts["bias"]})
         return cls(model, replace(sample, frame=0), Box(*map(float, facts["box"])))

@@ -10,10 +10,14 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import math
 import os
+import reprlib
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
+from numbers import Number
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -31,7 +35,12 @@ def _about(description: str, **bounds: float) -> Meta:
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """All settings of a run. Frozen: `dataclasses.replace` makes a changed copy.
+    """All settings of a run, checked. Frozen: `dataclasses.replace` makes a changed copy.
+
+    Raises
+    ------
+    SettingsError
+        For a name that does not exist (names the nearest), or a value that does not fit.
 
     >>> Settings(coreset_size=128).coreset_size
     128
@@ -216,6 +225,19 @@ class Settings:
     mine_frames: Annotated[int, _about("Frames from one search for hard negatives to the next.", ge=1)] = 8
     mine_score: Annotated[float, _about("Score below which none are searched for.")] = 0.6
 
+    def __new__(cls, *unnamed: Any, **given: Any) -> Settings:
+        if unnamed:
+            raise SettingsError(
+                f"settings are given by name, got {unnamed[0]!r}: for example Settings(coreset_size=128)"
+            )
+        for name in given:
+            _check_name(name)
+        return super().__new__(cls)
+
+    def __post_init__(self) -> None:
+        for name in _kinds():
+            object.__setattr__(self, name, _checked(name, getattr(self, name)))
+
     @classmethod
     def load(
         cls,
@@ -260,7 +282,7 @@ class Settings:
         values: dict[str, Any] = {}
         if preset is not None:
             if preset not in PRESETS:
-                raise SettingsError(f"there is no preset {preset!r}{_nearest(preset, PRESETS)}")
+                raise SettingsError(f"there is no preset {preset!r}: there are {', '.join(PRESETS)}")
             values.update(PRESETS[preset])
         if file is not None:
             values.update(_read(Path(file)))
@@ -271,17 +293,14 @@ class Settings:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Settings:
-        """Check names and values (texts are read as their setting's type)."""
-        kinds = get_type_hints(cls, include_extras=True)
-        checked = {}
-        for name, value in values.items():
-            if name not in kinds:
-                raise SettingsError(f"there is no setting {name!r}{_nearest(name, kinds)}")
-            try:
-                checked[name] = msgspec.convert(value, kinds[name], strict=not isinstance(value, str))
-            except msgspec.ValidationError as error:
-                raise SettingsError(f"setting {name} cannot be {value!r}: {error}") from None
-        return cls(**checked)
+        """Check names and values; texts are read as their setting's type.
+
+        >>> Settings.of({"ridge": ".5", "lockstep": "true"}) == Settings(ridge=0.5, lockstep=True)
+        True
+        """
+        return cls(
+            **{name: _read_text(name, value) if isinstance(value, str) else value for name, value in values.items()}
+        )
 
     def for_length(self, frames: int | None) -> Settings:
         """These settings for a video of so many frames: `coreset_share` becomes a `coreset_size`.
@@ -356,19 +375,66 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def describe() -> list[tuple[str, str, Any, str]]:
     """Name, type, default and meaning of every setting: for `--help` and the docs."""
-    kinds = get_type_hints(Settings, include_extras=True)
-    rows = []
-    for field in dataclasses.fields(Settings):
-        kind, meta = kinds[field.name].__origin__, kinds[field.name].__metadata__[0]
-        bounds = [
-            f"{sign} {value:g}"
-            for sign, value in ((">=", meta.ge), (">", meta.gt), ("<=", meta.le), ("<", meta.lt))
-            if value is not None
-        ]
-        options = getattr(kind, "__args__", None)
-        text = " | ".join(map(str, options)) if options else kind.__name__
-        rows.append((field.name, " ".join([text, ", ".join(bounds)]).strip(), field.default, meta.description))
-    return rows
+    kinds = _kinds()
+    return [
+        (field.name, _takes(field.name), field.default, kinds[field.name].__metadata__[0].description)
+        for field in dataclasses.fields(Settings)
+    ]
+
+
+@cache
+def _kinds() -> dict[str, Any]:
+    """Type and bounds of each setting."""
+    return get_type_hints(Settings, include_extras=True)
+
+
+def _takes(name: str) -> str:
+    """What a setting takes: its type, or the options, and its bounds."""
+    kind, meta = _kinds()[name].__origin__, _kinds()[name].__metadata__[0]
+    bounds = [
+        f"{sign} {value:g}"
+        for sign, value in ((">=", meta.ge), (">", meta.gt), ("<=", meta.le), ("<", meta.lt))
+        if value is not None
+    ]
+    options = getattr(kind, "__args__", None)
+    text = " | ".join(map(str, options)) if options else kind.__name__
+    return " ".join([text, ", ".join(bounds)]).strip()
+
+
+def _check_name(name: str) -> None:
+    if name not in _kinds():
+        near = [repr(other) for other in difflib.get_close_matches(name, _kinds(), n=3)]
+        meant = f", did you mean {' or '.join(near)}?" if near else ":"
+        raise SettingsError(f"there is no setting {name!r}{meant} `catstream settings` lists all {len(_kinds())}")
+
+
+def _checked(name: str, value: Any) -> Any:
+    """The value of a setting, of its type; a number of numpy is one of Python."""
+    if isinstance(value, Number) and not isinstance(value, bool):
+        value = getattr(value, "item", lambda: value)()
+    try:
+        checked = msgspec.convert(value, _kinds()[name])
+    except msgspec.ValidationError:
+        raise _misfit(name, value) from None
+    if isinstance(checked, float) and not math.isfinite(checked):
+        raise _misfit(name, value)
+    return checked
+
+
+def _read_text(name: str, text: str) -> Any:
+    """The value that a text means, of the type of its setting."""
+    _check_name(name)
+    kind = _kinds()[name].__origin__
+    try:
+        if kind is bool:
+            return msgspec.convert(text, bool, strict=False)
+        return kind(text) if kind in (int, float) else text
+    except (ValueError, msgspec.ValidationError):
+        raise _misfit(name, text) from None
+
+
+def _misfit(name: str, value: Any) -> SettingsError:
+    return SettingsError(f"setting {name} cannot be {reprlib.repr(value)}: it takes {_takes(name)}")
 
 
 def _named(given: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
@@ -390,8 +456,3 @@ def _read(path: Path) -> dict[str, Any]:
         raise SettingsError(f"cannot read the settings file {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or nested without end
         raise SettingsError(f"the settings file {path} is not TOML: {error}") from None
-
-
-def _nearest(name: str, names: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(names), n=1)
-    return f", did you mean {near[0]!r}?" if near else f": there are {', '.join(sorted(names))}"

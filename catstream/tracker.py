@@ -8,30 +8,46 @@ three side by side.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
-from catstream import kalman
+from catstream import kalman, storage
 from catstream.box import Box
+from catstream.compression import checkpoint
 from catstream.compression.compressor import Compressor
+from catstream.detection.cells import row_length
 from catstream.detection.detector import Detector
-from catstream.errors import BoxError
+from catstream.errors import BoxError, FrameError, ProtocolError, ServiceError
+from catstream.image import as_bgr
 from catstream.messages import Features, Track
 from catstream.settings import Settings
+from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
+from catstream.wire.codec import check
 
 __all__ = ["Tracker"]
+
+_KIND = "tracker 1"  # and the version of what the file holds
 
 
 class Tracker:
     """Follows one object, frame by frame; used like a `cv2.Tracker`.
 
-    The same frames and settings give the same boxes, bit for bit.
+    The same frames and settings give the same boxes, bit for bit. While a call computes, linear algebra in this
+    process runs on one thread; what was set before holds again once it returns.
+
+    A frame is an array of shape (h, w, 3) in the order of OpenCV (blue, green, red), (h, w, 4) with transparency
+    last (BGRA), or (h, w) or (h, w, 1) in grey; of uint8, uint16, or float from 0 to 1. All frames of an object have
+    one size. Anything else is a `FrameError`, and the tracker stays as it was.
 
     Parameters
     ----------
-    settings : all defaults where None
+    settings : `Settings`, or names and values of those that are not to have their default
 
     >>> frame = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
     >>> tracker = Tracker()
@@ -41,8 +57,8 @@ class Tracker:
     (True, True)
     """
 
-    def __init__(self, settings: Settings | None = None) -> None:
-        self.settings = settings or Settings()
+    def __init__(self, settings: Settings | Mapping[str, Any] | None = None) -> None:
+        self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
         self._track: Track | None = None
 
     @property
@@ -63,7 +79,7 @@ class Tracker:
 
         Parameters
         ----------
-        frame : uint8 (h, w, 3) BGR, or (h, w) grey
+        frame : the image, as above
         box : x, y, w, h in pixels: four numbers, or a text such as "120,80,64,48"
         time : seconds since the start of the video
 
@@ -71,13 +87,19 @@ class Tracker:
         ------
         BoxError
             For a box that is not in the frame, has no area, or is not a number.
+        FrameError
+            For an array that is not a frame.
         """
+        image, start = as_bgr(frame), Box.of(box)
+        compressor, trainer = Compressor(self.settings), Trainer(self.settings)
         detector = Detector(self.settings)
-        first = detector.init(frame, Box.of(box), time)  # where the box is refused, all goes on as before
-        self.detector = detector
-        self.compressor = Compressor(self.settings)
-        self.trainer = Trainer(self.settings)
-        self._learn(*first)
+        detector.prepare()  # a library is held to one thread if it is there when a call begins
+        with one_thread():
+            first = detector.init(image, start, time)  # if the box is refused, all goes on as before
+            kalman.prepare()
+            self.detector, self.compressor, self.trainer = detector, compressor, trainer
+            self._size = image.shape[:2]
+            self._learn(*first)
 
     def update(self, frame: np.ndarray, time: float = 0.0) -> tuple[bool, Box | None]:
         """Find the object in the next frame, and learn from it.
@@ -85,14 +107,103 @@ class Tracker:
         Returns
         -------
         whether it is there, and where: x, y, w, h in pixels, None where absent
+
+        Raises
+        ------
+        BoxError
+            Before `init`.
+        FrameError
+            For an array that is not a frame, or is of another size than those before.
         """
         _ = self.track
-        self._learn(*self.detector.step(frame, time))
+        image = as_bgr(frame)
+        if image.shape[:2] != self._size:
+            (height, width), (first_height, first_width) = image.shape[:2], self._size
+            raise FrameError(
+                f"this frame is {width}x{height} pixels, those before it {first_width}x{first_height}: "
+                "resize it, or call init to begin anew"
+            )
+        with one_thread():
+            self._learn(*self.detector.step(image, time))
         return self.track.box is not None, self.track.box
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all that was learned to one file, whole or not at all: `Tracker.load` goes on from there.
+
+        Raises
+        ------
+        BoxError
+            Before `init`.
+        ServiceError
+            If it cannot be written.
+        """
+        track = self.track
+        arrays, facts = self.compressor.state()
+        model, model_facts = checkpoint.model_state(self.detector.model)
+        start, start_facts = self.detector.bootstrap_state()
+        told: dict[str, object] = {
+            "kind": _KIND,
+            "program": version("catstream"),
+            "settings": self.settings.texts(),
+            "size": list(self._size),
+            "track": [track.time, track.state, track.box and list(track.box), track.score, track.model_version],
+            "compressor": facts,
+            "model": model_facts,
+            "bootstrap": start_facts,
+        }
+        try:
+            storage.write(path, arrays | model | start, told)
+        except OSError as error:
+            raise ServiceError(f"cannot write {str(path)!r} ({error}): give another file") from None
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """A tracker that goes on where `save` was called, bit for bit.
+
+        Raises
+        ------
+        ServiceError
+            If there is no such file, or it cannot be read.
+        ProtocolError
+            If it is damaged, another file, or of a catstream with other features.
+        """
+        if not Path(path).is_file():
+            raise ServiceError(f"there is no saved tracker {str(path)!r}: `Tracker.save` writes one")
+        arrays, facts = storage.read(path)
+        try:
+            if facts.get("kind") != _KIND:
+                raise ValueError(f"it is of kind {facts.get('kind')!r}, not {_KIND!r}")
+            return cls._of(arrays, facts)
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+            raise ProtocolError(f"{path} is not a saved tracker ({error}): `Tracker.save` writes one") from None
+
+    @classmethod
+    def _of(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Self:
+        self = cls(Settings.of(facts["settings"]))
+        self.compressor = Compressor.from_state(arrays, facts["compressor"], self.settings)
+        self.trainer, self.detector = Trainer(self.settings), Detector(self.settings)
+        model = checkpoint.model_of(arrays, facts["model"])
+        if len(model.weights) != row_length():
+            raise ValueError(
+                f"its model has {len(model.weights)} weights, the features of this catstream are {row_length()}: "
+                f"catstream {facts['program']} wrote it"
+            )
+        seq, bearings = self.compressor.seq, self.compressor.bearings
+        if bearings is None:
+            raise ValueError("it does not say where the object was")
+        self.detector.resume(seq, bearings, model)
+        self.detector.resume_bootstrap(arrays, facts["bootstrap"])
+        height, width = facts["size"]
+        self._size = int(height), int(width)
+        time, state, box, score, model_version = facts["track"]
+        self._track = Track(seq, seq - 1, float(time), state, box and Box(*box), float(score), int(model_version))
+        for message in (model, self._track):
+            check(message)
+        kalman.prepare()
+        return self
 
     def _learn(self, track: Track, features: Features) -> None:
         self._track = track
         sample = self.compressor.take(features)
         if sample is not None:
             self.detector.adopt(self.trainer.train(sample))
-            kalman.prepare()  # a later model brings the motion

@@ -5,11 +5,9 @@ Each can be started by hand, in any order, on any endpoint; `catstream track` st
 
 from __future__ import annotations
 
-import os
+from catstream.threads import limit_process
 
-# The processes are the parallelism: BLAS threads of their own would only take turns on the same cores.
-for _library in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
-    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+limit_process()  # before anything imports numpy
 
 import logging
 import sys

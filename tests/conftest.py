@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
-from threadpoolctl import threadpool_limits
 
 from catstream.box import Box
+from catstream.threads import one_thread
 from catstream.video.demo import write
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
@@ -70,9 +70,9 @@ def demo_video(tmp_path_factory):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def one_thread():
+def one_core():
     """As in the pipeline: with more, BLAS adds in another order, and bits differ."""
-    with threadpool_limits(1):
+    with one_thread():
         yield
 
 

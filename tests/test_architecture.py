@@ -16,8 +16,8 @@ ROOT = Path(__file__).parents[1]
 
 #: From the ground up. A module imports from the floors below its own, and from its own folder.
 FLOORS = [
-    {"errors"},
-    {"box", "storage", "extras"},
+    {"errors", "threads"},
+    {"box", "image", "storage", "extras"},
     {"messages", "settings", "ridge", "kalman", "html"},
     {"detection", "compression", "training", "wire", "video", "adapters"},
     {"learned"},
@@ -33,7 +33,13 @@ FLOORS = [
 HOMES = {
     "numpy": ["catstream", "services"],
     "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
-    "cv2": ["catstream/detection", "catstream/video", "catstream/evaluation/peers.py", "services/__main__.py"],
+    "cv2": [
+        "catstream/detection",
+        "catstream/video",
+        "catstream/threads.py",
+        "catstream/evaluation/peers.py",
+        "services/__main__.py",
+    ],
     "filterpy": ["catstream/kalman.py"],
     "numba": ["catstream/detection/compiled.py"],
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
@@ -44,7 +50,7 @@ HOMES = {
     "zmq": ["catstream/wire/sockets.py", "catstream/wire/gate.py", "catstream/wire/keys.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
-    "threadpoolctl": ["catstream/evaluation/onepass.py", "catstream/recording/learning.py"],
+    "threadpoolctl": ["catstream/threads.py"],
     "psutil": ["catstream/loadtest/usage.py"],
     "hdrh": ["catstream/loadtest/latencies.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],

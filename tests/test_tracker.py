@@ -1,10 +1,16 @@
 """The three stages in one process."""
 
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
+from catstream import storage
 from catstream.box import Box
-from catstream.errors import BoxError, SettingsError
+from catstream.errors import BoxError, FrameError, ProtocolError, ServiceError, SettingsError
 from catstream.settings import PRESETS, Settings
 from catstream.tracker import Tracker
 
@@ -85,3 +91,138 @@ def test_a_refused_box_leaves_what_is_followed(video):
     found, box = tracker.update(frames[1])
     assert found
     assert box.overlap(Box(*boxes[1])) > 0.5
+
+
+def test_frames_of_other_libraries_give_the_boxes_of_the_same_frames(video):
+    frames, boxes = video
+    expected, _ = follow(video, Settings())
+    read_only = [np.frombuffer(frame.tobytes(), np.uint8).reshape(frame.shape) for frame in frames]
+    assert follow((read_only, boxes), Settings())[0] == expected
+    assert follow(([frame.astype(np.float32) / 255 for frame in frames], boxes), Settings())[0] == expected
+
+
+@pytest.mark.parametrize("bad", [None, np.zeros((3, 240, 320), np.uint8), np.zeros((240, 320), bool)])
+def test_what_is_no_frame_is_refused_and_the_tracker_goes_on(video, bad):
+    frames, boxes = video
+    tracker = Tracker()
+    with pytest.raises(FrameError):
+        tracker.init(bad, boxes[0])
+    tracker.init(frames[0], boxes[0])
+    with pytest.raises(FrameError):
+        tracker.update(bad)
+    assert (tracker.track.seq, tracker.update(frames[1])[0]) == (1, True)
+
+
+def test_a_frame_of_another_size_is_refused(video):
+    frames, boxes = video
+    tracker = Tracker()
+    tracker.init(frames[0], boxes[0])
+    with pytest.raises(
+        FrameError, match="this frame is 160x240 pixels, those before it 320x240: resize it, or call init"
+    ):
+        tracker.update(frames[1][:, :160])
+
+
+def test_settings_may_be_given_as_a_mapping():
+    assert Tracker({"coreset_size": 32}).settings == Settings(coreset_size=32)
+
+
+def test_trackers_in_two_threads_give_what_each_gives_alone(video):
+    with ThreadPoolExecutor(2) as pool:
+        one, two = (pool.submit(follow, video, Settings(seed=seed)) for seed in (0, 1))
+    assert (one.result()[0], two.result()[0]) == (follow(video, Settings())[0], follow(video, Settings(seed=1))[0])
+
+
+def results(tracker, frames):
+    return [(*tracker.update(frame), tracker.track) for frame in frames]
+
+
+@pytest.mark.parametrize("settings", [{}, {"bootstrap": "scm", "coreset_size": 36, "copies": 5}], ids=["copies", "scm"])
+@pytest.mark.parametrize("after", [1, 4, 11], ids="after {} frames".format)
+def test_a_saved_tracker_goes_on_bit_for_bit(video, tmp_path, settings, after):
+    frames, boxes = video
+    tracker = Tracker(settings)
+    tracker.init(frames[0], boxes[0])
+    results(tracker, frames[1:after])
+    tracker.save(tmp_path / "kept")
+    loaded = Tracker.load(tmp_path / "kept")
+    assert (loaded.track, loaded.settings) == (tracker.track, tracker.settings)
+    assert results(loaded, frames[after:]) == results(tracker, frames[after:])
+
+
+def test_a_tracker_saved_while_the_object_is_absent_finds_it_as_the_other_does(video, tmp_path):
+    frames, boxes = video
+    tracker = Tracker(Settings(motion_frames=8))
+    tracker.init(frames[0], boxes[0])
+    results(tracker, [*frames[1:12], *[np.zeros_like(frames[0])] * 3])
+    assert tracker.track.state == "absent"
+    tracker.save(tmp_path / "kept")
+    back = results(tracker, frames[12:])
+    assert any(found for found, *_ in back)
+    assert results(Tracker.load(tmp_path / "kept"), frames[12:]) == back
+
+
+_LOADS = """
+import sys, numpy as np
+from catstream import Tracker
+tracker = Tracker.load(sys.argv[1])
+for frame in np.load(sys.argv[2]):
+    tracker.update(frame)
+    print(tracker.track)
+"""
+
+
+def test_another_process_goes_on_bit_for_bit_whatever_its_threads(video, tmp_path):
+    frames, boxes = video
+    tracker = Tracker()
+    tracker.init(frames[0], boxes[0])
+    results(tracker, frames[1:8])
+    tracker.save(tmp_path / "kept")
+    np.save(tmp_path / "rest.npy", frames[8:])
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    command = [sys.executable, "-P", "-c", _LOADS, tmp_path / "kept", tmp_path / "rest.npy"]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    assert told.splitlines() == [str(track) for *_, track in results(tracker, frames[8:])]
+
+
+def test_nothing_is_saved_before_init(tmp_path):
+    with pytest.raises(BoxError, match="call init"):
+        Tracker().save(tmp_path / "kept")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_is_no_saved_tracker_is_refused(video, tmp_path):
+    kept = tmp_path / "kept"
+    with pytest.raises(ServiceError, match="there is no saved tracker"):
+        Tracker.load(kept)
+    storage.write(kept, {"weights": np.zeros(3)}, {"kind": "learned 1"})
+    with pytest.raises(ProtocolError, match="of kind 'learned 1', not 'tracker 1'"):
+        Tracker.load(kept)
+    tracker = Tracker()
+    tracker.init(video[0][0], video[1][0])
+    tracker.save(kept)
+    whole = bytearray(kept.read_bytes())
+    whole[len(whole) // 2] ^= 1
+    kept.write_bytes(whole)
+    with pytest.raises(ProtocolError, match="its checksum does not fit"):
+        Tracker.load(kept)
+    kept.write_bytes(whole[:1000])
+    with pytest.raises(ProtocolError, match="not a whole file"):
+        Tracker.load(kept)
+
+
+def test_a_tracker_of_other_features_is_refused(video, tmp_path):
+    tracker = Tracker()
+    tracker.init(video[0][0], video[1][0])
+    tracker.save(tmp_path / "kept")
+    arrays, facts = storage.read(tmp_path / "kept")
+    storage.write(tmp_path / "kept", arrays | {"weights": arrays["weights"][:-1].copy()}, facts)
+    with pytest.raises(ProtocolError, match="its model has 2463 weights, the features of this catstream are 2464"):
+        Tracker.load(tmp_path / "kept")
+
+
+def test_a_saved_tracker_that_cannot_be_written_is_said_in_one_line(video, tmp_path):
+    tracker = Tracker()
+    tracker.init(video[0][0], video[1][0])
+    with pytest.raises(ServiceError, match=r"cannot write .*: give another file"):
+        tracker.save(tmp_path / "missing" / "kept")

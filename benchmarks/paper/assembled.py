@@ -10,7 +10,6 @@ from time import perf_counter
 from unittest.mock import patch
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
@@ -20,10 +19,10 @@ from catstream.detection.scm import SparseCollaborativeModel
 from catstream.detection.search import Found
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import starts_of
-from catstream.evaluation.peers import one_thread
 from catstream.evaluation.runs import Run
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
+from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 
 __all__ = ["Recipe", "follow_all"]
@@ -96,7 +95,7 @@ def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> Run:
     settings = recipe.settings.for_length(frames)
     detector, compressor, trainer = Detector(settings), Compressor(settings, recipe.tree), Trainer(settings)
     boxes, scores, moments = [], [], [perf_counter()]
-    with threadpool_limits(1), one_thread():
+    with one_thread(opencv=True):
         for row, image in enumerate(sequence.frames(start)):
             track, features = detector.step(image) if row else detector.init(image, Box(*sequence.boxes[start]))
             sample = compressor.take(features) if row < recipe.learned * frames else None

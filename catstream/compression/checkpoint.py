@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from catstream.box import Box
-from catstream.messages import Bearings, Motion, Sample, Summary
+from catstream.messages import Bearings, Model, Motion, Sample, Summary
 
-__all__ = ["bearings_of", "bearings_state", "sample_of", "sample_state"]
+__all__ = ["bearings_of", "bearings_state", "model_of", "model_state", "sample_of", "sample_state"]
 
 State = tuple[dict[str, np.ndarray], dict[str, Any] | None]
 
@@ -41,6 +41,23 @@ def sample_of(arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> Sa
         rows, mean = arrays[f"sample.{name}.rows"], arrays[f"sample.{name}.mean"]
         summaries[name] = Summary(rows, mean, int(count), tuple(levels))
     return Sample(int(facts["version"]), int(facts["frame"]), centres=arrays["sample.centres"], **summaries)
+
+
+def model_state(model: Model) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and facts that `model_of` makes this model of again."""
+    arrays = {"weights": model.weights}
+    if model.extent is not None:
+        arrays["extent"] = model.extent
+    if model.motion is not None:
+        arrays |= {"process": model.motion.process, "observation": model.motion.observation}
+    return arrays, {"version": model.version, "frame": model.frame, "bias": model.bias}
+
+
+def model_of(arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Model:
+    """The model, bit for bit; KeyError, TypeError or ValueError if it is none."""
+    motion = Motion(arrays["process"], arrays["observation"]) if "process" in arrays else None
+    version, frame = int(facts["version"]), int(facts["frame"])
+    return Model(version, frame, arrays["weights"], float(facts["bias"]), motion, arrays.get("extent"))
 
 
 def bearings_state(bearings: Bearings | None) -> State:

@@ -9,6 +9,7 @@ of what is the object, and of which size it has.
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import numpy as np
 
@@ -154,8 +155,12 @@ class Compressor:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one file, whole or not at all."""
+        storage.write(path, *self.state())
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays and facts that `from_state` goes on from."""
         arrays: dict[str, np.ndarray] = {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
-        facts: dict[str, object] = {
+        facts: dict[str, Any] = {
             "seq": self.seq,
             "frame": self.frame,
             "box": list(self.box) if self.box else None,
@@ -166,9 +171,9 @@ class Compressor:
         bearings, facts["bearings"] = checkpoint.bearings_state(self.bearings)
         arrays |= sample | bearings
         for name, tree in self.trees.items():
-            own, facts["trees"][name] = tree.state()  # type: ignore[index]
+            own, facts["trees"][name] = tree.state()
             arrays |= {f"{name}.{key}": array for key, array in own.items()}
-        storage.write(path, arrays, facts)
+        return arrays, facts
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], settings: Settings) -> Compressor:
@@ -182,19 +187,8 @@ class Compressor:
             Where it was made with another coreset size.
         """
         arrays, facts = storage.read(path)
-        self = cls(settings)
         try:
-            self.seq, self.frame = int(facts["seq"]), int(facts["frame"])  # type: ignore[call-overload]
-            self.box = Box(*facts["box"]) if facts["box"] else None  # type: ignore[misc]
-            self.bearings = checkpoint.bearings_of(arrays, facts["bearings"])  # type: ignore[arg-type]
-            self.last_sample = checkpoint.sample_of(arrays, facts["sample"])  # type: ignore[arg-type]
-            self._sampled_leaves = int(facts["sampled_leaves"])  # type: ignore[call-overload]
-            self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]
-            for name, tree_facts in facts["trees"].items():  # type: ignore[attr-defined]
-                own = {
-                    key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")
-                }
-                self.trees[name] = CoresetTree.from_state(own, tree_facts)
+            self = cls.from_state(arrays, facts, settings)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): take an older copy") from None
         if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset_size}:
@@ -202,6 +196,21 @@ class Compressor:
                 f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset_size}: "
                 "go on with the same settings"
             )
+        return self
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any], settings: Settings) -> Compressor:
+        """Go on where `state` was called; KeyError, TypeError or ValueError if these are none."""
+        self = cls(settings)
+        self.seq, self.frame = int(facts["seq"]), int(facts["frame"])
+        self.box = Box(*facts["box"]) if facts["box"] else None
+        self.bearings = checkpoint.bearings_of(arrays, facts["bearings"])
+        self.last_sample = checkpoint.sample_of(arrays, facts["sample"])
+        self._sampled_leaves = int(facts["sampled_leaves"])
+        self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]
+        for name, tree_facts in facts["trees"].items():
+            own = {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
+            self.trees[name] = CoresetTree.from_state(own, tree_facts)
         return self
 
     def _leaves(self) -> dict[str, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -62,6 +62,13 @@ class Detector:
         self._centre: CentreFilter | None = None
         self._balance = Balance()
         self._scm: SparseCollaborativeModel | None = None
+
+    def prepare(self) -> None:
+        """Import what `init` needs, if that takes long."""
+        if self.settings.bootstrap == "scm":
+            from catstream.detection import scm
+
+            scm.prepare()
 
     @property
     def box(self) -> Box | None:
@@ -184,7 +191,20 @@ class Detector:
             self._centre = CentreFilter.resumed(bearings.motion, bearings.centre, bearings.state != "absent")
         if bearings.balance is not None:
             self._balance = Balance.resumed(bearings.balance)
+        if not model.version:
+            self.model = model  # what stands in before the first one
         self.adopt(model)
+
+    def bootstrap_state(self) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
+        """Arrays and facts of the sparse collaborative model, for `resume_bootstrap`; none if it is not in use."""
+        return ({}, None) if self._scm is None else self._scm.state()
+
+    def resume_bootstrap(self, arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> None:
+        """Go on with the sparse collaborative model that another detector followed the object by, after `resume`."""
+        if facts is not None:
+            from catstream.detection.scm import SparseCollaborativeModel
+
+            self._scm = SparseCollaborativeModel.resumed(arrays, facts)
 
     def bearings_at(self, box: Box, first: Box) -> Bearings:
         """Where nothing is known but where the object was last, and in its first frame."""

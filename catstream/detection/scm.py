@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,13 +25,19 @@ from catstream.detection.compiled import kernel
 from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
 
-__all__ = ["SparseCollaborativeModel"]
+__all__ = ["SparseCollaborativeModel", "prepare"]
 
 _SIDE = 32  # of a template, in pixels
 _PENALTY = 0.01  # lambda of all sparse codes
 _SPREAD = np.array([0.2, 0.2, 0.015, 0.005, 0.01])  # of particles: shares of the size, logarithms, radians
 _POSITIVES, _NEGATIVES = 50, 200
 _EVERY = 5  # frames from one update to the next
+
+
+def prepare() -> None:
+    """Import what the first frame needs, in two seconds: for who has the time before it."""
+    import sklearn.cluster
+    import sklearn.linear_model  # noqa: F401
 
 
 class SparseCollaborativeModel:
@@ -54,8 +61,37 @@ class SparseCollaborativeModel:
         grey = _grey(image)
         template = self._cuts(grey, self._state[None])
         positives = self._cuts(grey, self._beside(_POSITIVES, 0.0, 0.02))
-        self._discriminative = _Discriminative(positives, self._background(grey))
-        self._generative = _Generative(template[0], int(rng.integers(2**31)))
+        self._discriminative = _Discriminative.of(positives, self._background(grey))
+        self._generative = _Generative.of(template[0], int(rng.integers(2**31)))
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays and facts that `resumed` goes on from."""
+        judged, made = self._discriminative, self._generative
+        arrays = {
+            "scm.state": self._state,
+            "scm.positives": judged.positives,
+            "scm.templates": judged.templates,
+            "scm.selected": judged.selected,
+            "scm.atoms": made.atoms,
+            "scm.first": made.first,
+            "scm.histogram": made.histogram,
+        }
+        chance = self._rng.bit_generator.state
+        return arrays, {"box": self._first, "frames": self._frames, "particles": self._particles, "rng": chance}
+
+    @classmethod
+    def resumed(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> SparseCollaborativeModel:
+        """Go on where `state` was called, bit for bit; KeyError, TypeError or ValueError if these are none."""
+        self = cls.__new__(cls)
+        self._first, self._frames, self._particles = Box(*facts["box"]), int(facts["frames"]), int(facts["particles"])
+        self._rng = np.random.default_rng()
+        self._rng.bit_generator.state = facts["rng"]
+        self._state = arrays["scm.state"]
+        self._discriminative = _Discriminative(
+            *(arrays[f"scm.{name}"] for name in ("positives", "templates", "selected"))
+        )
+        self._generative = _Generative(*(arrays[f"scm.{name}"] for name in ("atoms", "first", "histogram")))
+        return self
 
     def step(self, image: np.ndarray) -> Found:
         """Find the object in the next frame, of the size of the first.
@@ -76,7 +112,7 @@ class SparseCollaborativeModel:
         self._state = states[best]
         self._frames += 1
         if self._frames % _EVERY == 0:
-            self._discriminative = _Discriminative(self._discriminative.positives, self._background(grey))
+            self._discriminative = _Discriminative.of(self._discriminative.positives, self._background(grey))
             self._generative.update(cuts[best])
         return Found(confidence / (1 + confidence), self._box)
 
@@ -123,24 +159,28 @@ class _Discriminative:
     _SELECTION = 0.001  # lambda of the regression
     _SIGMA = 0.4
 
-    def __init__(self, positives: np.ndarray, negatives: np.ndarray) -> None:
+    def __init__(self, positives: np.ndarray, templates: np.ndarray, selected: np.ndarray) -> None:
+        self.positives, self.templates, self.selected = positives, templates, selected
+        self._templates = templates[:, selected]
+
+    @classmethod
+    def of(cls, positives: np.ndarray, negatives: np.ndarray) -> _Discriminative:
+        """Learn which pixels tell them apart."""
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.linear_model import Lasso  # two seconds to import: only who starts with this model pays
 
-        self.positives = positives
         templates = _unit(np.concatenate([positives, negatives]).reshape(-1, _SIDE * _SIDE))
         labels = np.repeat([1.0, -1.0], [len(positives), len(negatives)])
         # Pixels are selected by a sparse regression of the labels ("Feature Selection").
-        regression = Lasso(self._SELECTION / len(labels), fit_intercept=False)
+        regression = Lasso(cls._SELECTION / len(labels), fit_intercept=False)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a thousand sweeps select well enough
             weights = regression.fit(templates, labels).coef_
-        self._selected = np.flatnonzero(weights) if weights.any() else np.arange(_SIDE * _SIDE)
-        self._templates = templates[:, self._selected]
+        return cls(positives, templates, np.flatnonzero(weights) if weights.any() else np.arange(_SIDE * _SIDE))
 
     def confidences(self, cuts: np.ndarray) -> np.ndarray:
         """H of each candidate: how much better the object's templates rebuild it than the background's."""
-        rows = _unit(cuts.reshape(-1, _SIDE * _SIDE))[:, self._selected]
+        rows = _unit(cuts.reshape(-1, _SIDE * _SIDE))[:, self.selected]
         codes = _codes(rows, self._templates)
         half = len(self.positives)
         foreground = _squares(rows - codes[:, :half] @ self._templates[:half])
@@ -155,41 +195,49 @@ class _Generative:
     _COVERED = 0.04  # a patch rebuilt worse than this is covered
     _LEARNS, _KEEPS = 0.8, 0.95  # share of covered patches from which nothing is learned; share of the first histogram
 
-    def __init__(self, template: np.ndarray, seed: int) -> None:
+    def __init__(self, atoms: np.ndarray, first: np.ndarray, histogram: np.ndarray) -> None:
+        self.atoms, self.first, self.histogram = atoms, first, histogram
+
+    @classmethod
+    def of(cls, template: np.ndarray, seed: int) -> _Generative:
+        """Learn the object's patches."""
         from sklearn.cluster import KMeans
         from sklearn.exceptions import ConvergenceWarning
 
-        patches = self._patches(template[None])
+        patches = cls._patches(template[None])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a plain object has fewer than 50 different patches
-            self._atoms = _unit(KMeans(self._ATOMS, n_init=1, random_state=seed).fit(patches).cluster_centers_)
-        self._first = self._histogram = self._coded(template[None])[0][0]
+            atoms = _unit(KMeans(cls._ATOMS, n_init=1, random_state=seed).fit(patches).cluster_centers_)
+        self = cls(atoms, np.empty(0), np.empty(0))
+        self.first = self.histogram = self._coded(template[None])[0][0]
+        return self
 
     def similarities(self, cuts: np.ndarray) -> np.ndarray:
         """L of each candidate: intersection with the object's histogram, where it is not covered."""
         codes, covered = self._coded(cuts)
         codes[covered] = 0
-        shared = np.minimum(codes, self._histogram).sum(axis=(1, 2))
-        return shared / max(self._histogram.sum(), 1e-6)
+        shared = np.minimum(codes, self.histogram).sum(axis=(1, 2))
+        return shared / max(self.histogram.sum(), 1e-6)
 
     def update(self, found: np.ndarray) -> None:
         """Learn the new look, unless it is covered; the first is never forgotten ("Update Scheme")."""
         codes, covered = self._coded(found[None])
         if covered.mean() < self._LEARNS:
             codes[covered] = 0
-            self._histogram = self._KEEPS * self._first + (1 - self._KEEPS) * codes[0]
+            self.histogram = self._KEEPS * self.first + (1 - self._KEEPS) * codes[0]
 
     def _coded(self, cuts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Codes (count, 196, 50) of all patches, and which of them are covered (count, 196)."""
         patches = self._patches(cuts)
-        codes = _codes(patches, self._atoms)
-        covered = _squares(patches - codes @ self._atoms) >= self._COVERED
+        codes = _codes(patches, self.atoms)
+        covered = _squares(patches - codes @ self.atoms) >= self._COVERED
         return codes.reshape(len(cuts), -1, self._ATOMS), covered.reshape(len(cuts), -1)
 
-    def _patches(self, cuts: np.ndarray) -> np.ndarray:
+    @classmethod
+    def _patches(cls, cuts: np.ndarray) -> np.ndarray:
         """Overlapping patches of unit length, float32 (count * 196, 36)."""
-        views = sliding_window_view(cuts, (self._PATCH, self._PATCH), axis=(1, 2))
-        return _unit(views[:, :: self._STRIDE, :: self._STRIDE].reshape(-1, self._PATCH**2))
+        views = sliding_window_view(cuts, (cls._PATCH, cls._PATCH), axis=(1, 2))
+        return _unit(views[:, :: cls._STRIDE, :: cls._STRIDE].reshape(-1, cls._PATCH**2))
 
 
 def _grey(image: np.ndarray) -> Pyramid:

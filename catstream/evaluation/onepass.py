@@ -12,16 +12,16 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, ServiceError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.peers import PEERS, Peer, one_thread
+from catstream.evaluation.peers import PEERS, Peer
 from catstream.evaluation.runs import Run, claim, label, load, save
 from catstream.services.loop import die_with
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
+from catstream.threads import one_thread
 from catstream.tracker import Tracker
 
 __all__ = ["TRACKERS", "evaluate", "follow", "starts_of"]
@@ -153,7 +153,7 @@ def _follow(
 ) -> Run | CatstreamError:
     """`follow`, and keep the run. On one core: all trackers have the same conditions, the jobs are the parallelism."""
     try:
-        with threadpool_limits(1), one_thread():
+        with one_thread(opencv=True):
             run = follow(tracker, settings, sequence, start)
         if output is not None:
             save(output, run)

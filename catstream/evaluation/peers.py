@@ -6,8 +6,7 @@ OpenCV 4: `pip install "catstream[peers]"`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -17,7 +16,7 @@ from catstream.box import Box
 from catstream.errors import BoxError, SettingsError
 from catstream.extras import install_command
 
-__all__ = ["OPENCV", "PEERS", "Peer", "one_thread"]
+__all__ = ["OPENCV", "PEERS", "Peer"]
 
 OPENCV: str = cv2.__version__  #: which OpenCV that is
 
@@ -73,14 +72,3 @@ def _find(name: str) -> Callable[[], Any]:
     raise SettingsError(
         f"OpenCV {OPENCV} has no tracker {name!r}: install the contrib modules of OpenCV 4, {install_command('peers')}"
     )
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Hold OpenCV to one thread inside a `with`."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from catstream.compression.compressor import Compressor
 from catstream.errors import RecordingError
 from catstream.messages import Features, Model
 from catstream.recording.file import Recording
 from catstream.settings import Settings
+from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 from catstream.wire.codec import encode
 
@@ -88,7 +88,7 @@ def check(recording: Recording, *, incomplete: bool = False) -> None:
         )
 
 
-@threadpool_limits.wrap(limits=1)  # as the processes have: more threads add in another order
+@one_thread()  # as the processes have: more threads add in another order
 def learn(
     recording: Recording,
     settings: Settings,

@@ -77,9 +77,9 @@ def test_the_score_falls_where_the_object_is_gone(scene):
 
 def test_a_covered_object_teaches_nothing(scene, rng):
     model = SparseCollaborativeModel(scene(60, 50), START, rng)._generative
-    before = model._histogram
+    before = model.histogram
     model.update(rng.integers(0, 256, (32, 32), np.uint8))
-    assert model._histogram is before
+    assert model.histogram is before
 
 
 def test_grey_frames_are_followed_as_those_in_colour(scene):

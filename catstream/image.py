@@ -1,0 +1,78 @@
+"""Images: what other libraries give as a picture, as the 8-bit BGR array that catstream computes with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from catstream.errors import FrameError
+
+__all__ = ["as_bgr"]
+
+_CHANNELS = (1, 3, 4)
+_HALF_STEP = 0.5 / 255  # of brightness: by so much an image that was resized may leave the range from 0 to 1
+_WANTED = "a frame is a numpy array (h, w, 3), blue green red, or (h, w) grey, of uint8, uint16 or float from 0 to 1"
+
+
+def as_bgr(image: Any) -> np.ndarray:
+    """An image as uint8 (h, w, 3), blue green red; itself if it is one that may be written to, in one piece.
+
+    Parameters
+    ----------
+    image : array of shape (h, w, 3) BGR, (h, w, 4) BGRA, (h, w) or (h, w, 1) grey. uint8 is taken as it is, of uint16
+        the upper 8 bits, of a float from 0 to 1 the nearest of 255 steps. Transparency is left out. It may be
+        read-only, and a view of other memory
+
+    Raises
+    ------
+    FrameError
+        For all else; says what came, and what to do.
+
+    >>> as_bgr(np.full((2, 2, 1), 0.5))[0, 0]
+    array([128, 128, 128], dtype=uint8)
+    """
+    pixels = _eight_bit(_checked(image))
+    if pixels.ndim == 2 or pixels.shape[2] == 1:
+        pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
+    elif pixels.shape[2] == 4:
+        pixels = pixels[:, :, :3]
+    return np.require(pixels, requirements=["C", "W"])
+
+
+def _checked(image: Any) -> np.ndarray:
+    if image is None:
+        raise FrameError(
+            f"{_WANTED}, got None: a read has failed, as at the end of a video; check what it returns first"
+        )
+    if not isinstance(image, np.ndarray):
+        raise FrameError(f"{_WANTED}, got {type(image).__name__}: turn it into such an array first")
+    shape = image.shape
+    if not (image.ndim == 2 or (image.ndim == 3 and shape[2] in _CHANNELS)):
+        hint = "give one of this shape"
+        if image.ndim == 3 and shape[0] in _CHANNELS:
+            hint = "the channels come last, np.moveaxis(frame, 0, -1) puts them there"
+        elif image.ndim == 4:
+            hint = "give one image of a batch at a time"
+        raise FrameError(f"{_WANTED}, got the shape {shape}: {hint}")
+    if not image.size:
+        raise FrameError(f"{_WANTED}, got the shape {shape}, which has no pixels: check where it was cut from")
+    return np.asarray(image)
+
+
+def _eight_bit(image: np.ndarray) -> np.ndarray:
+    if image.dtype == np.uint8:
+        return image
+    if image.dtype.kind == "u" and image.itemsize == 2:
+        return (image >> 8).astype(np.uint8)
+    if image.dtype.kind != "f":
+        raise FrameError(
+            f"{_WANTED}, got {image.dtype}: frame.astype(np.uint8) if its values are brightness from 0 to 255"
+        )
+    low, high = float(image.min()), float(image.max())
+    if not (low >= -_HALF_STEP and high <= 1 + _HALF_STEP):  # also of NaN
+        raise FrameError(
+            f"{_WANTED}, got {image.dtype} from {low:g} to {high:g}: "
+            "frame.astype(np.uint8) if its values are brightness from 0 to 255"
+        )
+    return (image.clip(0, 1) * 255).round().astype(np.uint8)

@@ -1,0 +1,137 @@
+"""How many threads linear algebra runs on: one, for as long as catstream computes.
+
+The matrices here are small: with more threads, OpenBLAS spends its time waking and waiting for them (a tenth of the
+frames a second), and adds in another order. A process of catstream's own sets environment variables before numpy is
+imported (`limit_process`). Inside somebody else's process nothing may stay changed: there `one_thread` sets the
+number of threads around each call, and sets it back.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from contextlib import ContextDecorator
+from typing import Any
+
+__all__ = ["limit_process", "one_thread"]
+
+_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def limit_process() -> None:
+    """Have all libraries of this process start on one thread, unless the user's environment says otherwise.
+
+    To be called before numpy is imported: the libraries read the environment when they are loaded.
+    """
+    for variable in _VARIABLES:
+        os.environ.setdefault(variable, "1")
+
+
+class _Libraries:
+    """The threaded libraries that are loaded in this process, and who holds them at one thread.
+
+    The number of threads of a BLAS is one for the whole process: the first holder sets it, and the last one to leave
+    sets it back. That of OpenMP belongs to the calling thread: each holder sets its own.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._modules = 0  # how many were imported when libraries were looked for
+        self._blas: list[Any] = []
+        self._openmp: list[Any] = []
+        self._holders = 0
+        self._before: dict[str, tuple[Any, int]] = {}  # path -> a BLAS, and its threads before the first holder
+
+    def hold(self) -> list[tuple[Any, int]]:
+        """Go down to one thread; returns what `release` needs."""
+        with self._lock:
+            self._find()
+            self._holders += 1
+            for library in self._blas:
+                if library.filepath not in self._before:
+                    self._before[library.filepath] = (library, library.get_num_threads() or 1)
+                    _set(library, 1)
+            own = [(library, library.get_num_threads() or 1) for library in self._openmp]
+            for library, _ in own:
+                _set(library, 1)
+            return own
+
+    def release(self, own: list[tuple[Any, int]]) -> None:
+        """Undo one `hold`."""
+        with self._lock:
+            for library, threads in own:
+                _set(library, threads)
+            self._holders -= 1
+            if self._holders:
+                return
+            for library, threads in self._before.values():
+                if library.get_num_threads() == 1:  # otherwise somebody else has set it meanwhile: it is theirs
+                    _set(library, threads)
+            self._before.clear()
+
+    def _find(self) -> None:
+        """Look for libraries, in a few milliseconds, if anything was imported since the last time."""
+        if len(sys.modules) == self._modules:
+            return
+        from threadpoolctl import ThreadpoolController
+
+        self._modules = len(sys.modules)
+        found = ThreadpoolController().lib_controllers
+        self._openmp = [library for library in found if _is_openmp(library)]
+        self._blas = [library for library in found if not _is_openmp(library)]
+
+
+def _is_openmp(library: Any) -> bool:
+    return library.user_api == "openmp" or getattr(library, "threading_layer", "") == "openmp"
+
+
+def _set(library: Any, threads: int) -> None:
+    # threadpoolctl lets only one thread of a process set OpenBLAS; here the last holder sets it back, whichever it is.
+    getattr(library, "_real_set_num_threads", library.set_num_threads)(threads)
+
+
+_libraries = _Libraries()
+
+
+class one_thread(ContextDecorator):
+    """Run linear algebra on one thread inside a `with`, or inside the function that it decorates.
+
+    May be nested, and used by several threads at once: what was set before holds again once the last one has left,
+    also after an exception. Meanwhile linear algebra in other threads of the process is on one thread, too.
+    Costs some microseconds.
+
+    Parameters
+    ----------
+    opencv : also hold OpenCV to one thread; this may not be used by several threads at once
+
+    >>> from threadpoolctl import threadpool_info
+    >>> import numpy
+    >>> with one_thread():
+    ...     {library["num_threads"] for library in threadpool_info()}
+    {1}
+    """
+
+    def __init__(self, *, opencv: bool = False) -> None:
+        self._opencv = opencv
+        self._held: list[tuple[list[tuple[Any, int]], int | None]] = []
+
+    def _recreate_cm(self) -> one_thread:
+        return one_thread(opencv=self._opencv)  # a decorated function may run in several threads at once
+
+    def __enter__(self) -> None:
+        threads = None
+        if self._opencv:
+            import cv2
+
+            threads = cv2.getNumThreads()
+            cv2.setNumThreads(1)
+        self._held.append((_libraries.hold(), threads))
+
+    def __exit__(self, *_: object) -> None:
+        own, threads = self._held.pop()
+        _libraries.release(own)
+        if threads is not None:
+            import cv2
+
+            cv2.setNumThreads(threads)

@@ -1,0 +1,72 @@
+"""What is taken as an image, and what is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from catstream.errors import FrameError
+from catstream.image import as_bgr
+
+
+@pytest.fixture
+def bgr(rng):
+    return rng.integers(0, 256, (6, 8, 3), np.uint8)
+
+
+def test_an_ordinary_frame_is_passed_on_and_not_copied(bgr):
+    assert as_bgr(bgr) is bgr
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda image: np.frombuffer(image.tobytes(), np.uint8).reshape(image.shape),
+        lambda image: image.astype(np.uint16) * 257,
+        lambda image: (image.astype(np.uint16) * 257).astype(">u2"),
+        lambda image: image / 255,
+        lambda image: image.astype(np.float32) / 255,
+        lambda image: np.dstack([image, np.zeros_like(image[:, :, :1])]),
+        lambda image: np.asfortranarray(image),
+        lambda image: image[::-1, ::-1].copy()[::-1, ::-1],
+        lambda image: np.ma.masked_array(image),
+    ],
+    ids=["read-only", "uint16", "big-endian", "float64", "float32", "alpha", "columns", "view", "masked"],
+)
+def test_each_form_of_an_image_is_the_same_image_ready_for_use(bgr, form):
+    found = as_bgr(form(bgr))
+    np.testing.assert_array_equal(found, bgr)
+    assert type(found) is np.ndarray
+    assert found.dtype == np.uint8
+    assert found.flags.c_contiguous
+    assert found.flags.writeable
+
+
+@pytest.mark.parametrize("form", [lambda grey: grey, lambda grey: grey[:, :, None]], ids=["plane", "channel"])
+def test_grey_is_expanded(bgr, form):
+    grey = bgr[:, :, 0]
+    np.testing.assert_array_equal(as_bgr(form(grey)), np.dstack([grey] * 3))
+
+
+@pytest.mark.parametrize(
+    ("image", "told"),
+    [
+        (None, "got None: a read has failed"),
+        ([[1, 2], [3, 4]], "got list: turn it into"),
+        (np.zeros((4, 5, 3), bool), "got bool: frame.astype"),
+        (np.zeros((4, 5, 3), np.int64), "got int64: frame.astype"),
+        (np.zeros((3, 4, 5), np.uint8), r"got the shape \(3, 4, 5\): the channels come last"),
+        (np.zeros((2, 4, 5, 3), np.uint8), r"got the shape \(2, 4, 5, 3\): give one image of a batch"),
+        (np.zeros((7, 5, 2), np.uint8), r"got the shape \(7, 5, 2\): give one of this shape"),
+        (np.zeros(7, np.uint8), r"got the shape \(7,\)"),
+        (np.zeros((0, 5, 3), np.uint8), "has no pixels"),
+        (np.full((4, 5, 3), 200.0), "got float64 from 200 to 200: frame.astype"),
+        (np.full((4, 5, 3), -1, np.float32), "got float32 from -1 to -1"),
+        (np.full((4, 5, 3), np.nan), "got float64 from nan to nan"),
+        (np.full((4, 5, 3), 1j), "got complex128"),
+    ],
+)
+def test_what_is_no_image_is_an_error_of_one_line_that_says_what_to_do(image, told):
+    with pytest.raises(FrameError, match=told) as error:
+        as_bgr(image)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,93 @@
+"""Linear algebra on one thread, inside a program that has set something else."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
+import cv2
+import pytest
+import scipy.linalg  # noqa: F401  brings a BLAS of its own
+from threadpoolctl import ThreadpoolController, threadpool_limits
+
+from catstream.threads import _Libraries, one_thread
+
+
+def counts():
+    """Threads of each BLAS of this process."""
+    return {library.filepath: library.get_num_threads() for library in ThreadpoolController().lib_controllers}
+
+
+@pytest.fixture
+def libraries(monkeypatch):
+    """As in a user's program with two threads: nobody else in this process holds it at one."""
+    own = _Libraries()
+    monkeypatch.setattr("catstream.threads._libraries", own)
+    with threadpool_limits(2):
+        if set(counts().values()) != {2}:
+            pytest.skip("this machine has one core, or BLAS without threads")
+        yield own
+
+
+@pytest.mark.usefixtures("libraries")
+def test_all_libraries_are_on_one_thread_inside_and_as_before_outside():
+    before = counts()
+    with one_thread(), one_thread():
+        assert set(counts().values()) == {1}
+    assert counts() == before
+
+
+@pytest.mark.usefixtures("libraries")
+def test_an_exception_sets_back_what_was():
+    before = counts()
+    with pytest.raises(ZeroDivisionError), one_thread():
+        _ = 1 / 0
+    assert counts() == before
+
+
+@pytest.mark.usefixtures("libraries")
+def test_of_two_threads_the_last_to_leave_sets_it_back():
+    before, both, first_left = counts(), Barrier(2), Barrier(2)
+
+    def first():
+        with one_thread():
+            both.wait(60)
+        first_left.wait(60)
+
+    def last():
+        with one_thread():
+            both.wait(60)
+            first_left.wait(60)
+            return set(counts().values())
+
+    with ThreadPoolExecutor(2) as pool:
+        _, still = pool.submit(first), pool.submit(last)
+        assert still.result() == {1}
+    assert counts() == before
+
+
+@pytest.mark.usefixtures("libraries")
+def test_what_the_user_sets_meanwhile_is_not_set_back():
+    holder = one_thread()
+    holder.__enter__()
+    with threadpool_limits(1):
+        pass
+    libraries = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
+    for library in libraries:
+        library._real_set_num_threads(3) if hasattr(library, "_real_set_num_threads") else library.set_num_threads(3)
+    meant = [library.get_num_threads() for library in libraries]
+    holder.__exit__()
+    assert [library.get_num_threads() for library in libraries] == meant
+
+
+def test_opencv_is_held_only_if_asked_for():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        with one_thread():
+            assert cv2.getNumThreads() == 2
+        with one_thread(opencv=True):
+            assert cv2.getNumThreads() == 1
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(before)
