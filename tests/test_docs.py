@@ -123,6 +123,33 @@ def test_every_option_is_explained(verb, option):
     assert re.search(rf"`{flag}[ `]", rows + common), f"{where}, section {verb}: add the option {flag}"
 
 
+def in_the_house() -> set[str]:
+    """Files and folders that the tree of docs/architecture.md names."""
+    tree = page("docs/architecture.md").partition("## The house\n\n```\n")[2].partition("```")[0]
+    named, folders = set[str](), dict[int, str]()
+    for line in tree.splitlines():
+        depth = (len(line) - len(line.lstrip())) // 2
+        for name in re.split(r" {3,}", line.strip())[0].split():  # several names of a line are two blanks apart
+            path = folders.get(depth - 1, "") + name
+            named.add(path)
+            if name.endswith("/"):
+                folders[depth] = path
+    return named
+
+
+def test_the_house_has_every_module_and_none_that_is_gone():
+    named = in_the_house()
+    modules = {
+        path.relative_to(ROOT).as_posix()
+        for house in ("catstream", "services")
+        for path in ROOT.glob(f"{house}/**/*.py")
+    }
+    missing = {path for path in modules if not path.endswith("__init__.py")} - named
+    assert not missing, f"docs/architecture.md, the house: add {', '.join(sorted(missing))}"
+    gone = sorted(path for path in named if not (ROOT / path).exists())
+    assert not gone, f"docs/architecture.md, the house: {', '.join(gone)} is gone"
+
+
 def test_every_file_that_track_writes_is_explained(tmp_path):
     from catstream.video.results import ResultsWriter
 
