@@ -10,10 +10,13 @@ from typing import Self
 
 import numpy as np
 
-__all__ = ["COLOURS", "SHARES", "Axis", "plot"]
+__all__ = ["COLOURS", "DASHES", "SHARES", "Axis", "plot"]
 
 #: Of the curves, in order; distinct for the colour-blind too, on light and on dark.
-COLOURS = ("#e8590c", "#1c7ed6", "#2f9e44", "#9c36b5", "#c9a227", "#868e96")
+COLOURS = ("#f25100", "#2b82d9", "#56bf9c", "#a63700", "#30b2f2", "#3f8c7f", "#1c678c")
+
+#: Of the first four curves, of the next four, and of those after them.
+DASHES = ("none", "7 4", "2 3")
 
 _WIDTH, _HEIGHT = 460, 320
 _LEFT, _TOP, _RIGHT, _BOTTOM = 46, 34, 24, 44
@@ -84,7 +87,7 @@ def plot(title: str, x: Axis, y: Axis, curves: Mapping[str, tuple[np.ndarray, np
     for value, text in x.ticks:
         parts.append(f'<text x="{across(value):.1f}" y="{bottom + 18}" text-anchor="middle">{text}</text>')
     for number, (xs, ys) in enumerate(curves.values()):
-        style = f'fill="none" stroke="{_colour(number)}" stroke-width="2.2" stroke-linejoin="round"'
+        style = f'fill="none" {_stroke(number)} stroke-width="2.2" stroke-linejoin="round"'
         for piece in np.ma.clump_unmasked(np.ma.masked_invalid(ys)):
             points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(xs[piece]), down(ys[piece]), strict=True))
             parts.append(f'<polyline points="{points}" {style}/>')
@@ -100,12 +103,13 @@ def _legend(names: list[str]) -> tuple[list[str], int]:
             x, row = float(_LEFT), row + 1
         y = _TOP + 4 + _ROW * row
         parts += [
-            f'<rect x="{x:.0f}" y="{y - 5}" width="16" height="3" fill="{_colour(number)}"/>',
-            f'<text x="{x + 22:.0f}" y="{y}">{escape(name)}</text>',
+            f'<line x1="{x:.0f}" x2="{x + 18:.0f}" y1="{y - 4}" y2="{y - 4}" {_stroke(number)} stroke-width="3"/>',
+            f'<text x="{x + 23:.0f}" y="{y}">{escape(name)}</text>',
         ]
         x += width
     return parts, row + 1 if names else 0
 
 
-def _colour(number: int) -> str:
-    return COLOURS[number % len(COLOURS)]
+def _stroke(number: int) -> str:
+    dashes = DASHES[number // 4 % len(DASHES)]
+    return f'stroke="{COLOURS[number % len(COLOURS)]}" stroke-dasharray="{dashes}"'
