@@ -50,7 +50,7 @@ HOMES = {
     "zmq": ["catstream/wire/sockets.py", "catstream/wire/gate.py", "catstream/wire/keys.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
-    "threadpoolctl": ["catstream/threads.py"],
+    "threadpoolctl": ["catstream/threads.py", "catstream/evaluation/provenance.py"],
     "psutil": ["catstream/loadtest/usage.py"],
     "hdrh": ["catstream/loadtest/latencies.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -10,7 +14,7 @@ import click
 
 from catstream.errors import CatstreamError
 
-__all__ = ["INTERRUPTED", "VERBS", "main", "verb"]
+__all__ = ["INTERRUPTED", "VERBS", "interruptible", "main", "verb"]
 
 #: Exit code of a command that Ctrl-C ended before it was done.
 INTERRUPTED = 130
@@ -46,6 +50,24 @@ def verb(name: str) -> click.Command:
         import_module(f"catstream.cli.{_TOGETHER.get(name, name)}"), name.replace("-", "_")
     )
     return command
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """End this process at once on Ctrl-C inside a `with`, which is for imports before anything has begun.
+
+    Kernels that are compiled meanwhile swallow a KeyboardInterrupt, or make another error of it.
+    """
+
+    def leave(*_: object) -> None:
+        os.write(2, b"stopped\n")
+        os._exit(INTERRUPTED)
+
+    before = signal.signal(signal.SIGINT, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class _Verbs(click.Group):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -11,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from catstream.cli import INTERRUPTED, interruptible
 from catstream.errors import CatstreamError
 from catstream.services.options import with_settings
 from catstream.settings import Settings
@@ -24,7 +27,7 @@ __all__ = ["evaluate"]
 @click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Frames to start from.")
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Processes at once.")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder for results and report.html.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all numbers.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all numbers, and what made them.")
 @with_settings
 def evaluate(
     settings: Settings,
@@ -68,11 +71,12 @@ def evaluate(
       catstream evaluate sequences/walk --starts 5 --set coreset_size=128
     """
     # Here, so that --help and the other verbs need not wait for these.
-    from catstream.evaluation.datasets import find_sequences
-    from catstream.evaluation.onepass import evaluate as run_all
-    from catstream.evaluation.report import write_report
-    from catstream.evaluation.runs import Run
-    from catstream.evaluation.summary import rows_of, to_json
+    with interruptible():
+        from catstream.evaluation.datasets import find_sequences
+        from catstream.evaluation.onepass import evaluate as run_all
+        from catstream.evaluation.report import write_report
+        from catstream.evaluation.runs import Run
+        from catstream.evaluation.summary import rows_of, to_json
 
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
@@ -83,7 +87,7 @@ def evaluate(
     errors: list[CatstreamError] = []
     console = Console(width=None if sys.stdout.isatty() else 120)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True) as progress:
+    with _kept(output), Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("frames", total=None)
 
         def begin(frames: int) -> None:
@@ -109,7 +113,7 @@ def evaluate(
     if not runs:
         raise CatstreamError("no sequence could be followed: see above")
     rows = rows_of(runs)
-    numbers = to_json(rows)
+    numbers = to_json(rows, settings)
     console.print(_table(numbers))
     if json_file is not None:
         try:
@@ -120,6 +124,17 @@ def evaluate(
         console.print(f"report: {write_report(output / 'report.html', runs, settings)}", soft_wrap=True)
     if errors:
         raise CatstreamError(f"{len(errors)} of {len(errors) + len(runs)} runs could not be made, and are in no number")
+
+
+@contextmanager
+def _kept(output: Path | None) -> Iterator[None]:
+    """After Ctrl-C, say what there is."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        kept = "" if output is None else f": finished runs are kept in {str(output)!r}, the same command goes on"
+        click.echo(f"stopped{kept}", err=True)
+        sys.exit(INTERRUPTED)
 
 
 def _table(numbers: dict) -> Table:

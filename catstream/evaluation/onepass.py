@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -14,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from catstream.box import Box
-from catstream.errors import CatstreamError, ServiceError, SettingsError, VideoError
+from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.peers import PEERS, Peer
 from catstream.evaluation.runs import Run, claim, label, load, save
-from catstream.services.loop import die_with
-from catstream.services.start import SPAWN
+from catstream.evaluation.workers import results
 from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.tracker import Tracker
@@ -136,16 +131,9 @@ def _work(tasks: list[Any], output: Path | None, jobs: int) -> Iterator[Run | Ca
     if jobs == 1:
         yield from (_follow(output, *task) for task in tasks)
         return
-    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=_serve, initargs=(os.getpid(),)) as pool:
-        try:
-            # Long ones first, so that none is left running alone at the end.
-            tasks = sorted(tasks, key=lambda task: task[3] - len(task[2]))
-            for future in as_completed([pool.submit(_follow, output, *task) for task in tasks]):
-                yield future.result()
-        except BrokenProcessPool:
-            raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    # Long ones first, so that none is left running alone at the end.
+    ranked = sorted(tasks, key=lambda task: task[3] - len(task[2]))
+    yield from results(_follow, [(output, *task) for task in ranked], jobs)
 
 
 def _follow(
@@ -160,12 +148,6 @@ def _follow(
     except CatstreamError as error:
         return CatstreamError(f"{tracker} on {label(sequence, start)}: {error}")
     return run
-
-
-def _serve(parent: int) -> None:
-    """Ctrl-C reaches the workers too; the parent is the one that speaks, and none outlives it."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    die_with(parent)
 
 
 def _check(sequences: list[Sequence], trackers: list[str]) -> None:

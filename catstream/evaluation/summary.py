@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from statistics import fmean, pstdev
 from typing import Any
 
+from catstream.evaluation.provenance import provenance
 from catstream.evaluation.runs import Run
+from catstream.settings import Settings
 
 __all__ = ["MEASURES", "Row", "mean_of", "rows_of", "to_json"]
 
@@ -61,9 +63,9 @@ def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
     }
 
 
-def to_json(rows: list[Row]) -> dict[str, Any]:
-    """What `catstream evaluate --json` writes: {"sequences": [row ...], "mean": {tracker: {measure: mean}}}."""
-    return {"sequences": [dataclasses.asdict(row) for row in rows], "mean": mean_of(rows)}
+def to_json(rows: list[Row], settings: Settings) -> dict[str, Any]:
+    """What `catstream evaluate --json` writes: the rows, {tracker: {measure: mean}}, and what they were made with."""
+    return {**provenance(settings), "sequences": [dataclasses.asdict(row) for row in rows], "mean": mean_of(rows)}
 
 
 def _row(name: str, tracker: str, runs: list[Run]) -> Row:

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from typing import Any
 
+from catstream.evaluation.provenance import provenance
 from catstream.loadtest.measures import Measures
 from catstream.loadtest.trial import Trial
 from catstream.loadtest.usage import summary
 
-__all__ = ["machine", "to_json"]
+__all__ = ["to_json"]
 
 
 def to_json(trial: Trial) -> dict[str, Any]:
-    """The figures of the run that counts, and of the steps that led to it; seconds, shares from 0 to 1, bytes."""
+    """The figures of the run that counts, of the steps that led to it, and what they were made with.
+
+    Seconds, shares from 0 to 1, bytes.
+    """
     result = trial.result
     plan = result.plan
     return {
+        **provenance(plan.settings),
         "plan": {
             "streams": plan.streams,
             "subscribers": plan.subscribers,
@@ -26,9 +29,7 @@ def to_json(trial: Trial) -> dict[str, Any]:
             "duration": plan.duration,
             "size": list(plan.size),
             "chaos": plan.chaos,
-            "settings": plan.settings.changed(),
         },
-        "machine": machine(),
         "seconds": result.seconds,
         "interrupted": trial.interrupted,
         "latency": {"track": result.track.figures(), "model": result.model.figures()},
@@ -79,13 +80,4 @@ def _stream(measures: Measures, rate: float) -> dict[str, Any]:
         "stored": measures.stored,
         "success": measures.success,
         "success_followed": measures.success_followed,
-    }
-
-
-def machine() -> dict[str, Any]:
-    """What it ran on."""
-    return {
-        "processor": platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)),
-        "python": platform.python_version(),
     }

@@ -288,7 +288,7 @@ def test_the_mean_f_score_is_over_the_sequences_that_have_one(sequence, run):
 
 
 def test_the_json_holds_every_row_and_the_means(run):
-    numbers = json.loads(json.dumps(to_json(rows_of([run])), allow_nan=False))
+    numbers = json.loads(json.dumps(to_json(rows_of([run]), Settings()), allow_nan=False))
     (row,) = numbers["sequences"]
     assert {"name", "frames", "auc", "success", "precision", "f_score", "fps", "tracker"} <= row.keys()
     assert numbers["mean"].keys() == {"catstream"}

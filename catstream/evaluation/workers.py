@@ -1,0 +1,61 @@
+"""Worker processes that Ctrl-C ends without a word, from their first moment on.
+
+This module is the first thing that a worker imports: what takes long to import comes afterwards.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+from catstream.errors import ServiceError
+from catstream.services.loop import die_with
+from catstream.services.start import SPAWN
+
+__all__ = ["results"]
+
+_CTRL_C = {signal.SIGINT}
+
+
+def results(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
+    """What `work(*task)` gives for each task, in the order in which they are done; `jobs` processes at once.
+
+    If the caller stops early, as on Ctrl-C, the workers are killed: none is left.
+
+    Raises
+    ------
+    ServiceError
+        If a worker was killed by somebody else.
+    """
+    others = set(multiprocessing.active_children())
+    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=_begin, initargs=(os.getpid(),)) as pool:
+        try:
+            for future in as_completed(_submitted(pool, work, tasks)):
+                yield future.result()
+        except BrokenProcessPool:
+            raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
+        except BaseException:
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()
+            raise
+
+
+def _submitted(pool: ProcessPoolExecutor, work: Any, tasks: list[Any]) -> list[Future[Any]]:
+    """Workers are started here, and inherit that SIGINT is blocked: until `_begin` it could only be a traceback."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _CTRL_C)
+    try:
+        return [pool.submit(work, *task) for task in tasks]
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin(parent: int) -> None:
+    """Ctrl-C reaches the workers too, and ends them: the parent is the one that speaks, and none outlives it."""
+    die_with(parent)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _CTRL_C)

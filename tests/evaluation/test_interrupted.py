@@ -1,0 +1,50 @@
+"""Ctrl-C ends an evaluation in one line, with all its processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+
+import psutil
+import pytest
+
+from catstream.cli import INTERRUPTED, interruptible
+from catstream.evaluation.workers import results
+
+EVALUATE = [sys.executable, "-c", "from catstream.cli import main; main()", "evaluate"]
+
+
+def test_ctrl_c_while_the_workers_start_is_one_line_and_leaves_none(walk, tmp_path):
+    """The terminal sends it to all of them, of which the workers are at their imports."""
+    command = [*EVALUATE, str(walk), "--starts", "4", "--jobs", "2", "--output", str(tmp_path / "out")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, process_group=0)
+    family = psutil.Process(process.pid)
+    while len(family.children()) < 3 and process.poll() is None:  # two workers, and the tracker of their resources
+        pass
+    children = family.children()
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate()
+    assert errors.count("\n") == 1
+    assert errors.startswith("stopped: finished runs are kept in ")
+    assert process.returncode == INTERRUPTED
+    assert not psutil.wait_procs(children, timeout=10)[1]
+
+
+def test_a_caller_that_stops_early_leaves_no_worker():
+    given = results(abs, [(-1,), (-2,), (-3,)], jobs=2)
+    assert next(given) in {1, 2, 3}
+    workers = multiprocessing.active_children()
+    given.close()
+    assert len(workers) == 2
+    assert not multiprocessing.active_children()
+
+
+def test_ctrl_c_during_imports_ends_at_once(monkeypatch, capfd):
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    with pytest.raises(SystemExit, match=str(INTERRUPTED)), interruptible():
+        signal.raise_signal(signal.SIGINT)
+    assert capfd.readouterr().err == "stopped\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
