@@ -12,7 +12,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo test test-slow lint format docs settings bench lock clean fuzz audit
+.PHONY: help setup develop demo test test-slow lint format docs settings bench results lock clean fuzz audit
 
 help:  ## say what there is
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -63,8 +63,11 @@ docs: $(TOOLS)  ## the documentation, into site/
 settings: $(TOOLS)  ## write the table of docs/settings.md anew
 	$(BIN)/python tests/test_docs.py
 
-bench: $(TOOLS)  ## speed, memory and growth: a quarter of an hour
-	for name in startup throughput kernels wire endurance speed; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+bench: $(TOOLS)  ## measure speed, memory and growth on a quiet machine, into benchmarks/results: 20 minutes
+	PYTHON=$${PYTHON_OF_PEERS:-$(BIN)/python} benchmarks/measure.sh
+
+results: $(TOOLS)  ## write docs/results.md, and the figures of README, from benchmarks/results
+	$(BIN)/python benchmarks/page.py
 
 audit: $(TOOLS)  ## known holes in what the lock files install; asks PyPI
 	$(BIN)/python .ci/audit

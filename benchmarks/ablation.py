@@ -87,4 +87,4 @@ if __name__ == "__main__":
         "--only", nargs="+", metavar="WORD", help="leave out only ingredients whose name has one of these words"
     )
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -255,4 +255,4 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0, help="of the schedule (default: %(default)s)")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # the small disk is taken away then, too
-    publish(figures(options), options.json)
+    publish(figures(options), options)

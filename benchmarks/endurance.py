@@ -70,4 +70,4 @@ if __name__ == "__main__":
     parser.add_argument("--frames", type=int, default=20_000, help="at least as many (default: %(default)s)")
     parser.add_argument("--plot", type=Path, default=Path("out/endurance.png"), help="(default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

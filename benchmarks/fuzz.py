@@ -273,4 +273,4 @@ if __name__ == "__main__":
     options = parser.parse_args()
     if options.trial:
         trial(options.trial, options.inputs, options.folder)
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -84,4 +84,4 @@ if __name__ == "__main__":
     parser.add_argument("--rows", type=int, default=40, help="new rows before that, at most (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments (default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -211,4 +211,4 @@ if __name__ == "__main__":
     parser.add_argument("--through", type=int, default=50_000, help="through the process (default: %(default)s)")
     parser.add_argument("--plot", type=Path, default=Path("out/soak.png"), help="(default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -98,4 +98,4 @@ if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--frames", type=int, help="of each sequence beside the peers, the first ones (default: all)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -81,4 +81,4 @@ if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--runs", type=int, default=7, help="starts of each kind (default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -143,4 +143,4 @@ if __name__ == "__main__":
     parser.add_argument("--frozen", type=int, default=20, help="of them frozen (default: %(default)s)")
     parser.add_argument("--runs", type=int, default=2, help="with and without each (default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -1,28 +1,29 @@
-"""What every benchmark takes and gives: a few options in, tables on the terminal and in a JSON file out."""
+"""What every benchmark takes and gives: a few options in, tables on the terminal and in a JSON file out.
+
+`--json benchmarks/results/NAME.json` is the record that `docs/results.md` shows; `make results` writes the page anew.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
-import platform
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
-
-import cv2
-from rich.console import Console
-from rich.table import Table as Printed
+from typing import Any
 
 from catstream.errors import CatstreamError
+from catstream.evaluation.provenance import provenance
+from catstream.settings import Settings
 from catstream.threads import one_thread
 
-__all__ = ["Table", "command", "publish"]
+__all__ = ["Table", "command", "publish", "text"]
 
-_DATA = Path(os.environ.get("TRACKING_DATA") or Path(__file__).parents[2] / "shared" / "data")
-_LIBRARIES = ("catstream", "numpy", "numba", "scikit-learn", "pyzmq")
+_ROOT = Path(__file__).parents[1]
+_DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")
+_PLACES = ("--json", "--data", "--output")  # options that say where something lies on this machine
 
 Cell = str | int | float | None
 
@@ -38,8 +39,8 @@ class Table:
     """
 
     title: str
-    columns: tuple[str, ...]
-    rows: list[tuple[Cell, ...]]
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
     note: str = ""
 
 
@@ -47,48 +48,68 @@ def command(about: str | None) -> argparse.ArgumentParser:
     """The options that all benchmarks share."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=_DATA, help="folder of annotated sequences (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures, and what made them, to a file")
     parser.add_argument("--quick", action="store_true", help="a few rendered frames: shows that it runs, nothing else")
     return parser
 
 
-def publish(tables: Iterable[Table], file: Path | None) -> None:
-    """Print each table as it comes, and write all to a JSON file; linear algebra runs on one core meanwhile."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+def publish(tables: Iterable[Table], options: argparse.Namespace, settings: Settings | None = None) -> None:
+    """Print each table as it comes, and write all to the file of `--json`; linear algebra runs on one core meanwhile.
+
+    Parameters
+    ----------
+    tables : what was measured
+    options : of `command`
+    settings : those that hold for all tables, None for the defaults
+    """
     shown = []
     try:
         with one_thread(opencv=True):
             for table in tables:
-                console.print(f"[bold]{table.title}[/]", _printed(table), sep="\n")
-                console.print(table.note, "", sep="\n", style="dim", markup=False, soft_wrap=True)
+                print(table.title, text(table), sep="\n")
+                print(table.note, end="\n\n" if table.note else "\n", flush=True)
                 shown.append(asdict(table))
     except CatstreamError as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
-    if file is not None:
-        figures = {"benchmark": Path(sys.argv[0]).stem, "machine": _machine(), "tables": shown}
-        file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    if options.json is not None:
+        figures = {**provenance(settings or Settings(), list(_words())), "tables": shown}
+        options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
-def _printed(table: Table) -> Printed:
-    printed = Printed(box=None, header_style="italic", pad_edge=False)
-    for column, cell in zip(table.columns, table.rows[0] if table.rows else table.columns, strict=True):
-        printed.add_column(column, justify="left" if isinstance(cell, str) else "right")
-    for row in table.rows:
-        printed.add_row(*map(_text, row))
-    return printed
+def text(table: Table) -> str:
+    """Headings and rows, in columns: words to the left, figures to the right.
+
+    >>> print(text(Table("", ("tracker", "frames/s"), [("catstream", 101.4), ("csrt", None)])))
+    tracker    frames/s
+    catstream       101
+    csrt              -
+    """
+    cells = [list(table.columns), *([_cell(cell) for cell in row] for row in table.rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    first = table.rows[0] if table.rows else table.columns
+    lines = [
+        "  ".join(
+            f"{cell:<{width}}" if isinstance(kind, str) else f"{cell:>{width}}"
+            for cell, width, kind in zip(row, widths, first, strict=True)
+        ).rstrip()
+        for row in cells
+    ]
+    return "\n".join(lines)
 
 
-def _text(cell: Cell) -> str:
+def _cell(cell: Cell) -> str:
     if isinstance(cell, float):
         return f"{cell:.{0 if abs(cell) >= 100 else 1 if abs(cell) >= 10 else 3}f}"
     return "-" if cell is None else str(cell)
 
 
-def _machine() -> dict[str, object]:
-    return {
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "opencv": cv2.__version__,  # which may be of another package, with more in it
-        **{library: version(library) for library in _LIBRARIES},
-    }
+def _words() -> Iterator[str]:
+    """The command of this process, as somebody would type it in the checkout, without the options of `_PLACES`."""
+    program = Path(sys.argv[0]).resolve()
+    yield from ("python", program.relative_to(_ROOT).as_posix() if _ROOT in program.parents else program.name)
+    words: Iterator[Any] = iter(sys.argv[1:])
+    for word in words:
+        if word in _PLACES:
+            next(words, None)
+        elif not word.startswith(tuple(f"{option}=" for option in _PLACES)):
+            yield word

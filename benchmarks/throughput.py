@@ -89,4 +89,4 @@ if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--runs", type=int, default=3, help="runs of each video (default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -93,4 +93,4 @@ if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--messages", type=int, default=5_000, help="over each (default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -58,4 +58,4 @@ if __name__ == "__main__":
     parser = accuracy_command(__doc__, starts=3)
     parser.add_argument("--size", type=int, default=64, help="n, in frames and rows (default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -48,7 +49,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         sequence = named(options, name)
         path, truth = lengthened(sequence, frames)
         for n in options.sizes[:1] if options.quick else options.sizes:
-            settings = Settings(**PRESETS.get(options.preset, {}) | {"coreset_size": n, "coreset_share": 0.0})
+            settings = replace(base_of(options), coreset_size=n, coreset_share=0.0)
             label = f"{sequence.name}, n = {n}"
             journey = journeys[label] = travel(str(path), truth[0], settings, watch=max(frames // 200, 1))
             ends = (LENGTHS * frames).astype(int)
@@ -60,6 +61,11 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     paper = [(f"paper: {name}", *printed) for name, printed in PAPER.items()]
     yield Table("Success", ("frames", *lengths), successes + paper, "the paper's columns: 10K, 20K, 50K, 75K and 100K")
     yield Table("Growth", ("video", *GROWTH), [(name, *growth(journey)) for name, journey in journeys.items()])
+
+
+def base_of(options: argparse.Namespace) -> Settings:
+    """All settings but n."""
+    return Settings(**PRESETS.get(options.preset, {}))
 
 
 def lengthened(sequence: Sequence, frames: int) -> tuple[Path, np.ndarray]:
@@ -122,4 +128,4 @@ if __name__ == "__main__":
     parser.add_argument("--preset", choices=PRESETS, help="settings but for n; the defaults where not given")
     parser.add_argument("--plot", type=Path, default=Path("out/long_videos.png"), help="(default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options, base_of(options))

@@ -51,4 +51,4 @@ if __name__ == "__main__":
     parser = accuracy_command(__doc__, starts=3, kept=False)
     parser.add_argument("--ours", action="store_true", help="with our settings only")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

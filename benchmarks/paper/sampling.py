@@ -90,7 +90,7 @@ TREES = {"coreset": CoresetTree, "evenly spaced": Spaced, "random": Random}
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    base = Settings() if options.ours else Settings(**PRESETS["one-class-paper"])
+    base = base_of(options)
     shares = SHARES[:1] if options.quick else SHARES
     for n in options.sizes[:1] if options.quick else options.sizes:
         recipes = {
@@ -106,9 +106,14 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         yield Table(f"Success, n = {n}, by share of frames learned from", ("learned from", *map(str, shares)), rows)
 
 
+def base_of(options: argparse.Namespace) -> Settings:
+    """All settings but n and the tree."""
+    return Settings() if options.ours else Settings(**PRESETS["one-class-paper"])
+
+
 if __name__ == "__main__":
     parser = accuracy_command(__doc__, kept=False)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256], help="n (default: %(default)s)")
     parser.add_argument("--ours", action="store_true", help="with our settings in place of the paper's")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options, base_of(options))

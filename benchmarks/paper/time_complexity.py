@@ -110,4 +110,4 @@ if __name__ == "__main__":
     parser.add_argument("--points", type=int, default=8192, help="at most (default: %(default)s)")
     parser.add_argument("--plot", type=Path, default=Path("out/time_complexity.png"), help="(default: %(default)s)")
     options = parser.parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

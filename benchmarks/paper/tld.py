@@ -46,4 +46,4 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 if __name__ == "__main__":
     options = accuracy_command(__doc__).parse_args()
-    publish(figures(options), options.json)
+    publish(figures(options), options)

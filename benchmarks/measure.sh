@@ -1,0 +1,27 @@
+#!/usr/bin/env bash
+# Measures what depends on time, on a quiet machine, and writes the records and docs/results.md: 20 minutes.
+# PYTHON has the contrib modules of OpenCV 4, for CSRT and KCF; TRACKING_DATA is the folder of sequences.
+set -eu
+cd "$(dirname "$0")/.."
+python=${PYTHON:-.venv/bin/python}
+unset OPENBLAS_NUM_THREADS OMP_NUM_THREADS  # as in a process of a user
+catstream=$(dirname "$python")/catstream
+
+measure() { # NAME SCRIPT [OPTION...]: benchmarks/results/NAME.json
+    local name=$1 began=$SECONDS
+    shift
+    "$@" --json "benchmarks/results/$name.json"
+    echo "== $name: $((SECONDS - began)) s"
+}
+
+measure startup "$python" benchmarks/startup.py --runs 3
+measure throughput "$python" benchmarks/throughput.py --runs 2
+measure kernels "$python" benchmarks/kernels.py
+measure wire "$python" benchmarks/wire.py
+measure endurance "$python" benchmarks/endurance.py --frames 6000
+measure subscribers "$python" benchmarks/subscribers.py --frames 1500 --runs 1
+measure resume "$python" benchmarks/resume.py --moments 8
+measure loadtest "$catstream" loadtest --streams 2 --duration 20
+measure loadtest-limit "$catstream" loadtest --find-limit --duration 8
+measure speed "$python" benchmarks/speed.py --frames 60
+"$python" benchmarks/page.py
