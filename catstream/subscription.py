@@ -17,6 +17,7 @@ from typing import Generic, Literal, Self, TypeVar, overload
 
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
+from catstream.wire.announced import Announcement
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.readable import readable
@@ -40,18 +41,21 @@ Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features | 
 
 
 class Gaps:
-    """Counts messages of a stream that never came, by what is missing between their `seq`.
+    """Counts messages of a stream that never came, by what is missing between their `seq`, which begins with 1.
 
-    missed  so far; who comes late has missed nothing, and a restarted sender may go back
+    missed  since the first that came; a restarted sender may go back
+    before  those before the first that came
     """
 
     def __init__(self) -> None:
-        self.missed = self._seq = 0
+        self.missed = self.before = self._seq = 0
 
     def take(self, seq: int) -> None:
-        """The next message that came, or the end."""
+        """Count what is missing before the next message that came, or before the end."""
         if self._seq:
             self.missed += max(0, seq - self._seq - 1)
+        else:
+            self.before = max(0, seq - 1)
         self._seq = seq
 
 
@@ -60,21 +64,26 @@ class Subscription(Generic[Message]):
 
     Tracks and features come one a frame, a restarted detector may repeat some. Of models, samples, previews and the
     health of each process the last one comes at once, then each that is the newest when it is
-    taken. Before the pipeline is there, and while it is away, it waits.
+    taken. At an endpoint that is named, it may be there before the pipeline: it waits, and gets every message from the
+    first one on, as the pipeline begins once it is connected (on the same machine, of the same user).
 
     Attributes
     ----------
-    missed : tracks or features that never came, as the gaps in `seq` tell: this reader was too slow, or away
-    refused : messages that were dropped because they were not what the channel carries
-    end : the pipeline's `End`, None before it
-    endpoint, keys : where it is attached, and with which
+    end : End or None
+        The pipeline's last message, None before it.
+    endpoint : str
+        Where it is attached.
+    keys : str
+        Folder of the keys that it connects with, empty without.
+    timeout : float or None
+        Seconds without a message after which iterating raises `SilenceError`.
 
     Raises
     ------
     SilenceError
-        While iterating, where nothing came for as long as `timeout` says. It may be iterated on.
+        While iterating, if nothing came for as long as `timeout` says. It may be iterated on.
     ServiceError
-        While iterating, where the pipeline does not let these keys in.
+        While iterating, if the pipeline does not let these keys in.
     """
 
     def __init__(self, endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> None:
@@ -89,14 +98,26 @@ class Subscription(Generic[Message]):
         self._what, self._channel, self._gaps = channel, CHANNELS[_OPEN[channel]], Gaps()
         self._newest: dict[str, float] = {}  # of each process that sends: what was taken last
         self._closing = float("inf")  # when to wait no more
-        self._messages = Subscriber(self._channel.name, place)
+        # A pipeline that begins here later waits until this subscription has come in.
+        self._waits = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
+        self._messages = Subscriber(self._channel.name, place, reader=self._waits.reader if self._waits else "")
         # By itself: a reader that is so slow that messages are dropped would miss the end among them.
         self._ends = Subscriber("tracks", place, only=End)
 
     @property
     def missed(self) -> int:
-        """Tracks or features that never came: this reader was too slow, or away."""
-        return self._gaps.missed
+        """Tracks or features of the run that never came here: before it was attached, or because it was too slow."""
+        return self._gaps.missed + self._gaps.before
+
+    @property
+    def missed_before(self) -> int:
+        """How many of those were sent before it was attached."""
+        return self._gaps.before
+
+    def losses(self) -> str:
+        """What is missing, for a person to read."""
+        before = f", {self.missed_before} of them before this began to listen" if self.missed_before else ""
+        return f"{self.missed} missed{before}"
 
     @property
     def refused(self) -> int:
@@ -105,6 +126,7 @@ class Subscription(Generic[Message]):
 
     def close(self) -> None:
         """Attach no more."""
+        self._attached()
         self._messages.close()
         self._ends.close()
 
@@ -149,12 +171,18 @@ class Subscription(Generic[Message]):
                     self.end, self._closing = message, 0.0
                     return None
             elif message is not None and self._new(message):
+                self._attached()
                 return message
         while self._ends.pending():
             end = self._ends.receive(0)
             if self.end is None and end is not None:
                 self.end, self._closing = end, monotonic() + _LAST_WORDS
         return None
+
+    def _attached(self) -> None:
+        """No pipeline has to wait for it any more."""
+        if self._waits is not None:
+            self._waits.close()
 
     def _new(self, message: Message) -> bool:
         """Whether it did not come before: a channel's last message is sent again when somebody new comes."""

@@ -38,7 +38,7 @@ async def show_tracks(endpoint: str) -> None:
             if track.state != state:
                 rr.log("state", rr.TextLog(track.state))
                 state = track.state
-        print(f"{count} tracks, {tracks.missed} missed: {tracks.end.reason}")
+        print(f"{count} tracks, {tracks.losses()}: {tracks.end.reason}")
 
 
 async def show_pictures(endpoint: str) -> None:

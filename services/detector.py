@@ -20,6 +20,7 @@ from catstream.services.previews import Previews
 from catstream.video.ahead import ahead
 from catstream.video.frames import Frame, Source, without_password
 from catstream.video.source import WHOLE, open_source
+from catstream.wire.announced import readers_of
 from catstream.wire.sockets import Publisher, Sender, Subscriber
 
 __all__ = ["main"]
@@ -30,6 +31,7 @@ _OPEN_SECONDS = 60.0  # that opening the source may take, and learning the first
 _SKIP_SECONDS = 0.1  # that decoding a frame may take which is passed over
 _HELD_SECONDS = 0.02  # from one look at the commands to the next while a frame is held
 _LONGEST_SOURCE = 1000  # characters of it that are told with the health
+_SUBSCRIBERS_SECONDS = 5.0  # that subscribers that wait for this pipeline may take to connect
 _OWNER_SECONDS = 0.5  # the owner may listen no more
 
 _log = logging.getLogger(__name__)
@@ -76,8 +78,7 @@ def main(
         detector = Detector(process.settings)
         helm = stack.enter_context(Helm(process.endpoint, detector, orders, file))
         line = _Line(process, stack, helm, owned)
-        if recorded:
-            line.wait_for_listener()
+        line.wait_for_subscribers(recorded)
         if resume:
             kalman.prepare()  # while the others say where they are
             line.resume(detector, learned)
@@ -184,11 +185,19 @@ class _Line:
         """Why no frame is followed any more, empty before."""
         return "it was stopped" if self._process.ended else self._helm.over
 
-    def wait_for_listener(self) -> None:
-        """Wait until somebody listens to the tracks."""
-        while not self._tracks.heard:
+    def wait_for_subscribers(self, recorded: bool) -> None:
+        """Wait for the recorder, however long it takes, and a few seconds for subscribers that announced themselves."""
+        publishers = {"tracks": self._tracks, "lessons": self._lessons}
+        for channel, readers in readers_of(self._process.endpoint).items():
+            if channel in publishers:
+                publishers[channel].expect(readers)
+        deadline = time.monotonic() + _SUBSCRIBERS_SECONDS
+        while (recorded and not self._tracks.heard) or (
+            time.monotonic() < deadline and not all(publisher.complete for publisher in publishers.values())
+        ):
             self._features.listen(0.02)
-            self._tracks.welcome()
+            for publisher in publishers.values():
+                publisher.welcome()
             self._turn()
 
     def resume(self, detector: Detector, learned: Learned | None) -> None:

@@ -26,6 +26,7 @@ class Recorder:
     ----------
     writer : of the recording; the caller closes it
     endpoint : where the pipeline runs
+    reader : name by which its subscription to the tracks was announced, empty if it was not
 
     Attributes
     ----------
@@ -33,14 +34,17 @@ class Recorder:
     failed : why nothing is written any more; empty while all is well
     """
 
-    def __init__(self, writer: RecordingWriter, endpoint: Endpoint) -> None:
+    def __init__(self, writer: RecordingWriter, endpoint: Endpoint, reader: str = "") -> None:
         self.end: End | None = None
         self.failed = ""
         self._writer = writer
         self._last: dict[str, tuple[float, ...]] = {}  # of the models, and of each process's health
         with ExitStack() as stack:
-            names = ("tracks", "models", "health")
-            self._channels = [stack.enter_context(Subscriber(name, endpoint, every=True)) for name in names]
+            known = {"tracks": reader, "models": "", "health": ""}
+            self._channels = [
+                stack.enter_context(Subscriber(name, endpoint, every=True, reader=reader))
+                for name, reader in known.items()
+            ]
             self._stack = stack.pop_all()
 
     def listen(self) -> None:

@@ -15,7 +15,8 @@ from catstream.messages import End, Features, Run
 from catstream.recording.file import Recording, RecordingWriter
 from catstream.services.recorder import Recorder
 from catstream.subscription import knock
-from catstream.wire.endpoint import Endpoint
+from catstream.wire.announced import Announcement
+from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.sockets import Subscriber
 
 __all__ = ["record"]
@@ -44,22 +45,26 @@ def record(output: Path, endpoint: str, keys: str) -> None:
       catstream record --output walk.rec --endpoint run
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    place = knock(endpoint, keys)
-    with suppress(KeyboardInterrupt):
-        _record(output, place, Console(stderr=True))
+    place = find(endpoint, keys)
+    with (
+        Announcement(place, ("lessons", "tracks")) as waits,
+        Subscriber("lessons", place, reader=waits.reader) as lessons,
+    ):
+        knock(endpoint, keys)
+        with suppress(KeyboardInterrupt):
+            _record(output, place, lessons, waits.reader)
     if output.exists():
         click.echo(f"{output}: {Recording(output)}", err=True)
 
 
-def _record(output: Path, place: Endpoint, console: Console) -> None:
+def _record(output: Path, place: Endpoint, lessons: Subscriber, reader: str) -> None:
     with ExitStack() as stack:
-        status = stack.enter_context(console.status("waiting for the settings of the pipeline"))
-        lessons = stack.enter_context(Subscriber("lessons", place))
+        status = stack.enter_context(Console(stderr=True).status("waiting for the settings of the pipeline"))
         while not isinstance(run := lessons.receive(0.1), Run):
             if isinstance(run, End):
                 raise RecordingError(f"nothing was recorded, as the pipeline has just ended: {run.reason}")
         writer = stack.enter_context(RecordingWriter(output, run))
-        recorder = stack.enter_context(Recorder(writer, place))
+        recorder = stack.enter_context(Recorder(writer, place, reader))
         seq, last, deadline = 0, None, float("inf")
         while (last is None or recorder.end is None) and time.monotonic() < deadline:
             message = lessons.receive(0.05)

@@ -82,7 +82,7 @@ def sink(
                 status.update(f"frame {newest}, {tracks.missed} missed")
         if tracks.end is not None:
             reason = f": {tracks.end.reason}"
-        click.echo(f"{written} tracks, {tracks.missed} missed{reason}", err=True)
+        click.echo(f"{written} tracks, {tracks.losses()}{reason}", err=True)
     if columns is not None:
         parquet.export(databases[0], columns)
 

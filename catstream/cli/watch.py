@@ -148,7 +148,7 @@ def watch(channel: str, endpoint: str, keys: str, as_json: bool, count: int | No
                 if seen == count:
                     break
         reason = f": {messages.end.reason}" if messages.end is not None else ""
-        click.echo(f"{seen} {channel}, {messages.missed} missed{reason}", err=True)
+        click.echo(f"{seen} {channel}, {messages.losses()}{reason}", err=True)
 
 
 def _print_json(message: Any) -> None:

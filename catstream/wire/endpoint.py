@@ -24,7 +24,7 @@ from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS, Channel
 from catstream.wire.keys import Keys
 
-__all__ = ["Endpoint", "find", "meeting_place", "private_folder", "running"]
+__all__ = ["Endpoint", "find", "homes", "meeting_place", "private_folder", "running"]
 
 _LONGEST_PATH = 107  # bytes that the kernel takes for the name of a Unix socket
 _PREFIX = "catstream-"  # of private folders
@@ -171,7 +171,7 @@ def _file(channel: Channel, sender: str) -> str:
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
     """A fresh folder that only this user may enter, gone afterwards; those of processes that were killed go with it."""
-    home = _homes()[0]
+    home = homes()[0]
     _sweep(home)
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=home))
     with (folder / ".mark").open("w") as mark:
@@ -262,7 +262,7 @@ def _noted(endpoint: Endpoint, folder: Path, source: str) -> Iterator[None]:
 def running() -> list[Endpoint]:
     """Where this user's pipelines run, in no order."""
     endpoints = []
-    for home in set(_homes()):
+    for home in set(homes()):
         for path in home.glob(f"{_PREFIX}*/{_NOTE}"):
             with contextlib.suppress(OSError), path.open() as note:  # it may be gone by now, or another user's
                 text = note.read()
@@ -330,7 +330,7 @@ def _follows(endpoint: Endpoint, source: str) -> bool:
     return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
 
 
-def _homes() -> list[Path]:
+def homes() -> list[Path]:
     """Where private folders are made, the best place first: a pipeline of a timer has no runtime folder."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     return [Path(home) for home in (runtime, tempfile.gettempdir()) if os.access(home, os.W_OK)]

@@ -23,7 +23,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from time import monotonic
 from typing import Any, Self
 
@@ -48,6 +48,7 @@ _SAMPLES = 65536  # that a sender remembers, at most one a message: as many as `
 _COMMANDS = 64  # that wait, or were answered last, and that are taken in at once
 _CHANGES = 1000  # readers that come or go, taken in at once
 _LONGEST_WISH = 4096  # bytes of what a reader says: who it is, and what it subscribes to
+_READER = b"\xffreader "  # begins the topic by which a subscriber is known that announced itself; no message does
 _HANDSHAKE = 5000  # milliseconds that a peer has to say who it is
 
 #: What ZeroMQ tells of a connection, where it is asked to.
@@ -428,6 +429,7 @@ class Publisher(_Socket):
         self._socket.maxmsgsize = _LONGEST_WISH
         self._openings = {b"", *map(opening, row.messages)}  # what readers may subscribe to
         self._wanted: set[bytes] = set()  # what messages must begin with for somebody to get them
+        self._expected: set[bytes] = set()  # topics of announced subscribers that are not connected yet
         self._last: bytes | None = None if greeting is None else encode(greeting)
         self._repeat = float("inf")  # when the last message is due once more
         self._newest = newest
@@ -450,6 +452,15 @@ class Publisher(_Socket):
         """Whether somebody listened when `send` or `welcome` was last called."""
         return bool(self._wanted)
 
+    def expect(self, readers: Iterable[str]) -> None:
+        """Name the announced subscribers that are to be connected before the first message."""
+        self._expected = {_READER + reader.encode() for reader in readers}
+
+    @property
+    def complete(self) -> bool:
+        """Whether all that were expected were connected when `welcome` was last called."""
+        return not self._expected
+
     def welcome(self) -> None:
         """Send the greeting, or the last message, to those who came since or missed it; call it now and then."""
         self._look()
@@ -459,7 +470,9 @@ class Publisher(_Socket):
                 change = self._socket.recv(zmq.NOBLOCK)
             except zmq.Again:
                 break
-            if change[1:] not in self._openings:
+            if change[1:].startswith(_READER):
+                self._expected.discard(change[1:])
+            elif change[1:] not in self._openings:
                 self._drop("subscription", "readers subscribe to everything, or to one kind")
             elif change.startswith(b"\x01"):
                 late = True
@@ -478,14 +491,19 @@ class Subscriber(_Socket):
     ----------
     only : the one kind of message to receive; all where None
     every : take also those that are not the newest, as far as they come
+    reader : name by which it announced that it waits, see `catstream.wire.announced`
     """
 
-    def __init__(self, channel: str, endpoint: Endpoint, only: type | None = None, *, every: bool = False) -> None:
+    def __init__(
+        self, channel: str, endpoint: Endpoint, only: type | None = None, *, every: bool = False, reader: str = ""
+    ) -> None:
         row = CHANNELS[channel]
         super().__init__(zmq.SUB, channel, endpoint, depth=row.depth if row.keeps == "every" else 16)
         if row.keeps == "newest" and len(row.senders) == 1 and not every:
             self._socket.conflate = True
         self._socket.subscribe(b"" if only is None else opening(only))  # the publisher sends nothing else
+        if reader:  # it comes in behind what is wanted: topics are sent in order, the empty one first
+            self._socket.subscribe(_READER + reader.encode())
         self._connect()
 
     def pending(self) -> bool:

@@ -13,7 +13,9 @@ import catstream
 from catstream.box import Box
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Run, Track
+from catstream.wire.announced import Announcement, readers_of
 from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
 
 
@@ -74,7 +76,7 @@ def test_each_gap_is_counted_also_the_one_before_the_end(endpoint, tracks):
         assert subscription.missed == 2 + 3 + 2
 
 
-def test_who_comes_late_has_missed_nothing_and_a_restarted_detector_takes_nothing_away(endpoint, tracks):
+def test_a_restarted_detector_takes_nothing_away(endpoint, tracks):
     with attached(endpoint, tracks) as subscription:
         for seq in (2, 3, 4, 2, 3, 4, 5):
             tracks.send(track(seq))
@@ -151,7 +153,9 @@ def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, un
         heard = list(subscription)
     assert [message.seq for message in heard] == [3, 4, 7]
     assert np.array_equal(heard[0].rows, features(3).rows)
-    assert subscription.missed == 2 + 1
+    assert subscription.missed == 2 + 2 + 1
+    assert subscription.missed_before == 2
+    assert subscription.losses() == "5 missed, 2 of them before this began to listen"
 
 
 def test_what_nobody_listens_to_is_not_even_made(endpoint, until):
@@ -214,3 +218,40 @@ def test_a_waiting_task_can_be_cancelled_and_hears_silence(endpoint, tracks):
 def test_a_channel_for_one_receiver_is_refused(endpoint, channel):
     with pytest.raises(ServiceError, match="one can subscribe to samples, models, tracks, health"):
         catstream.subscribe(str(endpoint), channel)
+
+
+def test_who_hears_only_the_end_has_missed_all(endpoint, tracks, until):
+    with catstream.subscribe(str(endpoint), "tracks", timeout=20) as subscription:
+        until(lambda: tracks.heard, tracks.welcome)
+        tracks.send(End(61, "the source came to its end"))
+        assert list(subscription) == []
+        assert (subscription.missed, subscription.missed_before) == (60, 60)
+
+
+@pytest.mark.parametrize("channel", ["tracks", "features"])
+def test_a_subscriber_that_was_there_first_is_expected_until_it_is_connected(endpoint, until, channel):
+    with catstream.subscribe(str(endpoint), channel, timeout=20) as subscription:
+        (name, readers), *others = readers_of(endpoint).items()
+        assert not others
+        with Publisher(name, endpoint) as publisher:
+            publisher.expect(readers)
+            assert not publisher.complete
+            until(lambda: publisher.complete, publisher.welcome)
+            message = track(1) if channel == "tracks" else features(1)
+            publisher.send(message)
+            assert next(subscription).seq == 1
+        assert readers_of(endpoint) == {}, "it has heard the pipeline: no other one has to wait for it"
+
+
+def test_an_announcement_is_for_one_endpoint_and_ends_with_its_process(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    here, there = Endpoint.parse(str(folder)), Endpoint.parse("tcp://127.0.0.1:5700")
+    with Announcement(here, ["tracks"]) as waits:
+        assert readers_of(here) == {"tracks": {waits.reader}}
+        assert readers_of(there) == {}
+        monkeypatch.chdir(folder.parent)
+        assert readers_of(Endpoint.parse(folder.name)) == readers_of(here), "however the folder is named"
+    assert readers_of(here) == {}
+    (dead := tmp_path / "catstream-reader-0").write_text(f"{folder}\ntracks")
+    assert readers_of(here) == {}
+    assert not dead.exists()
