@@ -31,6 +31,9 @@ _LAST_WORDS = 0.5
 #: Seconds to wait for a sign of life: each process of a running pipeline is heard once a second.
 _PATIENCE = 5.0
 
+#: Seconds from one look at the connections to the next: they say if the pipeline does not let this reader in.
+_LOOK_SECONDS = 1.0
+
 #: What one can subscribe to, and its channel: of features, that of the copies.
 _OPEN = {
     **{name: name for name, channel in CHANNELS.items() if not channel.acknowledged and name != "lessons"},
@@ -148,7 +151,7 @@ class Subscription(Generic[Message]):
             for socket in (self._messages, self._ends):
                 poller.register(socket.fileno(), select.POLLIN)
             seconds = self._left(patience)
-            poller.poll(None if seconds is None else seconds * 1000)
+            poller.poll(seconds * 1000)
         return message
 
     def __aiter__(self) -> Self:
@@ -206,15 +209,15 @@ class Subscription(Generic[Message]):
     def _patience(self) -> float:
         return float("inf") if self.timeout is None else monotonic() + self.timeout
 
-    def _left(self, patience: float) -> float | None:
-        """Seconds to wait at most, None for any time; raises SilenceError where they are over."""
+    def _left(self, patience: float) -> float:
+        """Seconds to wait before it is looked again; raises SilenceError if the time is over."""
         now = monotonic()
         if now >= patience and self.end is None:
             raise SilenceError(
                 f"no {self._what} came from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
             )
-        until = min(patience if self.end is None else float("inf"), self._closing)
-        return None if until == float("inf") else max(0.0, until - now)
+        until = min(patience if self.end is None else float("inf"), self._closing, now + _LOOK_SECONDS)
+        return max(0.0, until - now)
 
 
 def _mark(message: Health | Model | Sample | Preview) -> tuple[str, float]:
@@ -268,7 +271,7 @@ def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys
     return Subscription(endpoint, channel, timeout=timeout, keys=keys)
 
 
-def knock(endpoint: str, keys: str = "") -> Endpoint:
+def knock(endpoint: str, keys: str = "", seconds: float = _PATIENCE) -> Endpoint:
     """Where a pipeline runs, once it is heard: tracks and models may be silent for long where one does.
 
     Raises
@@ -276,8 +279,8 @@ def knock(endpoint: str, keys: str = "") -> Endpoint:
     ServiceError
         Where `endpoint` is empty and not just one pipeline runs.
     SilenceError
-        Where none is heard within seconds.
+        If none is heard in time.
     """
-    with subscribe(endpoint, "health", timeout=_PATIENCE, keys=keys) as health:
+    with subscribe(endpoint, "health", timeout=seconds, keys=keys) as health:
         next(health, None)
         return Endpoint.parse(health.endpoint, health.keys)

@@ -51,7 +51,8 @@ def test_the_rerun_subscriber_writes_what_the_viewer_would_show(demo_video, tmp_
                 select.select([reader.stdout], [], [], 0.5)  # while it starts, few pass
         printed = reader.communicate(timeout=60)[0]
     assert reader.returncode == 0
-    assert re.fullmatch(r"[1-9]\d* tracks, (0 missed|(\d+) missed, \2 of them before .*): the source came to its end\n", printed)
+    losses = r"(0 missed|(\d+) missed, \2 of them before this began to listen)"
+    assert re.fullmatch(rf"[1-9]\d* tracks, {losses}: the source came to its end\n", printed)
     data = shown.read_bytes()
     assert data.startswith(b"RRF2")
     for entity in (b"/camera/object", b"/score", b"/model", b"/state", b"Boxes2D"):

@@ -10,11 +10,11 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from catstream.cli.attach import wait_for_pipeline
 from catstream.errors import RecordingError
 from catstream.messages import End, Features, Run
 from catstream.recording.file import Recording, RecordingWriter
 from catstream.services.recorder import Recorder
-from catstream.subscription import knock
 from catstream.wire.announced import Announcement
 from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.sockets import Subscriber
@@ -28,7 +28,8 @@ _END_SECONDS = 1.0  # between the end of the tracks and that of the features
 @click.option("--output", required=True, type=click.Path(path_type=Path), help="The file; it must not be there yet.")
 @click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
 @click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
-def record(output: Path, endpoint: str, keys: str) -> None:
+@click.option("--wait", default=30.0, metavar="SECONDS", help="To wait for a pipeline that has not begun.")
+def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
     """Keep what a running pipeline says, in one file, until it ends or Ctrl-C.
 
     Features, models, tracks and health are written as they come, with the
@@ -50,7 +51,7 @@ def record(output: Path, endpoint: str, keys: str) -> None:
         Announcement(place, ("lessons", "tracks")) as waits,
         Subscriber("lessons", place, reader=waits.reader) as lessons,
     ):
-        knock(endpoint, keys)
+        wait_for_pipeline(endpoint, keys, wait)
         with suppress(KeyboardInterrupt):
             _record(output, place, lessons, waits.reader)
     if output.exists():

@@ -9,13 +9,14 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from catstream.cli.attach import wait_for_pipeline
 from catstream.extras import need
 from catstream.messages import Run
 from catstream.services.options import with_part
 from catstream.settings import Settings
 from catstream.sinks import parquet
 from catstream.sinks.sink import open_sink
-from catstream.subscription import knock, subscribe
+from catstream.subscription import subscribe
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Subscriber
 
@@ -28,11 +29,18 @@ _RUN_SECONDS = 1.0  # that a detector which follows frames may take to say what 
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
 @click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
+@click.option("--wait", default=30.0, metavar="SECONDS", help="To wait for a pipeline that has not begun.")
 @click.option("--source", metavar="SOURCE", help="What the pipeline follows, for an MP4.")
 @click.option("--parquet", "columns", type=click.Path(path_type=Path), help="Export the database to this at the end.")
 @with_part
 def sink(
-    files: tuple[Path, ...], endpoint: str, keys: str, source: str | None, columns: Path | None, part: slice
+    files: tuple[Path, ...],
+    endpoint: str,
+    keys: str,
+    wait: float,
+    source: str | None,
+    columns: Path | None,
+    part: slice,
 ) -> None:
     """Write the tracks of a running pipeline to FILES, until it ends or Ctrl-C.
 
@@ -66,7 +74,7 @@ def sink(
     written, newest, reach, reason = 0, -1, 0, ""
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
-            place = knock(tracks.endpoint, tracks.keys)
+            place = wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
             sinks = [stack.enter_context(closing(open_sink(path, source, part))) for path in files]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in tracks:

@@ -19,8 +19,9 @@ from rich.table import Table
 from rich.text import Text
 
 from catstream.box import Box
+from catstream.cli.attach import wait_for_pipeline
 from catstream.messages import Features, Health, Model, Preview, Sample, Track
-from catstream.subscription import Subscription, knock, subscribe
+from catstream.subscription import Subscription, subscribe
 
 __all__ = ["watch"]
 
@@ -108,9 +109,10 @@ _CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
 @click.argument("channel", type=click.Choice(list(_CELLS)))
 @click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
 @click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
+@click.option("--wait", default=30.0, metavar="SECONDS", help="To wait for a pipeline that has not begun.")
 @click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
 @click.option("--count", type=click.IntRange(min=1), help="End after so many messages.")
-def watch(channel: str, endpoint: str, keys: str, as_json: bool, count: int | None) -> None:
+def watch(channel: str, endpoint: str, keys: str, wait: float, as_json: bool, count: int | None) -> None:
     """Show what a running pipeline says, until it ends or Ctrl-C.
 
     The pipeline does not wait: what this reader was too slow for is counted as
@@ -135,7 +137,7 @@ def watch(channel: str, endpoint: str, keys: str, as_json: bool, count: int | No
     seen = 0
     with subscribe(endpoint, channel, keys=keys) as messages:  # type: ignore[call-overload]
         with suppress(KeyboardInterrupt), ExitStack() as stack:
-            knock(messages.endpoint, messages.keys)
+            wait_for_pipeline(messages.endpoint, messages.keys, wait)
             if as_json:
                 show = _print_json
             elif Console().is_terminal:

@@ -13,8 +13,8 @@ class _HasFileno(Protocol):
     def fileno(self) -> int: ...
 
 
-async def readable(sockets: Sequence[_HasFileno], seconds: float | None) -> None:
-    """Return once something may have come at one of these sockets, or after so many seconds; None for any time."""
+async def readable(sockets: Sequence[_HasFileno], seconds: float) -> None:
+    """Return once something may have come at one of these sockets, or after so many seconds."""
     loop, came = asyncio.get_running_loop(), asyncio.Event()
     handles = [socket.fileno() for socket in sockets]
     for handle in handles:

@@ -60,6 +60,8 @@ _EVENTS = (
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
 
+_OTHER_MECHANISM = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH: one side has keys, the other has none
+
 _NUMBERS = itertools.count(1)  # of sockets that are told of connections
 
 
@@ -115,7 +117,7 @@ class _Socket:
         if (keys := self._endpoint.keys) is not None:
             self._socket.curve_serverkey = keys.server
             self._socket.curve_publickey, self._socket.curve_secretkey = keys.public, keys.secret
-            self._watch()
+        self._watch()
         for sender in self.channel.senders:
             self._socket.connect(self._endpoint.address(self.channel, sender))
 
@@ -166,10 +168,11 @@ class _Socket:
         Raises
         ------
         ServiceError
-            Where this end connects, and its key is not let in: ZeroMQ does not try again.
+            If this end connects, and is not let in: its key may not take part, or it has none where keys are asked for.
         """
         while self._events is not None and self._events.poll(milliseconds):
-            event = recv_monitor_message(self._events)["event"]
+            told = recv_monitor_message(self._events)
+            event = told["event"]
             if event == zmq.EVENT_DISCONNECTED:
                 self._left = True
                 if self._listens:
@@ -180,6 +183,11 @@ class _Socket:
                         f"{self._endpoint} does not let this key take part in {self.channel.name}: "
                         "ask who runs it for one that may (catstream keys allow)"
                     )
+            elif told["value"] == _OTHER_MECHANISM and not self._listens and self._endpoint.keys is None:
+                raise ServiceError(
+                    f"the pipeline at {self._endpoint} asks for keys, and none were given: give a folder of keys "
+                    "that it lets in (--keys DIR, see catstream keys)"
+                )
             elif event != zmq.EVENT_MONITOR_STOPPED and self._listens:
                 needed = "does not speak ZeroMQ" if self._endpoint.keys is None else "has not the pipeline's keys"
                 refuse(self.channel.name, "handshake", f"a stranger was turned away: it {needed}")

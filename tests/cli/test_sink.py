@@ -77,7 +77,7 @@ def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the
 
 
 def test_where_no_pipeline_is_heard_no_file_is_left(said, tmp_path):
-    code, _, errors = said("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path)
+    code, _, errors = said("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path, "--wait", 1)
     assert code == 1
     assert "is a pipeline running there?" in errors
     assert not (tmp_path / "tracks.csv").exists()

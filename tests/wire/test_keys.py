@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import zmq
 
-from catstream.errors import ServiceError
+import catstream
+from catstream.errors import ServiceError, SilenceError
 from catstream.messages import Answer, Command, End, Health, Model, Position, Preview, Run, Sample, Track
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import encode
@@ -311,3 +312,21 @@ def test_sockets_with_keys_come_and_go_as_they_like(place, until):
         heard = []
         until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.waiting())))
     assert heard[0] == track(1)
+
+
+@pytest.mark.parametrize("attach", ["subscribe", "control"])
+def test_a_client_without_keys_is_told_that_the_pipeline_asks_for_them(place, listener, attach, until):
+    listens = listener("tracks" if attach == "subscribe" else "control")
+    endpoint = str(place("none"))
+
+    def refused():
+        listens()
+        if attach == "subscribe":
+            with catstream.subscribe(endpoint, "tracks", timeout=0.2) as tracks, suppress(SilenceError):
+                next(tracks)
+        else:
+            with catstream.control(endpoint, timeout=0.2) as pipeline, suppress(SilenceError):
+                pipeline.pause()
+
+    with pytest.raises(ServiceError, match=r"asks for keys, and none were given.*--keys DIR"):
+        until(refused)

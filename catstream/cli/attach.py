@@ -1,0 +1,24 @@
+"""How a verb waits for the pipeline that it attaches to."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from catstream.subscription import knock
+from catstream.wire.endpoint import Endpoint
+
+__all__ = ["wait_for_pipeline"]
+
+
+def wait_for_pipeline(endpoint: str, keys: str, seconds: float) -> Endpoint:
+    """Where a pipeline runs, once one of its processes is heard; says so on a terminal while it waits.
+
+    Raises
+    ------
+    ServiceError
+        If `endpoint` is empty and not just one pipeline runs, or the pipeline does not let these keys in.
+    SilenceError
+        If none is heard in time.
+    """
+    with Console(stderr=True).status(f"waiting for a pipeline {endpoint and f'at {endpoint}'}"):
+        return knock(endpoint, keys, seconds)
