@@ -23,6 +23,7 @@ _POINT_SECONDS = 0.25
 _POINTS = 480  # two minutes
 _RATE_SECONDS = 2.0  # that frames a second are counted over
 _FRAMES = 4096  # whose arrival is remembered, until a model has learned from them
+_GROWING = ("sent", "rows")  # counters that only grow in one pipeline, of one object
 _FAREWELL_SECONDS = 3.0  # that the processes may still be heard after the end
 _TRACKS = 256  # that are kept until the picture of their frame is here
 _PICTURES = 8  # a page that asks for the last but one still gets it
@@ -55,8 +56,7 @@ class Board:
         self.learned_after: float | None = None
         self.film = Film()
         self.pictures: OrderedDict[int, Preview] = OrderedDict()
-        self._trees: dict[str, float] = {}  # what the compressor counted last
-        self._sent = 0.0  # frames that the detector has followed
+        self._last: dict[str, Health] = {}  # as `health`, and kept while the pipeline is silent
         self._model: Model | None = None
         self._since = 0  # first frame of the object that is followed
         self._points: deque[tuple[float | None, ...]] = deque(maxlen=_POINTS)
@@ -149,19 +149,17 @@ class Board:
         if isinstance(message, Track):  # a restarted detector goes on, or began before the first model
             over = self.track is not None and message.seq < self.track.seq and not message.model_version
             return over or self.standing == "ended"
-        if message.process != "detector" or self.standing not in ("ended", "gone"):
-            return False
+        before = self._last.get(message.process, message).counters
+        over = any(message.counters.get(name, 0.0) < before.get(name, 0.0) for name in _GROWING)
         late = self.standing == "ended" and now - self._ended > _FAREWELL_SECONDS
-        return late or message.counters.get("sent", 0.0) < self._sent
+        return late or (over and self.standing in ("ended", "gone"))
 
     def _hear(self, health: Health, now: float) -> None:
         self.health[health.process] = health
         heard = self.heard | {health.process: now}
         self.heard = {name: last for name, last in heard.items() if now - last <= SILENCE_SECONDS}
-        if health.process == "compressor":
-            self._trees = health.counters
-        elif health.process == "detector":
-            self.source, self._sent = health.source, health.counters.get("sent", 0.0)
+        self._last[health.process] = health
+        self.source = health.source or self.source
         if self.standing in ("waiting", "gone"):
             self.standing, self.reason = "running", ""
         self._point(now)
@@ -254,10 +252,11 @@ class Board:
         return [[value if value is None else round(value, 3) for value in point] for point in list(self._points)[-new:]]
 
     def _trees_part(self, _: int) -> dict[str, Any]:
+        counted = self._last["compressor"].counters if "compressor" in self._last else {}
         return {
-            "leaves": {tree: self._trees.get(f"{tree}_leaves") for tree in TREES},
-            "bytes": self._trees.get("bytes"),
-            "rows": self._trees.get("rows"),
+            "leaves": {tree: counted.get(f"{tree}_leaves") for tree in TREES},
+            "bytes": counted.get("bytes"),
+            "rows": counted.get("rows"),
         }
 
     def _film_part(self, _: int) -> dict[str, Any]:

@@ -87,9 +87,9 @@ def test_the_last_health_of_a_pipeline_is_not_taken_for_the_next_one(board):
     board.take(Health("detector", 1.0, {"sent": 7.0}), 9.0)
     board.take(End(2, "the source came to its end"), 10.0)
     board.take(Health("detector", 1.0, {"sent": 8.0}), 10.5)
-    board.take(Health("compressor", 1.0, {}), 20.0)
+    board.take(Health("compressor", 1.0, {}), 10.6)
     assert board.standing == "ended"
-    board.take(Health("detector", 2.0, {"sent": 9.0}), 20.0)
+    board.take(Health("compressor", 2.0, {}), 20.0)
     assert board.standing == "running"
 
 
@@ -106,7 +106,7 @@ def followed(board, facts, endpoint):
     told = {}
     board.attach(endpoint)
     board.take(Health("detector", 1.0, {"sent": 9.0}, source="first.mp4"), 0.0)
-    board.take(Health("compressor", 1.0, {"object_leaves": 3.0}), 0.0)
+    board.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 90.0}), 0.0)
     for frame in (50, 51):
         board.take(facts.track(frame, version=5), frame / 10)
         board.take(facts.model(5, frame=50), frame / 10)
@@ -125,6 +125,7 @@ FIRST_SIGNS = {
     "its track at another endpoint": ("b", False, lambda facts: facts.track(70, version=9)),
     "its track at the same endpoint after the end": ("a", True, lambda facts: facts.track(70, version=9)),
     "its health at the same endpoint after the end": ("a", True, lambda _: Health("detector", 2.0, {"sent": 0.0})),
+    "its trees at the same endpoint after the end": ("a", True, lambda _: Health("compressor", 2.0, {"rows": 0.0})),
     "its first track at the same endpoint": ("a", False, lambda facts: facts.track(0, version=0)),
 }
 
