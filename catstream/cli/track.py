@@ -16,6 +16,7 @@ from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli import INTERRUPTED
+from catstream.cli.serving import PORT, Address, AddressType, with_token
 from catstream.extras import need
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
@@ -33,7 +34,15 @@ _FOLDER = click.Path(path_type=Path)
 @click.option("--output", type=_FOLDER, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--record", type=click.Path(path_type=Path), help="File to record the run to: `catstream replay`.")
-@click.option("--view", type=int, is_flag=False, flag_value=8000, metavar="[PORT]", help="Serve a web page of it.")
+@click.option(
+    "--view",
+    type=AddressType(),
+    is_flag=False,
+    flag_value=str(PORT),
+    metavar="[[HOST:]PORT]",
+    help="Serve a web page of it.",
+)
+@with_token("view-")
 @click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
 @click.option("--state", type=_FOLDER, help="Folder to keep what was learned in, through power cuts.")
 @click.option("--resume", type=_FOLDER, help="Go on with what is kept in such a folder.")
@@ -50,7 +59,8 @@ def track(
     output: Path | None,
     video: bool,
     record: Path | None,
-    view: int | None,
+    view: Address | None,
+    token: str | None,
     lockstep: bool,
     state: Path | None,
     resume: Path | None,
@@ -93,6 +103,7 @@ def track(
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
       catstream track 0 --view
+      VIEW_TOKEN=$(openssl rand -hex 16) catstream track 0 --view 0.0.0.0:8000
       catstream track walk.mp4 --box 120,80,64,48 --output out --state kept
       catstream track --resume kept
     """
@@ -132,9 +143,10 @@ def track(
             if view is not None:
                 from catstream.web.server import Server
 
-                server = Server(pipeline.endpoint, pipeline.settings.keys, port=view)
+                server = Server(pipeline.endpoint, pipeline.settings.keys, host=view.host, port=view.port, token=token)
                 stack.enter_context(server.beside())
-                console.print(f"page: {server.url}", highlight=False)
+                for url in server.urls:
+                    console.print(f"page: {url}", highlight=False)
             if pipeline.waits:
                 where = f" --endpoint {pipeline.endpoint}"
                 console.print(f"it waits for a box: catstream set-box X,Y,W,H{where}", highlight=False)

@@ -2,30 +2,45 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
 import httpx
 
+TOKEN = "correct-horse-battery"
 
-def test_the_first_box_comes_from_the_page_and_the_run_goes_on_to_its_end(demo_video, folder, tmp_path, until):
+
+def test_the_first_box_comes_from_the_page_which_tells_of_the_end_of_the_run_and_its_own(
+    demo_video, folder, tmp_path, until
+):
     source, boxes = demo_video(40)
-    words = ["track", source, "--view", "0", "--output", tmp_path / "out", "--set", f"endpoint={folder}"]
+    words = ["track", source, "--output", tmp_path / "out", "--set", f"endpoint={folder}"]
+    page = ["--view", "127.0.0.1:0", "--view-token", TOKEN]
     with (
         subprocess.Popen(
-            [sys.executable, "-c", "from catstream.cli import main; main()", *map(str, words)],
+            [sys.executable, "-c", "from catstream.cli import main; main()", *map(str, words), *page],
             stderr=subprocess.PIPE,
             text=True,
         ) as run,
-        httpx.Client(timeout=60, verify=False) as browser,
+        httpx.Client(timeout=60, verify=False, headers={"Authorization": f"Bearer {TOKEN}"}) as browser,
     ):
         said = run.stderr.readline()
         assert said.startswith("page: http://127.0.0.1:")
-        url = said.split()[1]
+        url, _, token = said.split()[1].partition("#")
+        assert token == TOKEN
         until(lambda: browser.get(f"{url}readyz").status_code == 200)
-        command = {"verb": "set-box", "box": list(boxes[0])}
-        answer = until(lambda: browser.post(f"{url}control", json=command))
-        assert answer.json()["done"], answer.text
+        told = {}
+        with browser.stream("GET", f"{url}events") as events:
+            lines = events.iter_lines()
+            next(lines)
+            command = {"verb": "set-box", "box": list(boxes[0])}
+            answer = until(lambda: browser.post(f"{url}control", json=command))
+            assert answer.json()["done"], answer.text
+            for line in lines:
+                told |= json.loads(line.removeprefix("data: ")) if line.startswith("data: ") else {}
         run.communicate(timeout=120)
+    assert (told["status"]["standing"], told["status"]["source"], told["closed"]) == ("ended", str(source), True)
+    assert told["track"]["frame"] == 39
     assert run.returncode == 0
     assert len((tmp_path / "out" / "demo.txt").read_text().splitlines()) == 40
