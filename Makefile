@@ -12,7 +12,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo test test-slow lint format docs settings bench results lock clean fuzz audit
+.PHONY: help setup develop demo test test-slow lint format docs picture settings bench results lock clean fuzz audit
 
 help:  ## say what there is
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -25,7 +25,7 @@ $(READY): requirements.lock pyproject.toml
 		echo "catstream needs Python 3.11 or newer, '$(PYTHON)' is $$($(PYTHON) --version 2>/dev/null || echo missing):" \
 			"install one, or say where it is: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
 	@test -x $(BIN)/pip || .ci/step "making $(VENV) with $$($(PYTHON) --version)" $(PYTHON) -m venv --clear $(VENV)
-	@.ci/step "installing $$(grep -c '==' requirements.lock) packages, 900 MB on disk, about a minute" \
+	@.ci/step "installing $$(grep -c '==' requirements.lock) packages, 900 MB on disk: a minute or more" \
 		$(PIP) --require-hashes -r requirements.lock
 	@.ci/step "installing catstream itself" $(PIP) --no-deps --no-build-isolation --editable .
 	@.ci/step "compiling kernels, once" $(BIN)/python -c 'import catstream.detection.detector'
@@ -34,7 +34,7 @@ $(READY): requirements.lock pyproject.toml
 develop: $(TOOLS)  ## add what tests and checks need, from requirements-dev.lock
 
 $(TOOLS): $(READY) requirements-dev.lock
-	@.ci/step "installing $$(grep -c '==' requirements-dev.lock) packages for tests, 800 MB on disk, about a minute" \
+	@.ci/step "installing $$(grep -c '==' requirements-dev.lock) packages for tests, 600 MB on disk: a minute or more" \
 		$(PIP) --require-hashes -r requirements-dev.lock -r requirements.lock
 	@touch $@
 
@@ -59,6 +59,9 @@ format: $(TOOLS)  ## put style right where that needs no thought
 
 docs: $(TOOLS)  ## the documentation, into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+picture: $(READY)  ## make the animated picture of README.md anew
+	@$(BIN)/python .ci/picture
 
 settings: $(TOOLS)  ## write the table of docs/settings.md anew
 	$(BIN)/python tests/test_docs.py

@@ -1,6 +1,6 @@
 """A running pipeline in the Rerun viewer: pictures, box, score, state and model, frame by frame.
 
-    pip install 'catstream[rerun]'
+    pip install "catstream[rerun]"
     catstream track walk.mp4 --box 120,80,64,48 --set endpoint=run
     python examples/rerun_subscriber.py run
     python examples/rerun_subscriber.py run --save walk.rrd

@@ -7,22 +7,31 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 import yaml
 
 from catstream.box import Box
+from catstream.cli import group
+from catstream.errors import CatstreamError
 from catstream.messages import Health
 from catstream.services.__main__ import main
+from catstream.services.start import environment, service_command
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
+from catstream.subscription import subscribe
+from catstream.web.server import Server
+from catstream.wire import keys
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
 
 ROOT = Path(__file__).parents[1]
 SERVICES = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
+WITH_KEYS = yaml.safe_load((ROOT / "docker-compose.keys.yml").read_text())["services"]
 IMAGE = (ROOT / "services" / "Dockerfile").read_text()
 PROCESSES = pytest.mark.parametrize("name", NAMES)
 
@@ -38,32 +47,82 @@ def filled_in(text, **variables):
     return re.sub(r"\$\{(\w+)(?:(:[-?])([^}]*))?\}", value, text)
 
 
+@contextmanager
+def ended(process):
+    """Ends a process with the `with`."""
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def words(name):
+    """The command line of a service, with its variables replaced."""
+    return [filled_in(word, SOURCE="walk.mp4", BOX="1,2,30,40") for word in SERVICES[name]["command"]]
+
+
 def parsed(name):
     """What the command line of a service says, read by the parser of `catstream.services`."""
-    words = [filled_in(word, SOURCE="walk.mp4", BOX="1,2,30,40") for word in SERVICES[name]["command"]]
-    with main.make_context("catstream.services", list(words)) as context:
-        verb, command, rest = main.resolve_command(context, words)
+    with main.make_context("catstream.services", words(name)) as context:
+        verb, command, rest = main.resolve_command(context, words(name))
         return verb, command.make_context(verb, rest, parent=context).params
 
 
-def test_there_is_a_service_for_each_process_and_one_that_holds_the_network():
-    assert set(SERVICES) == {*NAMES, "network"}
+def settings(name):
+    """What a service runs with: its options over its environment."""
+    environment = SERVICES[name]["environment"]
+    return Settings.load(overrides=parsed(name)[1]["pairs"], environment=environment)
+
+
+def published(service):
+    """The addresses and the ports of this host that a service is reached at."""
+    for line in service["ports"]:
+        address, ports, _ = re.fullmatch(r"([\d.]+):([\d-]+):([\d-]+)", filled_in(line)).groups()
+        first, _, last = ports.partition("-")
+        yield from ((address, port) for port in range(int(first), int(last or first) + 1))
+
+
+def test_there_is_a_service_for_each_process_the_page_and_one_that_holds_the_network():
+    assert set(SERVICES) == {*NAMES, "view", "network"}
     assert {service["image"] for service in SERVICES.values()} == {"catstream"}
 
 
 @PROCESSES
 def test_each_process_accepts_its_command_line(name):
-    verb, options = parsed(name)
-    assert verb == name
-    Settings.load(overrides=options["pairs"], environment={})
+    assert parsed(name)[0] == name
 
 
-def test_all_meet_at_one_endpoint_inside_one_network_that_nobody_else_is_in():
-    (endpoint,) = {Settings.load(overrides=parsed(name)[1]["pairs"], environment={}).endpoint for name in NAMES}
+def test_all_meet_on_the_loopback_of_one_network_that_nobody_else_is_in():
+    (endpoint,) = {settings(name).endpoint for name in NAMES}
     assert Endpoint.parse(endpoint).host == "127.0.0.1"
-    assert {SERVICES[name]["network_mode"] for name in NAMES} == {"service:network"}
-    assert SERVICES["network"]["network_mode"] == "none"
-    assert not any("ports" in service for service in SERVICES.values())
+    assert {SERVICES[name]["network_mode"] for name in (*NAMES, "view")} == {"service:network"}
+
+
+def test_the_page_alone_is_published_on_this_host_alone():
+    assert {name for name, service in SERVICES.items() if "ports" in service} == {"network"}
+    assert list(published(SERVICES["network"])) == [("127.0.0.1", 8000)]
+
+
+def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
+    monkeypatch.setenv("VIEW_TOKEN", "0123456789abcdef")
+    service = SERVICES["view"]
+    assert (service["entrypoint"], service["profiles"]) == (["catstream"], ["view"])
+    assert set(service["environment"]) == {"VIEW_TOKEN"}
+    options = group.make_context("catstream", list(service["command"]))
+    verb, command, rest = group.resolve_command(options, service["command"])
+    page = command.make_context(verb, rest, parent=options).params
+    assert (page["endpoint"], page["port"]) == (settings("detector").endpoint, 8000)
+    server = Server(page["endpoint"], host=page["host"], port=0, token=page["token"])
+    script = service["healthcheck"]["test"][-1].replace(":8000", f":{urlsplit(server.url).port}")
+    with server.beside():
+        subprocess.run([sys.executable, "-P", "-c", script], check=True)
+
+
+def test_without_a_token_the_page_does_not_start():
+    token = filled_in(SERVICES["view"]["environment"]["VIEW_TOKEN"])
+    with pytest.raises(CatstreamError, match="token"):
+        Server("tcp://127.0.0.1:5700", host="0.0.0.0", port=0, token=token)
 
 
 def test_who_dies_goes_on_where_it_stopped():
@@ -74,18 +133,22 @@ def test_who_dies_goes_on_where_it_stopped():
 
 def test_the_video_is_mounted_read_only_and_named_by_the_user():
     _, options = parsed("detector")
-    assert options["source"] == "/videos/walk.mp4"
+    assert f"{SERVICES['detector']['working_dir']}/{options['source']}" == "/videos/walk.mp4"
     assert Box.of(options["box"]) == (1, 2, 30, 40)
     assert [filled_in(volume, VIDEOS="/films") for volume in SERVICES["detector"]["volumes"]] == ["/films:/videos:ro"]
     for name in ("SOURCE", "BOX"):
         assert f"${{{name}:?" in " ".join(SERVICES["detector"]["command"])
 
 
+def test_the_address_of_a_camera_is_taken_as_it_is():
+    assert filled_in(SERVICES["detector"]["command"][-1], SOURCE="rtsp://10.0.0.7/one") == "rtsp://10.0.0.7/one"
+
+
 @PROCESSES
 def test_the_health_check_hears_its_process_and_notices_silence(name):
-    command, program, flag, script, address = SERVICES[name]["healthcheck"]["test"]
-    assert (command, program, flag) == ("CMD", "python", "-c")
-    compose = Endpoint.parse(Settings.load(overrides=parsed(name)[1]["pairs"], environment={}).endpoint)
+    *command, script, address = SERVICES[name]["healthcheck"]["test"]
+    assert command == ["CMD", "python", "-P", "-c"]
+    compose = Endpoint.parse(settings(name).endpoint)
     assert address == compose.address(CHANNELS["health"], name)
 
     with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -99,6 +162,41 @@ def test_the_health_check_hears_its_process_and_notices_silence(name):
             health.welcome()
             time.sleep(0.01)
     assert hearing.returncode == 0
+
+
+def test_what_a_client_may_subscribe_to_is_published_on_this_host_alone_if_there_are_keys():
+    compose = Endpoint.parse(settings("detector").endpoint)
+    wanted = {
+        int(compose.address(channel, sender).rpartition(":")[2])
+        for channel in CHANNELS.values()
+        if channel.role in ("watch", "steer")
+        for sender in channel.senders
+    }
+    assert set(published(WITH_KEYS["network"])) == {("127.0.0.1", port) for port in wanted}
+
+
+def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, tmp_path, tcp, monkeypatch):
+    path, truth = demo_video(60)
+    keys.create(tmp_path / "pipeline")
+    keys.allow(tmp_path / "pipeline", "phone", "watch", tmp_path / "phone")
+    here = {"/keys": str(tmp_path), "/state": str(tmp_path / "state")}
+    here["tcp://0.0.0.0:5700"] = tcp.replace("127.0.0.1", "0.0.0.0")
+    monkeypatch.chdir(path.parent)
+    with ExitStack() as stack:
+        for name in NAMES:
+            variables = {**SERVICES[name]["environment"], **WITH_KEYS[name]["environment"]}
+            line = [filled_in(word, SOURCE=path.name, BOX=str(truth[0])) for word in SERVICES[name]["command"]]
+            for there, place in here.items():
+                variables = {key: value.replace(there, place) for key, value in variables.items()}
+                line = [word.replace(there, place) for word in line]
+            stack.enter_context(ended(subprocess.Popen(service_command(*line), env=environment() | variables)))
+        with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=60) as tracks:
+            assert next(tracks).box is not None
+        first = int(tcp.rpartition(":")[2])
+        *_, script, address = SERVICES["trainer"]["healthcheck"]["test"]
+        monkeypatch.setenv("CATSTREAM_KEYS", str(tmp_path / "pipeline"))
+        heard = address.replace("5707", str(first + 7))
+        subprocess.run([sys.executable, "-P", "-c", script, heard], check=True)
 
 
 def test_the_image_is_pinned_runs_the_processes_and_is_nobody_in_particular():

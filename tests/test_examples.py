@@ -36,7 +36,7 @@ def command(example):
 
 
 def test_the_rerun_subscriber_writes_what_the_viewer_would_show(demo_video, tmp_path):
-    pytest.importorskip("rerun", reason="rerun is missing: pip install 'catstream[rerun]'")
+    pytest.importorskip("rerun", reason='rerun is missing: pip install "catstream[rerun]"')
     (source, boxes), shown = demo_video(60), tmp_path / "walk.rrd"
     with (
         Pipeline(str(source), boxes[0], Settings(window=1)) as pipeline,
