@@ -135,10 +135,17 @@ def test_a_restarted_trainer_goes_on_learning(video, until):
     assert model.version > versions[30]
 
 
-def test_in_lockstep_the_tracks_are_those_of_one_process(video):
+@pytest.fixture(scope="module")
+def in_lockstep(video):
+    """Tracks of a run in which each frame waits for all learning from those before."""
     path, boxes = video
-    settings = Settings(lockstep=True)
-    tracker, expected = Tracker(settings), []
+    with Pipeline(path, boxes[0], Settings(lockstep=True)) as pipeline:
+        return list(pipeline)
+
+
+def test_in_lockstep_the_tracks_are_those_of_one_process(in_lockstep, video):
+    path, boxes = video
+    tracker, expected = Tracker(Settings(lockstep=True)), []
     with open_source(path) as source:
         for frame in source:
             if expected:
@@ -146,17 +153,15 @@ def test_in_lockstep_the_tracks_are_those_of_one_process(video):
             else:
                 tracker.init(frame.image, boxes[0], frame.time)
             expected.append(tracker.track)
-    with Pipeline(path, boxes[0], settings) as pipeline:
-        assert list(pipeline) == expected
+    assert in_lockstep == expected
 
 
-def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(video):
+def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(in_lockstep, video):
     path, boxes = video
     lag = 5
     with Pipeline(path, boxes[0], Settings(lag_frames=lag)) as pipeline:
         tracks = list(pipeline)
-    with Pipeline(path, boxes[0], Settings(lockstep=True)) as pipeline:
-        due = [track.model_version for track in pipeline]
+    due = [track.model_version for track in in_lockstep]
     assert due[-1] > 2
     late = [i for i in range(lag, len(tracks)) if tracks[i].model_version < due[i - lag]]
     assert not late
