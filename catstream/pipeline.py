@@ -353,6 +353,13 @@ class Pipeline:
         return self._box is None and self._model is None and self._kept is None
 
     @property
+    def complete(self) -> bool:
+        """Whether it is to go on with a run that has followed all frames; asked before it starts."""
+        if self._kept is None or self._state is None or self.frames is None or self.live:
+            return False
+        return self._start(self._state).seq >= self.frames
+
+    @property
     def holding(self) -> str:
         """Why no frame is followed though there are some, empty where they are: "paused", or "waiting" for a box."""
         told = self.health.get("detector", {})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from contextlib import ExitStack
@@ -16,6 +15,7 @@ from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli import INTERRUPTED
+from catstream.cli.interrupts import Interrupts
 from catstream.cli.serving import PORT, Address, AddressType, with_token
 from catstream.extras import need
 from catstream.messages import Track
@@ -131,10 +131,14 @@ def track(
         raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
     if resume is not None and output is not None:
         pipeline.after = last_position(output, pipeline.name)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup has it
-        signal.signal(signal.SIGHUP, signal.default_int_handler)
     console = Console(stderr=True, soft_wrap=True)
+    if resume is not None and pipeline.complete:
+        if box is not None:
+            raise click.UsageError(f"{_complete(pipeline, resume, output)}: no frame is left for a box")
+        console.print(_complete(pipeline, resume, output), highlight=False)
+        return
+    interrupts = Interrupts()
+    interrupts.install()
     run = _Run(pipeline)
     interrupted = False
     try:
@@ -155,8 +159,9 @@ def track(
             for found in pipeline:
                 # Not before there is something to write: a run that cannot start leaves older results alone.
                 sinks = sinks or _Sinks(stack, pipeline, output, video, resume is not None)
-                sinks.write(found)
-                run.show(progress, found)
+                with interrupts.held():  # a frame is in all results, and counted, or in none
+                    sinks.write(found)
+                    run.show(progress, found)
     except KeyboardInterrupt:
         interrupted = True
     finally:
@@ -164,10 +169,21 @@ def track(
             console.print(run.summary(output), highlight=False)
             if record is not None:
                 console.print(f"recording: {record}, {Recording(record)}", highlight=False)
+    if resume is not None and not run.frames and not interrupted:
+        console.print(f"no frame was left to follow: the run in {resume} is complete", highlight=False)
     if interrupted:
         go_on = f", go on with: catstream track --resume {state or resume}" if state or resume else ""
         console.print(f"stopped: the results so far are kept{go_on}", highlight=False)
         sys.exit(INTERRUPTED)
+
+
+def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
+    """Says that a run that is resumed has come to its end."""
+    results = f", its results are in {output}" if output is not None else ""
+    return (
+        f"the run in {resume} is complete, all {pipeline.frames} frames were followed{results}; "
+        "to follow the source again, begin a new run in another folder (--state DIR)"
+    )
 
 
 class _Sinks:

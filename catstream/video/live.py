@@ -70,6 +70,7 @@ class LiveSource(Source):
         self._problem = ""  # why it is lost, empty while it is not
         self._heard = monotonic()  # when the last frame came
         self._closed = False
+        self._was_there = idle is not None  # without it, a source that never was there is an error, and not lost
         self._thread = threading.Thread(target=self._read, name=f"reader of {self.name}", daemon=True)
         self._thread.start()
         self._first: Frame | None = None
@@ -183,12 +184,12 @@ class LiveSource(Source):
                 self.reopened += 1
                 _log.warning("the source %s is back after %.1f s", self.name, moment - self._heard)
             self.skipped += self._newest is not None
-            self._newest, self._heard, self._problem = (moment, decoded), moment, ""
+            self._newest, self._heard, self._problem, self._was_there = (moment, decoded), moment, "", True
             self._news.notify()
 
     def _lose(self, problem: str) -> None:
         """Say why, where that is news: a source may be away for days."""
-        if problem != self._problem and not self._closed:
+        if problem != self._problem and self._was_there and not self._closed:
             _log.warning("the source %s is lost (%s), and is opened again until it is back", self.name, problem)
         self._problem = problem
 

@@ -184,3 +184,18 @@ def test_a_terminal_that_is_lost_ends_a_run_like_ctrl_c(video, catstream, until,
     assert process.returncode == code, errors
     with open_source(tmp_path / "demo.mp4") as film:  # it may be short of the frame at which the signal came
         assert len(frames(tmp_path)) - sum(1 for _ in film) in (0, 1)
+
+
+def test_a_run_that_is_complete_is_not_resumed_and_says_so(video, said, tmp_path):
+    (source, box), kept, out = video, tmp_path / "kept", tmp_path / "out"
+    code, _, errors = said("track", source, "--box", box, "--end", 6, "--output", out, "--state", kept)
+    assert code == 0, errors
+    before = (out / "tracks.csv").read_bytes()
+    code, output, errors = said("track", "--resume", kept)
+    assert (code, output) == (0, "")
+    assert f"the run in {kept} is complete, all 6 frames were followed, its results are in {out}" in errors
+    code, _, errors = said("track", "--resume", kept, "--box", "1,2,30,40")
+    assert code == 2
+    assert "is complete" in errors
+    assert "no frame is left for a box" in " ".join(errors.split())
+    assert (out / "tracks.csv").read_bytes() == before

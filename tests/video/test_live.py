@@ -124,12 +124,13 @@ def test_a_camera_that_returns_with_other_pixels_is_scaled_to_the_first(camera):
         assert frame.image.shape == (96, 128, 3)
 
 
-def test_what_was_never_there_is_refused_and_its_password_not_shown(camera):
+def test_what_was_never_there_is_refused_and_its_password_not_shown(camera, caplog):
     cam = camera(numbered)
     cam.leave()
     with pytest.raises(VideoError, match=r"cannot open 'http://127.*connection refused.*check") as error:
         open_source(cam.url.replace("//", "//me:secr@t@"))
     assert "secr" not in str(error.value)
+    assert not caplog.records, "what never was there is not lost, and not opened again"
 
 
 def test_a_camera_that_this_machine_has_not_is_refused():

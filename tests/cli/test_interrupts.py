@@ -1,0 +1,53 @@
+"""Ctrl-C and its like, between frames and within one."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from catstream.cli.interrupts import Interrupts
+
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.fixture
+def interrupts():
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    one = Interrupts()
+    one.install()
+    yield one
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_frame_that_was_begun_is_in_all_results_before_the_run_ends(interrupts, number):
+    results, video = [], []
+
+    def follow():
+        for frame in range(10):
+            with interrupts.held():
+                results.append(frame)
+                if frame == 3:
+                    signal.raise_signal(number)
+                video.append(frame)
+
+    with pytest.raises(KeyboardInterrupt):
+        follow()
+    assert results == video == [0, 1, 2, 3]
+
+
+def test_between_frames_it_ends_at_once(interrupts):
+    with interrupts.held():
+        pass
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_what_a_shell_has_this_process_ignore_is_ignored(interrupts):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    interrupts.install()
+    signal.raise_signal(signal.SIGHUP)
