@@ -1,0 +1,51 @@
+"""Figures say what made them, and nothing of where that was."""
+
+from __future__ import annotations
+
+import json
+import platform
+import re
+import subprocess
+
+import pytest
+
+from catstream.evaluation import provenance as module
+from catstream.evaluation.provenance import machine, provenance
+from catstream.settings import Settings
+
+
+def test_figures_say_the_settings_that_are_not_the_default_and_the_command():
+    made = provenance(Settings(coreset_size=32), ["catstream", "evaluate", "walk", "--starts", "5"])
+    assert made["settings"] == ["coreset_size=32"]
+    assert made["command"] == "catstream evaluate walk --starts 5"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", made["date"])
+
+
+@pytest.mark.parametrize("word", ["/home/me/walk", "--data=/home/me/walk"])
+def test_a_command_names_no_folder_of_the_machine(word):
+    assert provenance(Settings(), ["catstream", word])["command"] == f"catstream {word.replace('/home/me/', '')}"
+
+
+def test_a_machine_is_told_by_what_it_computes_with_and_not_by_its_name():
+    told = machine()
+    assert {"processor", "cores", "memory_gb", "python", "opencv", "blas", "numpy"} <= told.keys()
+    assert platform.node() not in json.dumps(told)
+
+
+def test_the_commit_is_that_of_the_checkout_and_says_if_the_code_was_changed(tmp_path, monkeypatch):
+    def git(*words):
+        subprocess.run(["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", *words], check=True)
+
+    monkeypatch.setattr(module, "_ROOT", tmp_path)
+    assert provenance(Settings())["commit"] is None
+    for folder in ("catstream", "benchmarks/results"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "catstream" / "code.py").touch()
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    commit = provenance(Settings())["commit"]
+    (tmp_path / "benchmarks" / "results" / "speed.json").touch()
+    assert provenance(Settings())["commit"] == commit
+    (tmp_path / "catstream" / "code.py").write_text("changed")
+    assert provenance(Settings())["commit"] == f"{commit}-dirty"
