@@ -7,10 +7,6 @@ PIP := $(BIN)/pip install --quiet --quiet --disable-pip-version-check
 READY := $(VENV)/.ready
 TOOLS := $(VENV)/.tools
 
-# One BLAS thread a process: catstream's processes are the parallelism.
-export OPENBLAS_NUM_THREADS ?= 1
-export OMP_NUM_THREADS ?= 1
-
 .DEFAULT_GOAL := help
 .PHONY: help setup develop demo test test-slow lint format docs picture settings bench results lock clean fuzz audit
 

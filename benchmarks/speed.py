@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from statistics import median
 
@@ -27,8 +29,27 @@ PEERS = ("csrt", "kcf", "mil")
 SIZES = ((320, 240), (640, 480), (960, 720), (1280, 720), (1920, 1080))
 CORESETS = (16, 32, 64, 128, 256, 512)
 
+#: What a user writes. Says frames a second without decoding, and a checksum of the boxes.
+PROGRAM = """
+import sys, time, zlib, cv2, catstream
+video, tracker, check, seconds = cv2.VideoCapture(sys.argv[1]), catstream.Tracker(), 0, 0.0
+tracker.init(video.read()[1], sys.argv[2])
+while (read := video.read())[0]:
+    begin = time.perf_counter()
+    ok, box = tracker.update(read[1])
+    seconds += time.perf_counter() - begin
+    check = zlib.crc32(repr((ok, box)).encode(), check)
+print((tracker.track.seq - 1) / seconds, check)
+"""
+#: Its environment: as it is, and with one thread from the start.
+ENVIRONMENTS = {
+    "none": {},
+    "OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1": {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+}
+
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
+    yield own_program(options)
     yield beside_peers(options)
     yield steps([named(options, "TLD_01_david")])
     sizes, coresets, frames = (SIZES[:1], CORESETS[:1], 24) if options.quick else (SIZES, CORESETS, 300)
@@ -40,6 +61,29 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     rows = [(n, rate(frames, (640, 480), Settings(coreset_size=n))) for n in coresets]
     yield Table(
         "Frames/s against the size of the coreset", ("n", "640x480, local"), rows, "three processes, with decoding"
+    )
+
+
+def own_program(options: argparse.Namespace) -> Table:
+    """The Tracker in a program of a user, which sets nothing, and the same with one thread from the start."""
+    frames, runs = (24, 1) if options.quick else (300, 5)
+    sequence = rendered(frames, (352, 288))
+    box = ",".join(map(str, sequence.boxes[0].tolist()))
+    command = [sys.executable, "-P", "-c", PROGRAM, str(sequence.path / "demo.mp4"), box]
+    plain = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    found: dict[str, list[tuple[float, str]]] = {name: [] for name in ENVIRONMENTS}
+    for _ in range(runs):  # turn about, so that other work on the machine slows both alike
+        for name, variables in ENVIRONMENTS.items():
+            told = subprocess.run(
+                command, env=plain | variables, capture_output=True, text=True, check=True
+            ).stdout.split()
+            found[name].append((float(told[0]), told[1]))
+    rates = {name: median(rate for rate, _ in each) for name, each in found.items()}
+    same = len({check for each in found.values() for _, check in each}) == 1
+    rows = [(name, rate, rate / list(rates.values())[-1], "yes" if same else "no") for name, rate in rates.items()]
+    columns = ("variables set", "frames/s", "ratio", "all boxes the same")
+    return Table(
+        "Tracker in a user's program", columns, rows, f"352x288 pixels, {frames} frames, median of {runs} runs"
     )
 
 

@@ -11,7 +11,7 @@ Each command is asked again until it is answered, and carried out once.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from time import monotonic
 from typing import Self
@@ -49,13 +49,13 @@ class Control:
         self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
         self._commands = Requester("control", self._place)
 
-    def set_box(self, box: Sequence[float], *, keep: bool = False) -> Answer:
+    def set_box(self, box: str | Iterable[float], *, keep: bool = False) -> Answer:
         """Say where the object is in the newest frame: x, y, w, h in pixels.
 
         It is another object, and what was learned of the one before is forgotten; with `keep`
         it is the same one, found again for the tracker. A paused pipeline follows this frame, and stays paused.
         """
-        return self._ask("set-box", Box(*map(float, box)), keep)
+        return self._ask("set-box", Box.of(box), keep)
 
     def pause(self) -> Answer:
         """Stop taking frames; those of a live source pass by and are counted as skipped."""
