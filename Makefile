@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 TOOLS := $(VENV)/.tools
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo test test-slow lint format docs picture settings bench results lock clean fuzz audit
+.PHONY: help setup develop demo test test-slow lint format docs pythons picture settings bench results lock clean fuzz audit
 
 help:  ## say what there is
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -55,6 +55,9 @@ format: $(TOOLS)  ## put style right where that needs no thought
 
 docs: $(TOOLS)  ## the documentation, into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+pythons:  ## follow the demo on each Python of this machine that catstream supports
+	@.ci/pythons
 
 picture: $(READY)  ## make the animated picture of README.md anew
 	@$(BIN)/python .ci/picture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import sys
 from importlib.util import find_spec
@@ -31,9 +32,9 @@ def need(extra: str) -> None:
     feature, modules = EXTRAS[extra]
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
-        packages = " and ".join(missing)
-        verb = "is" if len(missing) == 1 else "are"
-        raise MissingExtraError(f"{feature} needs {packages}, which {verb} not installed: {install_command(extra)}")
+        raise MissingExtraError(
+            f"{feature} needs packages that are not installed ({', '.join(missing)}): {install_command(extra)}"
+        )
 
 
 def install_command(extra: str) -> str:
@@ -42,5 +43,5 @@ def install_command(extra: str) -> str:
     It is right for a checkout too: pip keeps the catstream that is there, and installs what the extra adds.
     """
     beside = Path(sys.executable).with_name("pip")
-    pip = "pip" if shutil.which("pip") == str(beside) else f"{sys.executable} -m pip"
+    pip = "pip" if shutil.which("pip") == str(beside) else f"{shlex.quote(sys.executable)} -m pip"
     return f'{pip} install "catstream[{extra}]"'

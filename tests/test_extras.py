@@ -40,7 +40,7 @@ def test_a_package_whose_extra_is_missing_says_the_command(monkeypatch, package,
     monkeypatch.setitem(sys.modules, EXTRAS[extra][1][0], None)
     for name in [name for name in sys.modules if name == package or name.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(MissingExtraError, match=rf'{EXTRAS[extra][0]} needs .* "catstream\[{extra}\]"'):
+    with pytest.raises(MissingExtraError, match=rf'{EXTRAS[extra][0]} needs packages .* "catstream\[{extra}\]"'):
         importlib.import_module(package)
 
 

@@ -1,0 +1,62 @@
+"""What `make demo` and `make test` set up: the lock files, the Pythons, the package."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+LOCKS = {name: (ROOT / name).read_text() for name in ("requirements.lock", "requirements-dev.lock")}
+
+
+def pinned(lock):
+    """The packages of a lock file, by name, with their versions."""
+    return dict(re.findall(r"^([A-Za-z0-9._-]+)==([^ ;]+)", LOCKS[lock], re.MULTILINE))
+
+
+def names(requirements):
+    """Names of what is required, without versions, and without catstream's own extras."""
+    found = {re.match(r"[\w.-]+", requirement)[0].lower() for requirement in requirements}
+    return found - {"catstream"}
+
+
+def test_what_runs_catstream_with_its_page_is_in_one_lock_and_what_tests_it_in_the_other():
+    project = PROJECT["project"]
+    extras = project["optional-dependencies"]
+    run, test = pinned("requirements.lock"), pinned("requirements-dev.lock")
+    assert names([*project["dependencies"], *extras["view"], *PROJECT["build-system"]["requires"]]) <= set(run)
+    assert names(extras["dev"]) <= set(run) | set(test)
+    assert not set(run) & set(test)
+    assert not {"pytest", "mypy", "mkdocs", "pyarrow"} & set(run)
+
+
+@pytest.mark.parametrize("lock", LOCKS)
+def test_a_lock_has_hashes_for_each_package_one_version_for_all_pythons_and_no_index(lock):
+    entries = re.split(r"^(?=\S+==)", LOCKS[lock], flags=re.MULTILINE)[1:]
+    assert all("--hash=sha256:" in entry for entry in entries)
+    assert len(entries) == len(pinned(lock))
+    assert "://" not in LOCKS[lock]
+
+
+def test_the_newest_python_that_is_named_and_the_oldest_are_those_that_are_allowed():
+    versions = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["project"]["classifiers"]))
+    assert PROJECT["project"]["requires-python"] == f">={versions[0]}"
+    assert f"{sys.version_info[0]}.{sys.version_info[1]}" in versions
+
+
+def test_building_the_package_warns_of_nothing_and_packs_the_page(tmp_path):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "catstream", "services"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    build = "import setuptools.build_meta as build; build.build_wheel('wheel')"
+    done = subprocess.run([sys.executable, "-c", build], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert not re.findall(r".*(?:Warning|absent from|deprecated).*", done.stdout + done.stderr)
+    (wheel,) = (tmp_path / "wheel").iterdir()
+    listed = subprocess.run([sys.executable, "-m", "zipfile", "-l", wheel], capture_output=True, text=True, check=True)
+    page = {f"catstream/web/page/{path.name}" for path in (ROOT / "catstream" / "web" / "page").iterdir()}
+    assert {*page, "catstream/services/__main__.py", "catstream/py.typed"} <= set(listed.stdout.split())
