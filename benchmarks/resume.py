@@ -74,8 +74,7 @@ def watched(arguments: list[str], out: Path, rows: int | None) -> float:
 
 def written(out: Path) -> int:
     """Rows that there are."""
-    table = out / "tracks.csv"
-    return max(table.read_text().count("\n") - 1, 0) if table.exists() else 0
+    return sum(max(table.read_text().count("\n") - 1, 0) for table in out.glob("*.csv"))
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def wait(process: subprocess.Popen[bytes], output: Path, version: int, begin: fl
     running = True
     while running:
         running = process.poll() is None
-        if any(found >= version for found in versions(output / "tracks.csv")):
+        if any(found >= version for found in versions(next(output.glob("*.csv"), output / "none"))):
             return time.perf_counter() - begin
         time.sleep(0.002)
     return None

@@ -51,7 +51,7 @@ class Learned:
         try:
             storage.write(path, arrays | model, facts)
         except OSError as error:
-            raise ServiceError(f"cannot write {str(path)!r} ({error}): give another file") from None
+            raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another file") from None
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:

@@ -19,12 +19,12 @@ from typing import Any, Self
 
 from catstream.box import Box
 from catstream.detection import COMPILING
-from catstream.errors import RecordingError, ServiceError, SettingsError, VideoError
+from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
 from catstream.learned import Learned
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.state import Origin, began, held, position
+from catstream.state import Origin, began, held, learned, position
 from catstream.video.frames import without_password
 from catstream.video.source import WHOLE, is_live, open_source
 from catstream.wire.endpoint import meeting_place, private_folder
@@ -82,6 +82,9 @@ class Pipeline:
         the last frame that was learned from: tracks of the last second may come again.
     notes : mapping of str to str
         Texts to keep with the state, for the program that goes on.
+    save_model : path
+        File to write what was learned to once the processes have ended, however the run ended: what
+        `catstream save` writes.
 
     Attributes
     ----------
@@ -128,6 +131,7 @@ class Pipeline:
         resume: str | os.PathLike[str] | None = None,
         after: Position | None = None,
         notes: Mapping[str, str] | None = None,
+        save_model: str | os.PathLike[str] | None = None,
     ) -> None:
         if state is not None and resume is not None:
             raise SettingsError("a run is begun in a folder (state) or goes on in one (resume): give one of them")
@@ -152,6 +156,7 @@ class Pipeline:
         self.source = str(source)
         self._box = Box.of(box) if box is not None else None
         self._record = None if record is None else Path(record)
+        self._save_model = None if save_model is None else Path(save_model)
         self._model = Path(model) if model is not None else None
         if self._box is not None and self._model is not None:
             raise SettingsError("a box says where the object is, with a model it is searched for: give one of them")
@@ -193,6 +198,8 @@ class Pipeline:
             self._results = stack.enter_context(Receiver("results", endpoint, start, self.settings.window))
             self._reports = stack.enter_context(Subscriber("health", endpoint))
             settings = replace(self.settings, endpoint=str(endpoint))
+            if self._save_model is not None:  # by the compressor's last checkpoint
+                stack.enter_context(_saved(self._save_model, state or folder, settings))
             supervisor = Supervisor(
                 self.source,
                 self._origin.box,
@@ -418,3 +425,17 @@ def _begun(folder: Path, kept: Origin | None, origin: Origin) -> Iterator[None]:
         if origin != kept:
             origin.save(folder)
         yield
+
+
+@contextmanager
+def _saved(path: Path, state: Path, settings: Settings) -> Iterator[None]:
+    """Write what was learned to a file afterwards; if the run failed, it is its error that is raised."""
+    try:
+        yield
+    except BaseException:
+        try:
+            learned(state, settings).save(path)
+        except CatstreamError as error:
+            _log.warning("%s", error)
+        raise
+    learned(state, settings).save(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import tempfile
 import zlib
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 
-__all__ = ["place", "read", "write"]
+__all__ = ["is_writable", "place", "read", "write"]
 
 _KEY = "catstream"  # one metadata key only: with more, their order and so the bytes would vary
 _VERSION = 1  # of what the metadata means
@@ -43,6 +44,15 @@ def place(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
     finally:
         with contextlib.suppress(OSError):  # of a disk that is read-only now; the next one writes over it
             part.unlink(missing_ok=True)
+
+
+def is_writable(folder: Path) -> bool:
+    """Whether a file can be made in a folder."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
 
 
 def write(

@@ -41,7 +41,7 @@ def demo(output: Path, frames: int, render_only: bool) -> None:
         return
 
     tracks = output / "tracks"
-    arguments = [str(video), "--box", str(boxes[0]), "--output", str(tracks), "--video"]
+    arguments = [str(video), "--box", str(boxes[0]), "--output", str(tracks), "--video", "--overwrite"]
     track.main(arguments, prog_name="catstream track", standalone_mode=False)
 
     truth = np.array([box or (np.nan,) * 4 for box in boxes])

@@ -40,6 +40,8 @@ class _Meant:
         """Connect to it and say which one it is; a person at a terminal who named none is asked first."""
         pipeline = control(self.endpoint, timeout=self.timeout, keys=self.keys, source=self.source)
         line = f"pipeline: {pipeline.source or 'a pipeline'} at {pipeline.endpoint}"
+        if self.endpoint and not pipeline.source:
+            return pipeline  # nothing is known of it but what was said
         if self.named or self.yes or not sys.stdin.isatty():
             click.echo(line, err=True)
         elif not click.confirm(f"{line}. Is it the one that you mean?", default=True, err=True):

@@ -2,37 +2,46 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli import INTERRUPTED
 from catstream.cli.interrupts import Interrupts
 from catstream.cli.serving import PORT, Address, AddressType, with_token
+from catstream.errors import ServiceError
 from catstream.extras import need
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
 from catstream.services.options import with_given, with_object, with_part, with_reading
-from catstream.video.results import ResultsWriter, last_position, tracks
+from catstream.sinks.run import RunFiles
+from catstream.sinks.sink import STDOUT
+from catstream.state import Origin
+from catstream.storage import is_writable
 
 __all__ = ["track"]
 
-_FOLDER = click.Path(path_type=Path)
+_FOLDER = _FILE = click.Path(path_type=Path)
 
 
 @click.command()
 @click.argument("source", required=False)
 @click.option("--output", type=_FOLDER, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
+@click.option("--write", type=_FILE, multiple=True, metavar="FILE", help="Write the tracks to this too, - for stdout.")
+@click.option("--overwrite", is_flag=True, help="Replace results that are there.")
+@click.option("--save-model", type=_FILE, metavar="FILE", help="Write what was learned to this, at the end.")
 @click.option("--record", type=click.Path(path_type=Path), help="File to record the run to: `catstream replay`.")
 @click.option(
     "--view",
@@ -58,6 +67,9 @@ def track(
     model: Path | None,
     output: Path | None,
     video: bool,
+    write: tuple[Path, ...],
+    overwrite: bool,
+    save_model: Path | None,
     record: Path | None,
     view: Address | None,
     token: str | None,
@@ -90,13 +102,31 @@ def track(
       OUTPUT/NAME.txt               x,y,w,h a frame, nan where the object is absent
       OUTPUT/NAME_confidence.value  the score a frame
       OUTPUT/NAME_time.txt          seconds a frame
-      OUTPUT/tracks.csv             frame, seconds, state, box, score, model version
+      OUTPUT/NAME.csv               frame, seconds, state, box, score, model version
       OUTPUT/NAME.mp4               with --video
+
+    NAME is that of the source, so that several sources may share a folder.
+
+    \b
+    --write FILE, as often as wanted; each has every frame
+      .ndjson .jsonl   an object a line, with the fields of a track
+      -                the same, on standard output
+      .json            one array of such objects
+      .csv             as OUTPUT/NAME.csv
+      .txt             MOT text: frame,1,x,y,w,h,score,-1,-1,-1, counted from 1
+      .sqlite          the table tracks; others may read it meanwhile
+      .parquet         needs pip install "catstream[parquet]"
+      .mp4             the frames with their tracks drawn in
+
+    Files that are there are not replaced without --overwrite.
 
     \b
     EXAMPLES
       catstream track walk.mp4 --box 120,80,64,48 --output out --video
       catstream track frames/ --box 120,80,64,48 --output out --set coreset_size=128
+      catstream track walk.mp4 --box 120,80,64,48 --write tracks.parquet
+      catstream track walk.mp4 --box 120,80,64,48 --write - | jq .box
+      catstream track walk.mp4 --box 120,80,64,48 --save-model walker.safetensors
       catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
       catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
       catstream track walk.mp4 --box 120,80,64,48 --record walk.rec
@@ -111,6 +141,10 @@ def track(
         raise click.UsageError("--state begins a run, --resume goes on with one: give one of them")
     if resume is None and source is None:
         raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
+    if resume is not None and overwrite:
+        raise click.UsageError("--resume goes on with the results that are there, --overwrite replaces them: give one")
+    known = Origin.load(resume).notes if resume is not None else {}
+    notes = known | _notes(output, video, write, save_model)
     pipeline = Pipeline(
         source,
         box,
@@ -120,21 +154,37 @@ def track(
         state=state,
         record=record,
         resume=resume,
-        notes=({"output": str(output.absolute())} if output is not None else {}) | ({"video": "yes"} if video else {}),
+        notes=notes,
+        save_model=notes.get("save_model"),
     )
-    video, output = "video" in pipeline.notes, Path(pipeline.notes["output"]) if "output" in pipeline.notes else None
     if view is not None:
         need("view")
-    if video and output is None:
-        raise click.UsageError("--video needs --output, the folder to write it to")
-    if video and pipeline.live:
-        raise click.UsageError("--video reads the frames once more, and those of a live source are gone: leave it away")
-    if resume is not None and output is not None:
-        pipeline.after = last_position(output, pipeline.name)
+    output = Path(notes["output"]) if "output" in notes else None
+    files = RunFiles(
+        pipeline.name,
+        pipeline.source,
+        pipeline.part,
+        output,
+        "video" in notes,
+        [*_written(notes), *([STDOUT] if STDOUT in write else [])],
+        pipeline.settings.image_rate,
+    )
+    files.check(
+        overwrite=overwrite,
+        resumable=state is not None or resume is not None,
+        known=[*_written(known), *([Path(known["output"])] if "output" in known else [])],
+    )
+    if save_model is not None:
+        _check_model(save_model, overwrite)
+    if resume is not None:
+        pipeline.after = files.position()
     console = Console(stderr=True, soft_wrap=True)
     if resume is not None and pipeline.complete:
         if box is not None:
             raise click.UsageError(f"{_complete(pipeline, resume, output)}: no frame is left for a box")
+        if not files.made:
+            with files.opened(resume=True):  # those that are new, or that were not closed
+                pass
         console.print(_complete(pipeline, resume, output), highlight=False)
         return
     interrupts = Interrupts()
@@ -152,21 +202,22 @@ def track(
                 for url in server.urls:
                     console.print(f"page: {url}", highlight=False)
             if pipeline.waits:
-                where = f" --endpoint {pipeline.endpoint}"
-                console.print(f"it waits for a box: catstream set-box X,Y,W,H{where}", highlight=False)
+                console.print(f"it waits for a box: {_ways_to_give_it(pipeline, view is not None)}", highlight=False)
             progress = stack.enter_context(run.progress(console))
-            sinks = None
+            keep: Callable[[Track, float], None] | None = None
+            moment = time.perf_counter()
             for found in pipeline:
                 # Not before there is something to write: a run that cannot start leaves older results alone.
-                sinks = sinks or _Sinks(stack, pipeline, output, video, resume is not None)
+                keep = keep or stack.enter_context(files.opened(resume=resume is not None))
+                before, moment = moment, time.perf_counter()
                 with interrupts.held():  # a frame is in all results, and counted, or in none
-                    sinks.write(found)
+                    keep(found, moment - before)
                     run.show(progress, found)
     except KeyboardInterrupt:
         interrupted = True
     finally:
         if run.frames:
-            console.print(run.summary(output), highlight=False)
+            console.print(run.summary([*([output] if output is not None else []), *files.files]), highlight=False)
             if record is not None:
                 console.print(f"recording: {record}, {Recording(record)}", highlight=False)
     if resume is not None and not run.frames and not interrupted:
@@ -186,48 +237,63 @@ def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
     )
 
 
-class _Sinks:
-    """Where tracks go: results files, and a video of the same frames read once more."""
-
-    def __init__(self, stack: ExitStack, pipeline: Pipeline, output: Path | None, video: bool, resume: bool) -> None:
-        self._results: ResultsWriter | None = None
-        if output is not None:
-            self._results = stack.enter_context(ResultsWriter(output, pipeline.name, resume=resume))
-        self._video: Any = None
-        self._moment = time.perf_counter()
-        if video and output is not None:
-            from catstream.video.annotate import AnnotatedVideo
-            from catstream.video.source import open_source
-
-            # A run ends at a damaged place unless it skips those: either way these are its frames.
-            self._frames = stack.enter_context(open_source(pipeline.source, part=pipeline.part, skip_damaged=True))
-            path = output / f"{pipeline.name}.mp4"
-            self._video = stack.enter_context(
-                AnnotatedVideo(path, pipeline.rate, pipeline.size, sound=self._frames.sound)
-            )
-            for found in tracks(output) if resume else ():  # a video cannot be written on: it is drawn again
-                self._video.write(next(self._frames).image, found, found.time)
-
-    def write(self, found: Track) -> None:
-        moment = time.perf_counter()
-        if self._results is not None:
-            self._results.write(found, moment - self._moment)
-        self._moment = moment
-        if self._video is not None:
-            self._video.write(next(self._frames).image, found, found.time)
+def _notes(output: Path | None, video: bool, write: tuple[Path, ...], save_model: Path | None) -> dict[str, str]:
+    """Where the results go, as it is kept for a run that is resumed from any working directory."""
+    files = [str(file.absolute()) for file in write if file != STDOUT]
+    return {
+        **({"output": str(output.absolute())} if output is not None else {}),
+        **({"video": "yes"} if video else {}),
+        **({"write": json.dumps(files)} if files else {}),
+        **({"save_model": str(save_model.absolute())} if save_model is not None else {}),
+    }
 
 
-class _StateColumn(ProgressColumn):
-    """The state of the track, or why no track comes to say so: the source is lost, or it is told to wait."""
+def _shown(path: Path) -> str:
+    """As it is named from the current folder."""
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
-    def __init__(self, pipeline: Pipeline) -> None:
+
+def _written(notes: dict[str, str]) -> list[Path]:
+    """The files that such notes name."""
+    return [Path(path) for path in json.loads(notes.get("write", "[]"))]
+
+
+def _check_model(file: Path, overwrite: bool) -> None:
+    if file.exists() and not overwrite:
+        raise ServiceError(f"{file} is there already: replace it with --overwrite, or give another name")
+    if file.is_dir() or not is_writable(file.parent):
+        raise ServiceError(f"cannot write {file}: give a file in a folder that exists and that you may write to")
+
+
+def _ways_to_give_it(pipeline: Pipeline, page: bool) -> str:
+    place = f"--endpoint {pipeline.endpoint}"
+    drawn = "draw one on the page" if page else f"draw one on the page of catstream view {place}"
+    return f"{drawn}, or say it: catstream set-box X,Y,W,H {place}"
+
+
+class _Line(ProgressColumn):
+    """State, frames and figures on one line: in a narrow terminal those that matter least are left out."""
+
+    _BAR = 24
+
+    def __init__(self, pipeline: Pipeline, console: Console) -> None:
         super().__init__()
-        self._pipeline = pipeline
+        self._pipeline, self._console = pipeline, console
 
     def render(self, task: Task) -> Text:
+        # Why no track comes to say the state: the source is lost, or it is told to wait.
         lost = self._pipeline.lost_seconds
         state = f"lost {lost:.0f} s" if lost else self._pipeline.holding or task.fields["state"]
-        return Text(f"{state:13}")
+        total = "" if self._pipeline.live else f"/{'?' if task.total is None else int(task.total)}"
+        parts = [f"{state:13}", f"{int(task.completed)}{total}", *task.fields["figures"]]
+        room = self._console.width - 1
+        while len(line := "  ".join(parts)) > room and len(parts) > 2:
+            parts.pop()
+        bar = min(self._BAR, room - len(line) - 2)
+        if task.total and bar >= 6:
+            done = round(bar * min(task.completed / task.total, 1.0))
+            parts.insert(1, "━" * done + "─" * (bar - done))
+        return Text("  ".join(parts), no_wrap=True, overflow="ellipsis")
 
 
 class _Run:
@@ -242,14 +308,8 @@ class _Run:
         self.version = 0
 
     def progress(self, console: Console) -> Progress:
-        columns = (
-            _StateColumn(self._pipeline),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[line]}"),
-        )
-        progress = Progress(*columns, console=console, transient=True, refresh_per_second=8)
-        self._task = progress.add_task("", total=self._pipeline.frames, state="starting", line="")
+        progress = Progress(_Line(self._pipeline, console), console=console, transient=True, refresh_per_second=8)
+        self._task = progress.add_task("", total=self._pipeline.frames, state="starting", figures=())
         return progress
 
     def show(self, progress: Progress, found: Track) -> None:
@@ -263,14 +323,16 @@ class _Run:
             return
         self._shown = now
         leaves = self._pipeline.health.get("compressor", {}).get("leaves", 0)
-        skipped = f"{self._detector('skipped'):.0f} skipped   " if self._pipeline.live else ""
-        line = (
-            f"{self._rate(now):.0f} frames/s   {skipped}score {found.score:+.2f}   "
-            f"model {found.model_version}   {leaves:.0f} leaves in the trees"
+        figures = (
+            f"{self._rate(now):.0f} frames/s",
+            *([f"{self._detector('skipped'):.0f} skipped"] if self._pipeline.live else []),
+            f"score {found.score:+.2f}",
+            f"model {found.model_version}",
+            f"{leaves:.0f} leaves",
         )
-        progress.update(self._task, completed=self.frames, state=found.state, line=line)
+        progress.update(self._task, completed=self.frames, state=found.state, figures=figures)
 
-    def summary(self, output: Path | None) -> str:
+    def summary(self, results: Sequence[Path]) -> str:
         lines = [
             f"{self.frames} frames, present in {self.present}, {self._rate(time.perf_counter()):.0f} frames/s, "
             f"first track after {self._first:.2f} s, model version {self.version}"
@@ -286,8 +348,8 @@ class _Run:
             lines.append(f"features: {totals['sent']} messages sent, {totals['stored']} stored in the coreset trees")
         if self._pipeline.restarts:
             lines.append(f"processes restarted: {self._pipeline.restarts}")
-        if output is not None:
-            lines.append(f"results: {output}")
+        if written := [_shown(file) for file in results if file != STDOUT]:
+            lines.append(f"results: {', '.join(written)}")
         return "\n".join(lines)
 
     def _detector(self, counter: str) -> float:

@@ -1,10 +1,10 @@
-"""Comma-separated values: the rows of `tracks.csv`, which `catstream track` writes."""
+"""Comma-separated values: the rows of `NAME.csv`, which `catstream track --output` writes."""
 
 from __future__ import annotations
 
 from catstream.messages import Track
 from catstream.sinks.lines import LineSink
-from catstream.video.results import COLUMNS, row
+from catstream.video.results import COLUMNS, row, track_of
 
 __all__ = ["CsvSink"]
 
@@ -17,3 +17,8 @@ class CsvSink(LineSink):
     def line(self, track: Track) -> str:
         """The row of a track."""
         return row(track)
+
+    @classmethod
+    def track(cls, line: str) -> Track:
+        """The track of a row, without the time stamp of a live stream."""
+        return track_of(line)

@@ -1,7 +1,7 @@
 """MOT text, as the tools of MOTChallenge read results: `frame,id,x,y,w,h,conf,-1,-1,-1`.
 
 Frames and pixels count from 1 there, so each is one more than here. The one object is number 1; a frame
-without it has no line.
+without it has no line, so that a file does not tell how many frames there were.
 """
 
 from __future__ import annotations

@@ -1,39 +1,93 @@
-"""Tracks in a column store, from their database: pyarrow, pandas, DuckDB and Spark read it."""
+"""Parquet, a column store that pyarrow, pandas, DuckDB and Spark read.
+
+Such a file can only be written at once. Until it is closed, its tracks are rows of a database beside it,
+`tracks.parquet.sqlite`, which stays if the process is killed or the disk is full.
+"""
 
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.extras import need
+from catstream.messages import Track
+from catstream.sinks.sqlite import SqliteSink, track_of
 
-__all__ = ["export"]
+__all__ = ["ParquetSink", "database_of"]
 
 _ROWS = 65536  # in memory at once
 
 
-def export(database: Path, path: Path) -> int:
-    """Write the tracks of a database to a Parquet file, which gets its name when it is whole.
+class ParquetSink:
+    """Tracks as rows of a Parquet file, which is written when this is closed.
 
-    Returns
-    -------
-    how many rows it has
+    Parameters
+    ----------
+    keep : go on with the file, if it is there, after its tracks of frames before this one; None for a new file
 
     Raises
     ------
     VideoError
-        If the database cannot be read or the file cannot be written.
+        From the constructor, if the place cannot be written to.
     MissingExtraError
-        If pyarrow is not installed.
+        From the constructor, if pyarrow is not installed.
     """
+
+    def __init__(self, path: Path, keep: int | None = None) -> None:
+        need("parquet")
+        self.path, self._database = path, database_of(path)
+        closed = path.exists() and not self._database.exists()
+        self._rows = SqliteSink(self._database, keep)
+        if keep is not None and closed:
+            for track in _read(path):
+                if track.frame < keep:
+                    self._rows.write(track)
+
+    @classmethod
+    def tracks(cls, path: Path) -> Iterator[Track]:
+        """The tracks in a file, or in the database beside it if it was not closed; none if there is neither."""
+        if database_of(path).exists():
+            yield from SqliteSink.tracks(database_of(path))
+        elif path.exists():
+            yield from _read(path)
+
+    def write(self, track: Track) -> None:
+        """Add a track."""
+        self._rows.write(track)
+
+    def close(self) -> None:
+        """Write the file, which gets its name when it is whole, and remove the database."""
+        self._rows.close()
+        _export(self._database, self.path)
+        self._database.unlink()
+
+
+def database_of(path: Path) -> Path:
+    """Where the tracks of a Parquet file are until it is closed."""
+    return path.with_name(path.name + ".sqlite")
+
+
+def _read(path: Path) -> Iterator[Track]:
     need("parquet")
+    from pyarrow.parquet import ParquetFile
+
+    try:
+        for batch in ParquetFile(path).iter_batches(_ROWS):
+            for row in batch.to_pylist():
+                yield track_of(tuple(row.values()))
+    except (OSError, ValueError) as error:
+        raise VideoError(f"cannot read {path} ({error}): is it a Parquet file of tracks?") from None
+
+
+def _export(database: Path, path: Path) -> None:
     import pyarrow as arrow
     import pyarrow.parquet
 
     kinds = {"INTEGER": arrow.int64(), "REAL": arrow.float64(), "TEXT": arrow.string()}
-    part, rows = path.with_name(path.name + ".part"), 0
+    part = path.with_name(path.name + ".part")
     try:
         with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=rw", uri=True)) as tracks:
             names = tracks.execute("SELECT name, type FROM pragma_table_info('tracks')").fetchall()
@@ -43,10 +97,8 @@ def export(database: Path, path: Path) -> int:
                 while batch := cursor.fetchmany(_ROWS):
                     columns = zip(zip(*batch, strict=True), schema.types, strict=True)
                     writer.write_batch(arrow.record_batch([arrow.array(*column) for column in columns], schema=schema))
-                    rows += len(batch)
         part.replace(path)
     except (OSError, sqlite3.Error) as error:
-        raise VideoError(f"cannot write {path} from {database}: {error}") from None
+        raise VideoError(f"cannot write {path} ({error}): its tracks stay in {database}") from None
     finally:
         part.unlink(missing_ok=True)
-    return rows

@@ -1,28 +1,37 @@
-"""What a sink is, and which one a file's name asks for.
+"""The formats that tracks are written in: the end of a file's name says which one.
 
-tracks.ndjson    an object a line, as on the wire
-tracks.csv       a row a frame, as `catstream track` writes it
+tracks.ndjson    an object a line, with the fields of `Track`; also tracks.jsonl, and - for standard output
+tracks.json      one array of such objects
+tracks.csv       a row a frame, as in the results of `catstream track`
 tracks.txt       MOT text, as the tools of MOTChallenge read it
 tracks.sqlite    a table in a database that others may read meanwhile
+tracks.parquet   a column store, written when it is closed
 walk.mp4         the video with the tracks drawn in
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from catstream.errors import VideoError
+from catstream.extras import need
 from catstream.messages import Track
+from catstream.sinks import parquet
 from catstream.sinks.csv import CsvSink
+from catstream.sinks.json import JsonSink, NdjsonSink, StdoutSink
 from catstream.sinks.mot import MotSink
-from catstream.sinks.ndjson import NdjsonSink
 from catstream.sinks.sqlite import SqliteSink
 from catstream.sinks.video import VideoSink
+from catstream.storage import is_writable
+from catstream.video.frames import RATE
 from catstream.video.source import WHOLE
 
-__all__ = ["SUFFIXES", "Sink", "open_sink"]
+__all__ = ["STDOUT", "SUFFIXES", "Sink", "check", "discard", "is_closed", "is_there", "open_sink", "reader"]
+
+#: Stands for standard output in place of a file.
+STDOUT = Path("-")
 
 
 class Sink(Protocol):
@@ -35,38 +44,122 @@ class Sink(Protocol):
         """Make the file whole; what was written stays. Raises VideoError where the file takes no more."""
 
 
-_KINDS: dict[str, Callable[[Path], Sink]] = {
-    ".ndjson": NdjsonSink,
-    ".csv": CsvSink,
-    ".txt": MotSink,
-    ".sqlite": SqliteSink,
+class _Format(NamedTuple):
+    """How one kind of file is made.
+
+    create  a sink of the file: `create(path, keep)`, see `open_sink`
+    tracks  what a file holds, None if it does not hold all that was written
+    """
+
+    create: Callable[[Path, int | None], Sink]
+    tracks: Callable[[Path], Iterator[Track]] | None
+
+
+_FORMATS = {
+    ".ndjson": _Format(NdjsonSink, NdjsonSink.tracks),
+    ".jsonl": _Format(NdjsonSink, NdjsonSink.tracks),
+    ".json": _Format(JsonSink, JsonSink.tracks),
+    ".csv": _Format(CsvSink, CsvSink.tracks),
+    ".txt": _Format(MotSink, None),
+    ".sqlite": _Format(SqliteSink, SqliteSink.tracks),
+    ".parquet": _Format(parquet.ParquetSink, parquet.ParquetSink.tracks),
 }
 
 #: What the name of a file may end with.
-SUFFIXES = (*_KINDS, ".mp4")
+SUFFIXES = (*_FORMATS, ".mp4")
 
 
-def open_sink(path: Path, source: str | None = None, part: slice = WHOLE) -> Sink:
-    """A new file for tracks, of the kind that its name says.
+def check(path: Path, *, there: bool = False) -> None:
+    """Raise VideoError if a sink cannot be opened.
 
     Parameters
     ----------
-    source, part : what the pipeline follows, as it was told; a video is read from it once more
+    there : whether the file may be there already
+    """
+    if path == STDOUT:
+        return
+    if path.suffix not in SUFFIXES:
+        raise VideoError(f"{path}: the name of a file for tracks ends with {', '.join(SUFFIXES)}, or is - for stdout")
+    if not there and is_there(path):
+        raise VideoError(f"{path} is there already: give another name, or remove it")
+    if path.suffix == ".parquet":
+        need("parquet")
+    if path.is_dir() or not is_writable(path.parent):
+        raise VideoError(f"cannot write {path}: give a file in a folder that exists and that you may write to")
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is such a file, or one that belongs to it."""
+    return path != STDOUT and any(file.exists() for file in _files(path))
+
+
+def is_closed(path: Path) -> bool:
+    """Whether there is such a file, with nothing beside it that was to become a part of it."""
+    return path.exists() and not any(file.exists() for file in _files(path)[1:])
+
+
+def reader(path: Path) -> Callable[[Path], Iterator[Track]] | None:
+    """What reads the tracks of such a file back, None if it does not hold all of them."""
+    return _FORMATS[path.suffix].tracks if path.suffix in _FORMATS and path != STDOUT else None
+
+
+def open_sink(
+    path: Path,
+    source: str | None = None,
+    part: slice = WHOLE,
+    *,
+    image_rate: float = RATE,
+    keep: int | None = None,
+) -> Sink:
+    """A file for tracks, in the format that its name says.
+
+    Parameters
+    ----------
+    source, part, image_rate : what the pipeline follows, as it was told; a video is read from it once more
+    keep : go on with the file, if it is there, after its tracks of frames before this one, where it holds all that was
+        written; None for a new file
 
     Raises
     ------
     VideoError
-        Where the file is there already or cannot be written, its name says no kind, or the source cannot be read.
+        If a new file is there already or cannot be written, its name says no format, or the source cannot be read.
     """
-    if path.exists():
-        raise VideoError(f"{path} is there already: give another name, or remove it")
+    check(path, there=keep is not None)
+    if path == STDOUT:
+        return StdoutSink(path)
     if path.suffix == ".mp4":
         if source is None:
             raise VideoError(f"{path} needs the frames: say where they come from (--source)")
-        return VideoSink(path, source, part)
-    if path.suffix not in _KINDS:
-        raise VideoError(f"{path}: the name of a sink ends with {', '.join(SUFFIXES)}, which says what it is")
+        return VideoSink(path, source, part, image_rate)
+    form = _FORMATS[path.suffix]
+    if form.tracks is None and keep is not None:
+        discard(path)
+        keep = None
     try:
-        return _KINDS[path.suffix](path)
+        return form.create(path, keep)
     except OSError as error:
         raise VideoError(f"cannot write {path} ({error.strerror}): give a place that you may write to") from None
+
+
+def discard(path: Path) -> None:
+    """Remove a file for tracks, and what belongs to it; nothing if it is not there.
+
+    Raises
+    ------
+    VideoError
+        If it cannot be removed.
+    """
+    try:
+        for file in _files(path) if path != STDOUT else ():
+            file.unlink(missing_ok=True)
+    except OSError as error:
+        raise VideoError(f"cannot replace {path} ({error.strerror}): give another name") from None
+
+
+def _files(path: Path) -> list[Path]:
+    """A file for tracks, and those beside it that hold a part of them until it is closed."""
+    if path.suffix == ".sqlite":
+        return [path, *(path.with_name(path.name + end) for end in ("-wal", "-shm"))]
+    if path.suffix == ".parquet":
+        return [path, *_files(parquet.database_of(path))]
+    return [path]

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
+from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import Track
 
-__all__ = ["SqliteSink"]
+__all__ = ["SqliteSink", "track_of"]
 
 _TABLE = """
-CREATE TABLE tracks (
+CREATE TABLE IF NOT EXISTS tracks (
     frame         INTEGER PRIMARY KEY,
     seq           INTEGER NOT NULL,
     seconds       REAL NOT NULL,  -- since the start of the source
@@ -28,13 +31,17 @@ CREATE TABLE tracks (
 class SqliteSink:
     """Tracks as rows of the table `tracks`, each committed by itself.
 
+    Parameters
+    ----------
+    keep : go on with the file, if it is there, after its tracks of frames before this one; None for a new file
+
     Raises
     ------
     VideoError
         From the constructor, where the database cannot be made.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, keep: int | None = None) -> None:
         self.path = path
         try:
             with ExitStack() as stack:
@@ -42,9 +49,29 @@ class SqliteSink:
                 self._database.execute("PRAGMA journal_mode = WAL")
                 self._database.execute("PRAGMA synchronous = NORMAL")  # a crash of the machine may cost the last rows
                 self._database.execute(_TABLE)
+                if keep is not None:
+                    self._database.execute("DELETE FROM tracks WHERE frame >= ?", (keep,))
                 stack.pop_all()
         except sqlite3.Error as error:
             raise VideoError(f"cannot make the database {path} ({error}): give a place that you may write to") from None
+
+    @classmethod
+    def tracks(cls, path: Path) -> Iterator[Track]:
+        """The tracks in a database, in order; none if there is no file.
+
+        Raises
+        ------
+        VideoError
+            If it cannot be read.
+        """
+        if not path.exists():
+            return
+        try:
+            with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as database:
+                for row in database.execute("SELECT * FROM tracks ORDER BY frame"):
+                    yield track_of(row)
+        except sqlite3.Error as error:
+            raise VideoError(f"cannot read {path} ({error}): is it a database of tracks?") from None
 
     def write(self, track: Track) -> None:
         """Add a track."""
@@ -61,3 +88,9 @@ class SqliteSink:
     def close(self) -> None:
         """Fold the log into the database, which is then one file."""
         self._database.close()
+
+
+def track_of(row: tuple[Any, ...]) -> Track:
+    """The track of a row of the table."""
+    frame, seq, seconds, state, x, y, w, h, score, version, pts = row
+    return Track(seq, frame, seconds, state, None if x is None else Box(x, y, w, h), score, version, pts)

@@ -3,10 +3,10 @@
     NAME.txt               x,y,w,h in pixels; nan,nan,nan,nan where the object is absent
     NAME_confidence.value  the score
     NAME_time.txt          seconds of work that the frame took
-    tracks.csv             frame, seconds since the start of the source, state, x, y, w, h, score, model_version
+    NAME.csv               frame, seconds since the start of the source, state, x, y, w, h, score, model_version
 
 The first three are what the benchmarks' toolkits read. Two lockstep runs write
-the same NAME.txt, NAME_confidence.value and tracks.csv, byte for byte;
+the same NAME.txt, NAME_confidence.value and NAME.csv, byte for byte;
 NAME_time.txt is measured and is never the same twice.
 """
 
@@ -20,21 +20,37 @@ from typing import Any, Self
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import Position, Track
+from catstream.messages import Track
 
-__all__ = ["COLUMNS", "ResultsWriter", "last_position", "row", "tracks"]
+__all__ = ["COLUMNS", "ResultsWriter", "files", "row", "table", "track_of", "tracks", "whole"]
 
-#: Of tracks.csv.
+#: Of NAME.csv.
 COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version"
 
 _ABSENT = "nan,nan,nan,nan"
-_TRACKS = "tracks.csv"
+
+
+def table(name: str) -> str:
+    """Name of the file with a row a track."""
+    return f"{name}.csv"
+
+
+def files(name: str) -> tuple[str, ...]:
+    """Names of all results files of a run."""
+    return (*_rows(name), table(name))
 
 
 def row(track: Track) -> str:
-    """The row of a track in tracks.csv."""
+    """The row of a track in NAME.csv."""
     box = ",,," if track.box is None else _sides(track.box)
     return f"{track.frame},{track.time:.6f},{track.state},{box},{track.score:.6f},{track.model_version}"
+
+
+def track_of(text: str) -> Track:
+    """The track of such a row; raises ValueError if it is none."""
+    frame, seconds, state, x, y, w, h, score, version = text.split(",")
+    box = Box(*map(float, (x, y, w, h))) if x else None
+    return Track(int(frame) + 1, int(frame), float(seconds), _state(state), box, float(score), int(version))
 
 
 def _sides(box: Box) -> str:
@@ -52,8 +68,8 @@ class ResultsWriter:
     directory : where to write; made if it is not there
     name : of the run, usually that of the source
     start : number of the first frame
-    resume : go on after the rows that are there: those of the last frame that is whole in every file;
-        what a power cut left beyond it is cut off
+    keep : go on with the files that are there, after their rows of frames before this one that are whole in every
+        file; None to replace them
 
     Raises
     ------
@@ -61,23 +77,23 @@ class ResultsWriter:
         Where the directory cannot be written to, before any work is done; or takes no more, later.
     """
 
-    def __init__(self, directory: str | Path, name: str, start: int = 0, *, resume: bool = False) -> None:
+    def __init__(self, directory: str | Path, name: str, start: int = 0, *, keep: int | None = None) -> None:
         self.directory = Path(directory)
         self.rows = start
         try:
-            with contextlib.ExitStack() as files:
+            with contextlib.ExitStack() as stack:
                 self.directory.mkdir(parents=True, exist_ok=True)
-                if resume:
-                    self.rows = _cut(self.directory, name)
+                if keep is not None:
+                    self.rows = _cut(self.directory, name, keep)
                 self._boxes, self._scores, self._times, self._tracks = (
-                    files.enter_context(
-                        (self.directory / file).open("a" if resume else "w", encoding="ascii", buffering=1)
+                    stack.enter_context(
+                        (self.directory / file).open("w" if keep is None else "a", encoding="ascii", buffering=1)
                     )
-                    for file in (*_rows(name), _TRACKS)
+                    for file in files(name)
                 )
                 if not self._tracks.tell():
                     self._tracks.write(COLUMNS + "\n")
-                self._files = files.pop_all()
+                self._files = stack.pop_all()
         except OSError as error:
             raise VideoError(
                 f"cannot write results to {str(directory)!r} ({error.strerror}): "
@@ -118,19 +134,16 @@ class ResultsWriter:
         self.close()
 
 
-def tracks(directory: str | Path) -> Iterator[Track]:
-    """The tracks that `tracks.csv` holds, up to the first that is not whole; none where there is no file."""
-    for _, track in _lines(Path(directory) / _TRACKS):
+def tracks(directory: Path, name: str) -> Iterator[Track]:
+    """The tracks that `NAME.csv` holds, up to the first that is not whole; none where there is no file."""
+    for _, track in _lines(directory / table(name)):
         yield track
 
 
-def last_position(directory: str | Path, name: str) -> Position:
-    """After which frame a run goes on that wrote these results: the last one that is whole in every file."""
-    rows, box = _whole(Path(directory), name), None
-    for track in tracks(directory):
-        if track.frame < rows:
-            box = track.box or box
-    return Position(rows, max(rows - 1, 0), box)
+def whole(directory: Path, name: str) -> int:
+    """How many frames are whole in every file."""
+    least = min(len(_row_ends(directory / file)) - 1 for file in _rows(name))
+    return max((track.frame + 1 for track in tracks(directory, name) if track.frame < least), default=0)
 
 
 def _rows(name: str) -> tuple[str, ...]:
@@ -139,16 +152,12 @@ def _rows(name: str) -> tuple[str, ...]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, Track]]:
-    """Where each line of `tracks.csv` ends, in bytes, and its track."""
+    """Where each line of `NAME.csv` ends, in bytes, and its track."""
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         end = len(file.readline())
         for line in file:
             try:
-                frame, seconds, state, x, y, w, h, score, version = line.decode("ascii").split(",")
-                box = Box(*map(float, (x, y, w, h))) if x else None
-                track = Track(
-                    int(frame) + 1, int(frame), float(seconds), _state(state), box, float(score), int(version)
-                )
+                track = track_of(line.decode("ascii"))
             except ValueError:  # half a line, or what a disk holds where nothing was written yet
                 return
             if not line.endswith(b"\n"):
@@ -174,19 +183,13 @@ def _row_ends(path: Path) -> list[int]:
     return ends
 
 
-def _whole(directory: Path, name: str) -> int:
-    """How many frames are whole in every file."""
-    least = min(len(_row_ends(directory / file)) - 1 for file in _rows(name))
-    return max((track.frame + 1 for track in tracks(directory) if track.frame < least), default=0)
-
-
-def _cut(directory: Path, name: str) -> int:
-    """Cut off what is beyond the last frame that is whole in every file; returns how many frames that leaves."""
-    rows = _whole(directory, name)
+def _cut(directory: Path, name: str, keep: int) -> int:
+    """Keep so many frames, if so many are whole in every file, and cut off the others; returns how many are kept."""
+    rows = min(whole(directory, name), keep)
     for file in _rows(name):
         if (directory / file).exists():
             os.truncate(directory / file, _row_ends(directory / file)[rows])
-    if (directory / _TRACKS).exists():
-        ends = [end for end, track in _lines(directory / _TRACKS) if track.frame < rows]
-        os.truncate(directory / _TRACKS, ends[-1] if ends else 0)
+    if (path := directory / table(name)).exists():
+        ends = [end for end, track in _lines(path) if track.frame < rows]
+        os.truncate(path, ends[-1] if ends else 0)
     return rows

@@ -40,7 +40,7 @@ def test_every_verb_says_what_it_does(help_of, verb):
 
 def test_track_says_what_it_writes_and_how_it_is_stopped(help_of):
     text = help_of("track")
-    for word in ("NAME.txt", "NAME_confidence.value", "NAME_time.txt", "tracks.csv", "NAME.mp4", "Ctrl-C", "EXAMPLES"):
+    for word in ("NAME.txt", "NAME_confidence.value", "NAME_time.txt", "NAME.csv", "NAME.mp4", "Ctrl-C", "EXAMPLES"):
         assert word in text
 
 

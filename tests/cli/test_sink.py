@@ -23,11 +23,9 @@ from catstream.wire.sockets import Publisher
 @pytest.mark.parametrize("stopped", [False, True], ids=["to the end", "stopped"])
 def test_tracks_go_to_files_and_stay_there(video, catstream, tmp_path, stopped):
     source, box = video
-    files = [tmp_path / name for name in ("tracks.ndjson", "tracks.sqlite", "walk.mp4")]
+    files = [tmp_path / name for name in ("tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet")]
     with Pipeline(source, [float(side) for side in box.split(",")], Settings(window=1)) as pipeline:
-        sink = catstream(
-            "sink", *files, "--source", source, "--endpoint", pipeline.endpoint, "--parquet", tmp_path / "t.parquet"
-        )
+        sink = catstream("sink", *files, "--source", source, "--endpoint", pipeline.endpoint)
         for track in pipeline:
             if sink.poll() is None:
                 select.select([sink.stderr], [], [], 0.3)  # while it starts, few pass

@@ -40,7 +40,7 @@ def state(said, tmp_path):
 
 
 def rows(folder):
-    return list(csv.DictReader((folder / "tracks.csv").read_text().splitlines()))
+    return list(csv.DictReader((folder / "demo.csv").read_text().splitlines()))
 
 
 def test_a_run_without_a_box_is_shown_the_object_and_goes_on_when_it_may(video, catstream, steer, state, tmp_path):
@@ -57,7 +57,9 @@ def test_a_run_without_a_box_is_shown_the_object_and_goes_on_when_it_may(video, 
     assert steer("resume") == (0, "it goes on after frame 0")
     errors = run.communicate(timeout=120)[1]
     assert run.returncode == 0, errors
-    assert "it waits for a box: catstream set-box X,Y,W,H --endpoint" in errors
+    (hint,) = (line for line in errors.splitlines() if line.startswith("it waits for a box: "))
+    assert f"catstream view --endpoint {tmp_path / 'run'}" in hint
+    assert f"catstream set-box X,Y,W,H --endpoint {tmp_path / 'run'}" in hint
     assert "60 messages sent, 60 stored" in errors
     assert len(rows(tmp_path / "out")) == 60
 

@@ -74,7 +74,7 @@ class Run:
         self.process.send_signal(signal.SIGINT)
         errors = self.process.communicate(timeout=60)[1]
         assert self.process.returncode == 130
-        rows = list(csv.DictReader((self.output / "tracks.csv").read_text().splitlines()))
+        rows = list(csv.DictReader((self.output / "one.csv").read_text().splitlines()))
         assert len((self.output / "one.txt").read_text().splitlines()) == len(rows)
         return rows, errors
 
@@ -126,7 +126,7 @@ def test_a_server_that_freezes_and_dies_is_followed_again_with_what_was_learned(
 def test_a_stream_over_http_is_followed_by_a_restarted_detector_too(camera, following, story):
     with following(camera(lambda number: story[number % len(story)][0]).url) as run:
         run.until(lambda counters: counters["model_version"] >= 3)
-        frames = len((run.output / "tracks.csv").read_text().splitlines())
+        frames = len((run.output / "one.csv").read_text().splitlines())
         (detector,) = (child for child in psutil.Process(run.process.pid).children() if "detector" in child.cmdline())
         detector.kill()
         run.until(lambda counters: counters["sent"] > frames + 40)

@@ -18,11 +18,11 @@ from catstream.state import TREES, Origin
 from catstream.video.source import open_source
 
 OFTEN = ["--set", "checkpoint_seconds=0.05", "--lockstep"]
-RESULTS = ["demo.txt", "demo_confidence.value", "tracks.csv"]
+RESULTS = ["demo.txt", "demo_confidence.value", "demo.csv"]
 
 
 def frames(folder):
-    path = folder / "tracks.csv"
+    path = folder / "demo.csv"
     return [int(row["frame"]) for row in csv.DictReader(path.read_text().splitlines())] if path.exists() else []
 
 
@@ -93,15 +93,15 @@ def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed
 
 def test_rows_that_a_power_cut_tore_are_cut_off_and_written_again(killed, undisturbed, said, tmp_path):
     kept = killed("--video")
-    for file, cut in [("demo.txt", 60), ("tracks.csv", 100)]:
+    for file, cut in [("demo.txt", 60), ("demo.csv", 100)]:
         path = tmp_path / "out" / file
         path.write_bytes(path.read_bytes()[:-cut] + bytes(9))
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
     for file in RESULTS:
-        assert len((tmp_path / "out" / file).read_text().splitlines()) == 60 + (file == "tracks.csv")
-    assert (tmp_path / "out" / "tracks.csv").read_text().splitlines()[:8] == (
-        (undisturbed / "tracks.csv").read_text().splitlines()[:8]
+        assert len((tmp_path / "out" / file).read_text().splitlines()) == 60 + (file == "demo.csv")
+    assert (tmp_path / "out" / "demo.csv").read_text().splitlines()[:8] == (
+        (undisturbed / "demo.csv").read_text().splitlines()[:8]
     )
     with open_source(tmp_path / "out" / "demo.mp4") as film:
         assert sum(1 for _ in film) == 60, "the video is drawn again, whole"
@@ -116,7 +116,7 @@ def test_a_damaged_checkpoint_is_said_and_the_one_before_goes_on(killed, undistu
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
     assert "damaged checkpoints: 1" in errors
-    assert (tmp_path / "out" / "tracks.csv").read_bytes() == (undisturbed / "tracks.csv").read_bytes()
+    assert (tmp_path / "out" / "demo.csv").read_bytes() == (undisturbed / "demo.csv").read_bytes()
 
 
 def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, catstream, tmp_path):

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sqlite3
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import Track
-from catstream.sinks import parquet
-from catstream.sinks.sink import SUFFIXES, open_sink
+from catstream.sinks.sink import SUFFIXES, open_sink, reader
+from catstream.sinks.sqlite import SqliteSink
 from catstream.video.results import ResultsWriter
 from catstream.video.source import open_source
 
@@ -23,6 +24,9 @@ TRACKS = [
     Track(2, 1, 0.04, "absent", None, 0.125, 3),
     Track(4, 3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.75, 4, 17.5),
 ]
+
+#: Formats that hold all that was written.
+COMPLETE = [".ndjson", ".jsonl", ".json", ".csv", ".sqlite", ".parquet"]
 
 
 @pytest.fixture
@@ -51,7 +55,7 @@ def test_csv_is_that_of_the_results(filled, tmp_path):
     with ResultsWriter(tmp_path / "results", "run") as results:
         for track in TRACKS:
             results.write(track, 0.0)
-    assert path.read_text() == (tmp_path / "results" / "tracks.csv").read_text()
+    assert path.read_text() == (tmp_path / "results" / "run.csv").read_text()
     assert [row["state"] for row in csv.DictReader(path.read_text().splitlines())] == [track.state for track in TRACKS]
 
 
@@ -73,13 +77,69 @@ def test_a_database_can_be_read_while_it_is_written(filled):
     ]
 
 
-def test_a_database_is_exported_as_parquet(filled, tmp_path):
+def test_json_is_one_array_once_it_is_closed(tmp_path):
+    sink = open_sink(tmp_path / "tracks.json")
+    for track in TRACKS:
+        sink.write(track)
+    sink.close()
+    objects = json.loads((tmp_path / "tracks.json").read_text())
+    assert objects == [{**asdict(track), "box": track.box and list(track.box)} for track in TRACKS]
+    open_sink(tmp_path / "empty.json").close()
+    assert json.loads((tmp_path / "empty.json").read_text()) == []
+
+
+def test_a_parquet_file_is_made_when_it_is_closed_of_rows_that_are_kept_until_then(tmp_path):
     arrow = pytest.importorskip("pyarrow.parquet")
-    assert parquet.export(filled("tracks.sqlite"), tmp_path / "tracks.parquet") == len(TRACKS)
+    sink = open_sink(tmp_path / "tracks.parquet")
+    for track in TRACKS:
+        sink.write(track)
+    assert list(SqliteSink.tracks(tmp_path / "tracks.parquet.sqlite")) == TRACKS
+    sink.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["tracks.parquet"]
     table = arrow.read_table(tmp_path / "tracks.parquet").to_pydict()
     assert table["frame"] == [0, 1, 3]
     assert table["state"] == [track.state for track in TRACKS]
     assert table["h"] == [40.0, None, 40.0]
+
+
+@pytest.fixture
+def left(tmp_path):
+    """A file of the tracks as it is when it is closed, or as a process that is killed leaves it."""
+
+    def leave(name, closed):
+        (tmp_path / "open").mkdir()
+        with closing(open_sink(tmp_path / "open" / name)) as sink:
+            for track in TRACKS:
+                sink.write(track)
+            if not closed:
+                shutil.copytree(tmp_path / "open", tmp_path / "left")
+        return tmp_path / ("open" if closed else "left") / name
+
+    return leave
+
+
+@pytest.mark.parametrize("suffix", COMPLETE)
+@pytest.mark.parametrize("closed", [True, False], ids=["closed", "killed"])
+def test_a_file_goes_on_after_the_frame_that_is_asked_for(left, suffix, closed):
+    path = left(f"tracks{suffix}", closed)
+    read, before = reader(path), path.read_bytes() if path.exists() else b""
+    kept = [replace(track, seq=track.frame + 1, pts=None) for track in TRACKS] if suffix == ".csv" else TRACKS
+    assert list(read(path)) == kept
+    with closing(open_sink(path, keep=2)) as again:
+        again.write(TRACKS[2])
+    assert list(read(path)) == kept
+    if suffix not in (".sqlite", ".parquet"):
+        assert path.read_bytes().removesuffix(b"]\n") == before.removesuffix(b"]\n")
+
+
+@pytest.mark.parametrize("suffix", [".ndjson", ".json", ".csv"])
+def test_a_line_that_a_power_cut_tore_is_not_read_and_is_cut_off(left, suffix):
+    path = left(f"tracks{suffix}", closed=False)
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole.splitlines()[-1][:9] + bytes(7))
+    assert len(list(reader(path)(path))) == len(TRACKS)
+    open_sink(path, keep=9).close()
+    assert path.read_bytes().removesuffix(b"]\n") == whole
 
 
 def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
@@ -94,7 +154,7 @@ def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
         assert sum(1 for _ in frames) == len(TRACKS)
 
 
-@pytest.mark.parametrize("suffix", [".ndjson", ".csv", ".txt"])
+@pytest.mark.parametrize("suffix", [".ndjson", ".json", ".csv", ".txt"])
 def test_a_disk_that_is_full_is_said_in_one_line_and_what_was_written_stays(tmp_path, full, suffix):
     path = tmp_path / f"tracks{suffix}"
     sink = open_sink(path)
@@ -119,9 +179,9 @@ def test_a_file_that_is_there_is_kept(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("name", "source", "words"),
     [
-        ("tracks.xls", None, "ends with .ndjson, .csv, .txt, .sqlite, .mp4"),
-        ("none/tracks.csv", None, "give a place that you may write to"),
-        ("none/tracks.sqlite", None, "give a place that you may write to"),
+        ("tracks.xls", None, "ends with .ndjson, .jsonl, .json, .csv, .txt, .sqlite, .parquet, .mp4"),
+        ("none/tracks.csv", None, "a folder that exists and that you may write to"),
+        ("none/tracks.sqlite", None, "a folder that exists and that you may write to"),
         ("walk.mp4", None, "say where they come from"),
         ("walk.mp4", "rtsp://127.0.0.1/cam", "those of a live source are gone"),
     ],

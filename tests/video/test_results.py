@@ -32,7 +32,7 @@ def test_each_frame_has_a_row_and_absence_is_nan(tmp_path):
     np.testing.assert_array_equal(boxes[4], [4, 2, 3.5, 4.25])
     np.testing.assert_array_equal(rows(out / "walk_confidence.value")[:, 0], [0.5, 0.5, 0.5, 0.125, 0.5])
     np.testing.assert_array_equal(rows(out / "walk_time.txt")[:, 0], 5 * [0.01])
-    lines = (out / "tracks.csv").read_text().splitlines()
+    lines = (out / "walk.csv").read_text().splitlines()
     assert lines[0] == "frame,seconds,state,x,y,w,h,score,model_version"
     assert lines[3] == "2,0.080000,present,2.0000,2.0000,3.5000,4.2500,0.500000,1"
     assert lines[4] == "3,0.120000,absent,,,,,0.125000,1"
@@ -54,7 +54,7 @@ def test_frames_without_a_track_get_a_row_of_nan(tmp_path):
         results.write(track(12), 0.01)
     boxes = rows(tmp_path / "walk.txt")
     assert np.isnan(boxes).all(axis=1).tolist() == [False, True, True, False]
-    assert len((tmp_path / "tracks.csv").read_text().splitlines()) == 3
+    assert len((tmp_path / "walk.csv").read_text().splitlines()) == 3
 
 
 def test_the_same_tracks_give_the_same_bytes(tmp_path):
@@ -62,11 +62,11 @@ def test_the_same_tracks_give_the_same_bytes(tmp_path):
         with ResultsWriter(tmp_path / folder, "walk") as results:
             for frame in range(20):
                 results.write(track(frame, Box(frame / 3, frame / 7, 10 / 3, 1e-9)), seconds)
-    for file in ("walk.txt", "walk_confidence.value", "tracks.csv"):
+    for file in ("walk.txt", "walk_confidence.value", "walk.csv"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-@pytest.mark.parametrize("file", ["walk.txt", "walk_confidence.value", "walk_time.txt", "tracks.csv"])
+@pytest.mark.parametrize("file", ["walk.txt", "walk_confidence.value", "walk_time.txt", "walk.csv"])
 def test_a_disk_that_is_full_is_said_in_one_line_and_what_was_written_stays(tmp_path, full, file):
     results = ResultsWriter(tmp_path, "walk")
     results.write(track(0), 0.01)
@@ -74,11 +74,11 @@ def test_a_disk_that_is_full_is_said_in_one_line_and_what_was_written_stays(tmp_
     for last in (lambda: results.write(track(1), 0.01), results.close):  # which tries it once more
         with pytest.raises(VideoError, match=r"cannot write results to .* any more: No space left on device$"):
             last()
-    assert len((tmp_path / file).read_text().splitlines()) == 1 + (file == "tracks.csv")
+    assert len((tmp_path / file).read_text().splitlines()) == 1 + (file == "walk.csv")
 
 
 def test_a_disk_that_is_full_from_the_start_is_refused_at_once(tmp_path):
-    (tmp_path / "tracks.csv").symlink_to("/dev/full")
+    (tmp_path / "walk.csv").symlink_to("/dev/full")
     with pytest.raises(VideoError, match="No space left on device"):
         ResultsWriter(tmp_path, "walk")
 
@@ -87,6 +87,6 @@ def test_a_place_that_cannot_be_written_is_refused_at_once(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(VideoError, match="cannot write results"):
         ResultsWriter(tmp_path / "file" / "out", "walk")
-    (tmp_path / "out" / "tracks.csv").mkdir(parents=True)
+    (tmp_path / "out" / "walk.csv").mkdir(parents=True)
     with pytest.raises(VideoError, match="cannot write results"):
         ResultsWriter(tmp_path / "out", "walk")

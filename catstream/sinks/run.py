@@ -1,0 +1,175 @@
+"""All files that one run writes its tracks to, from its start, or from where an earlier part of it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import takewhile
+from pathlib import Path
+
+from catstream.errors import VideoError
+from catstream.messages import Position, Track
+from catstream.sinks.sink import STDOUT, Sink, check, discard, is_closed, is_there, open_sink, reader
+from catstream.storage import is_writable
+from catstream.video import results
+from catstream.video.frames import RATE
+from catstream.video.results import ResultsWriter
+from catstream.video.source import is_live
+
+__all__ = ["RunFiles"]
+
+
+@dataclass(frozen=True, slots=True)
+class RunFiles:
+    """Where the tracks of a run go.
+
+    A run that is resumed goes on after the last frame that each of the files holds; rows beyond it, which a power
+    cut left in some of them, are cut off. Files that do not hold all tracks (a video, MOT text) and those
+    that are new begin again at the first frame, with the tracks that another file holds.
+
+    name    of the results files, that of the source
+    source  that a video is drawn from
+    part    which frames of it there are
+    output  folder of the results files, None for none
+    video   whether a video is among them
+    files   for tracks, see `catstream.sinks.sink`
+    rate    frames per second of a folder of images
+    """
+
+    name: str
+    source: str
+    part: slice
+    output: Path | None = None
+    video: bool = False
+    files: Sequence[Path] = ()
+    rate: float = RATE
+
+    def check(self, *, overwrite: bool, resumable: bool, known: Sequence[Path] = ()) -> None:
+        """Raise VideoError, before any work is done, if they cannot be written.
+
+        Parameters
+        ----------
+        overwrite : whether files that are there may be replaced
+        resumable : whether the run may be resumed one day
+        known : files, and a folder of results, that an earlier part of this run wrote
+        """
+        if self.video and self.output is None:
+            raise VideoError("--video needs --output, the folder to write it to")
+        if is_live(self.source) and (self.video or any(file.suffix == ".mp4" for file in self.files)):
+            raise VideoError("a video reads the frames once more, and those of a live source are gone: leave it away")
+        if self.output is not None:
+            folder = self.output.absolute()
+            nearest = next(path for path in (folder, *folder.parents) if path.exists())
+            if not is_writable(nearest):
+                raise VideoError(
+                    f"cannot write results to {str(self.output)!r}: give a folder that exists or can be made, "
+                    "and that you may write to"
+                )
+        there = [file.name for file in self._results() if file.exists()]
+        if there and not overwrite and self.output not in known:
+            raise VideoError(
+                f"results of {self.name!r} are in {str(self.output)!r} already ({', '.join(there)}): "
+                "replace them all with --overwrite, or give another folder"
+            )
+        for count, file in enumerate(self.files):
+            if file in self.files[:count]:
+                raise VideoError(f"{file} is named twice: give each file once")
+            check(file, there=True)
+            if is_there(file) and not overwrite and file not in known:
+                raise VideoError(f"{file} is there already: replace it with --overwrite, or give another name")
+        files = [file for file in self.files if file != STDOUT]
+        if resumable and self.output is None and files and not any(map(reader, files)):
+            raise VideoError(
+                f"{files[0]} does not hold all tracks, which a run that is resumed needs: add a file that does, "
+                "--write tracks.ndjson or --output FOLDER"
+            )
+
+    @property
+    def made(self) -> bool:
+        """Whether all files are there, and were closed."""
+        files = [file for file in self.files if file != STDOUT]
+        return all(is_closed(file) for file in [*files, *([self._film()] if self.video else [])])
+
+    def position(self) -> Position | None:
+        """After which frame a resumed run goes on: the last one that all files hold; None if none holds tracks."""
+        if self.output is None and not any(map(reader, self.files)):
+            return None
+        earlier = self._earlier()
+        frames = min((held for held, _ in earlier), default=0)
+        boxes = [track.box for track in self._tracks(earlier, frames) if track.box is not None]
+        return Position(frames, max(frames - 1, 0), boxes[-1] if boxes else None)
+
+    @contextmanager
+    def opened(self, *, resume: bool = False) -> Iterator[Callable[[Track, float], None]]:
+        """A function that writes a track, and the seconds that it took, to all files; they are closed afterwards.
+
+        Parameters
+        ----------
+        resume : whether to go on with the files, as `position` said; new ones replace those that are there
+
+        Raises
+        ------
+        VideoError
+            If a file cannot be written; also later, from the function and at the end.
+        """
+        earlier = self._earlier() if resume else []
+        keep = min((held for held, _ in earlier), default=0) if resume else None
+        rows: list[ResultsWriter] = []
+        sinks: list[Sink] = []
+        begun: list[Callable[[Track], None]] = []  # of the files that begin at the first frame
+        with ExitStack() as stack:
+            if self.output is not None:
+                new = not (self.output / results.table(self.name)).exists()
+                discard(self._film())
+                writer = stack.enter_context(ResultsWriter(self.output, self.name, keep=keep))
+                rows.append(writer)
+                begun += [partial(writer.write, seconds=float("nan"))] if new else []
+            for file in (*self.files, *([self._film()] if self.video else [])):
+                new = reader(file) is None or not is_there(file)
+                if not resume:
+                    discard(file)
+                sink = stack.enter_context(
+                    closing(open_sink(file, self.source, self.part, image_rate=self.rate, keep=keep))
+                )
+                sinks.append(sink)
+                begun += [sink.write] if new and file != STDOUT else []
+            for track in self._tracks(earlier, keep or 0) if begun else ():
+                for begin in begun:
+                    begin(track)
+
+            def write(track: Track, seconds: float) -> None:
+                for writer in rows:
+                    writer.write(track, seconds)
+                for sink in sinks:
+                    sink.write(track)
+
+            yield write
+
+    def _results(self) -> list[Path]:
+        """The results files, the video too."""
+        if self.output is None:
+            return []
+        return [*(self.output / file for file in results.files(self.name)), self._film()]
+
+    def _film(self) -> Path:
+        return (self.output or Path()) / f"{self.name}.mp4"
+
+    def _earlier(self) -> list[tuple[int, Callable[[], Iterator[Track]]]]:
+        """Of each file that is there and holds all tracks: how many frames, and what reads them."""
+        found: list[tuple[int, Callable[[], Iterator[Track]]]] = []
+        if self.output is not None and (self.output / results.table(self.name)).exists():
+            held = results.whole(self.output, self.name)
+            found.append((held, partial(results.tracks, self.output, self.name)))
+        for file in self.files:
+            read = reader(file)
+            if read is not None and is_there(file):
+                found.append((max((track.frame + 1 for track in read(file)), default=0), partial(read, file)))
+        return found
+
+    @staticmethod
+    def _tracks(earlier: list[tuple[int, Callable[[], Iterator[Track]]]], frames: int) -> Iterator[Track]:
+        """The tracks of the earlier part of the run."""
+        read = earlier[0][1] if earlier else lambda: iter(())
+        return takewhile(lambda track: track.frame < frames, read())
