@@ -68,6 +68,7 @@ class Bearings:
     centre     float64 (5, 4), the filter's mean (x, y, and their speeds) above its covariance; None before it has any
     balance    float64 (6,), where the object's colours lie in its window: frames taken in, contrast, the first
                centre's x and y, the present one's; None where nothing is known of it
+    sightings  frames in a row in which an object that is not found yet was seen at one place
     """
 
     state: State
@@ -79,6 +80,7 @@ class Bearings:
     motion: Motion | None = None
     centre: np.ndarray | None = None
     balance: np.ndarray | None = None
+    sightings: int = 0
 
 
 @dataclass(frozen=True, slots=True)

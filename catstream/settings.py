@@ -192,6 +192,11 @@ class Settings:
         float,
         _about("The same as a share of the score that the object usually has: the higher one counts.", ge=0, le=1),
     ] = 0.65
+    sighting_lead: Annotated[
+        float,
+        _about("Score by which the object of a saved model must lead the rest of the frame where it is first found."),
+    ] = 0.25
+    sighting_frames: Annotated[int, _about("Frames in a row that must agree on a first sighting.", ge=1)] = 3
     sure_score: Annotated[float, _about("Score below which the whole frame is searched now and then.")] = 0.55
     lost_score: Annotated[float, _about("Score below which the whole frame is searched in every frame.")] = 0.3
     jump_margin: Annotated[float, _about("Score by which a window elsewhere must be better than the one near.")] = 0.4

@@ -70,7 +70,7 @@ def bearings_state(bearings: Bearings | None) -> State:
         arrays = {f"bearings.{name}": array for name, array in {**parts, "centre": bearings.centre}.items()}
     if bearings.balance is not None:
         arrays["bearings.balance"] = bearings.balance
-    names = ("state", "window", "sure", "first", "usual", "elsewhere")
+    names = ("state", "window", "sure", "first", "usual", "elsewhere", "sightings")
     return arrays, {name: getattr(bearings, name) for name in names}
 
 

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 __all__ = ["Detector"]
 
 _USUAL_RATE = 0.01  # share that a frame has in the score that the object usually has
-_SOUGHT_FACTORS = (1.0, 1.25**3, 1.25**-3)  # of the size of an object not found yet; a search tries those between
+_AGAIN_OVERLAP = 0.3  # above which two windows in successive frames are the same object
+_SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that is not found yet
 
 
 class Detector:
@@ -58,6 +59,7 @@ class Detector:
         self._first_frame = self.seq  # of this object: an older model is of another one
         self._usual_score = 0.0
         self._elsewhere = False  # found by a search of the whole frame, and not trusted yet
+        self._sightings = 0  # frames in a row in which a saved model saw its object at one place
         self._first_box: Box | None = None  # None while it was not found yet
         self._centre: CentreFilter | None = None
         self._balance = Balance()
@@ -113,6 +115,9 @@ class Detector:
 
     def seek(self, model: Model, box: Box) -> None:
         """Start with a model: the object is absent until it is found, in whichever frame and size that is.
+
+        It is found at the window that scores `sighting_lead` higher than the rest of the frame, in
+        `sighting_frames` frames in a row: of two objects that look alike, neither.
 
         Parameters
         ----------
@@ -187,6 +192,7 @@ class Detector:
         self._first_box = bearings.first
         self._box, self._sure_box = bearings.window, bearings.sure
         self._usual_score, self._elsewhere = bearings.usual, bearings.elsewhere
+        self._sightings = bearings.sightings
         if bearings.motion is not None and bearings.centre is not None:
             self._centre = CentreFilter.resumed(bearings.motion, bearings.centre, bearings.state != "absent")
         if bearings.balance is not None:
@@ -226,10 +232,7 @@ class Detector:
             return self._answer(time, found.score, self._lesson(frame, found))
         found = self._find(frame) if self._first_box else self._seek(frame)
         self._elsewhere &= found.score < settings.trust_score
-        there = self._there(found.score)
-        if there and self._first_box is None:
-            self._box = self._sure_box = self._first_box = found.box
-            self._elsewhere = found.score < settings.trust_score
+        there = self._first_box is not None and self._there(found.score)
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
             self._box = self._balanced(extent.followed(self._box, found, settings), found).held_in(*frame.size)
@@ -280,9 +283,24 @@ class Detector:
         return found
 
     def _seek(self, frame: Pyramid) -> Found:
-        """The best window of the whole frame, of one of the sizes that the object may have."""
-        factor = _SOUGHT_FACTORS[self.seq % len(_SOUGHT_FACTORS)]
-        found = search.whole(frame, self._box.scaled(factor), self.model, self.settings)
+        """The best window of the whole frame, of any size that the object may have.
+
+        The object counts as found once this window has led the rest of the frame at one place in several
+        frames in a row. While nothing scores high, each frame is searched at a third of the sizes.
+        """
+        settings = self.settings
+        third = _SOUGHT_FACTORS[self.seq % 3 :: 3]
+        found, lead = search.sought(frame, self._box, third, self.model, settings)
+        if self._sightings or found.score >= settings.return_score:
+            found, lead = search.sought(frame, self._box, _SOUGHT_FACTORS, self.model, settings)
+        seen = found.score >= settings.return_score and lead >= settings.sighting_lead
+        again = self._sightings and found.box.overlap(self._sure_box) > _AGAIN_OVERLAP
+        self._sightings = (self._sightings + 1 if again else 1) if seen else 0
+        self._sure_box = found.box
+        if self._sightings < settings.sighting_frames:
+            return found
+        self._box = self._first_box = found.box
+        self._elsewhere = True
         return self._fitted(frame, found)
 
     def _fitted(self, frame: Pyramid, found: Found) -> Found:
@@ -317,4 +335,4 @@ class Detector:
         motion, centre = (self._centre.motion, self._centre.state) if self._centre is not None else (None, None)
         boxes = self._box, self._sure_box, self._first_box
         usual, balance = float(self._usual_score), self._balance.state.copy()
-        return Bearings(self.state, *boxes, usual, self._elsewhere, motion, centre, balance)
+        return Bearings(self.state, *boxes, usual, self._elsewhere, motion, centre, balance, self._sightings)

@@ -18,7 +18,7 @@ from catstream.detection.windows import Scored
 from catstream.messages import Model
 from catstream.settings import Settings
 
-__all__ = ["Found", "highest", "local", "scored_around", "scored_whole", "whole"]
+__all__ = ["Found", "highest", "local", "scored_around", "scored_whole", "sought", "whole"]
 
 _FAR_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _MOST_PIXELS = 4_000_000  # of a resized frame: what a whole search may cost for a tiny object in a large frame
@@ -60,6 +60,37 @@ def whole(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
             least = worth
             best = Found(score, scored.box(*scored.refined(*place)))
     return best
+
+
+def sought(
+    frame: Pyramid, box: Box, factors: tuple[float, ...], model: Model, settings: Settings
+) -> tuple[Found, float]:
+    """The best window of a whole frame at several sizes, and by how much it scores higher than the rest of the frame.
+
+    In a scene that the model never saw, anything may score high. The windows that do not touch the best
+    one show how high; 0, the mean of the background that was learned, counts as one of them.
+
+    Parameters
+    ----------
+    factors : the sizes, as factors of that of the box
+    """
+    sizes = [scored_whole(frame, box.scaled(factor), model) for factor in factors]
+    costs = [settings.extent_penalty * abs(np.log(factor)) for factor in factors]
+    worths = [float(scored.scores.max()) - cost for scored, cost in zip(sizes, costs, strict=True)]
+    best = sizes[int(np.argmax(worths))]
+    place = highest(best.scores)
+    found = Found(float(best.scores[place]), best.box(*best.refined(*place)))
+    return found, found.score - max(0.0, *(_highest_apart(scored, found.box) for scored in sizes))
+
+
+def _highest_apart(scored: Scored, box: Box) -> float:
+    """The highest score of a window that does not touch a box; -inf if there is none."""
+    (x, y), (w, h) = scored.origin, scored.step
+    rows, columns = scored.scores.shape
+    top, left = y + h * np.arange(rows), x + w * np.arange(columns)
+    beyond = (top >= box.y + box.h) | (top + WINDOW * h <= box.y)
+    beside = (left >= box.x + box.w) | (left + WINDOW * w <= box.x)
+    return float(scored.scores.max(where=beyond[:, None] | beside, initial=-np.inf))
 
 
 def scored_around(frame: Pyramid, box: Box, side: int, model: Model) -> Scored:

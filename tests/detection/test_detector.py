@@ -242,16 +242,66 @@ def test_a_box_that_cannot_be_followed_leaves_what_is(box):
     assert detector.step(image)[0].state != "absent"
 
 
-def test_a_model_finds_its_object_in_a_frame_that_it_never_saw(scene):
-    teacher = started(scene)
-    model = dataclasses.replace(teacher.model, version=7)
+@pytest.fixture
+def learned(scene):
+    """A model of the object, as one that is saved."""
+    return dataclasses.replace(started(scene).model, version=7)
+
+
+def sought(model, frames):
+    """The tracks of an object, as large as START when it was learned, that is searched for in these frames."""
     detector = Detector(Settings())
     detector.seek(model, START)
-    absent, _ = detector.step(scene())
-    found = [detector.step(scene((90, 60)))[0] for _ in range(3)][-1]
-    assert (absent.state, absent.model_version) == ("absent", 7)
-    assert found.state == "present"
-    assert found.box.overlap(Box(90, 60, 48, 40)) > 0.6
+    return [detector.step(frame)[0] for frame in frames]
+
+
+def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned):
+    tracks = sought(learned, [scene(), *[scene((90, 60))] * 3])
+    assert [track.state for track in tracks] == ["absent"] * 3 + ["present"]
+    assert {track.model_version for track in tracks} == {7}
+    assert tracks[-1].box.overlap(Box(90, 60, 48, 40)) > 0.6
+
+
+@pytest.mark.parametrize("before", [0, 1, 2], ids="frames before: {}".format)
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.5, 2.0], ids="size: {}".format)
+def test_the_first_box_of_an_object_that_is_found_has_its_size(scene, learned, factor, before):
+    frame = cv2.resize(scene((90, 60)), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    empty = cv2.resize(scene(), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    tracks = sought(learned, [empty] * before + [frame] * 5)
+    box = next(track.box for track in tracks if track.box is not None)
+    assert np.sqrt(box.area / (48 * 40)) == pytest.approx(factor, rel=0.15)
+
+
+def test_a_window_that_does_not_lead_its_frame_is_not_the_object(scene, learned):
+    frame = scene((90, 60))
+    frame[150:190, 200:248] = frame[60:100, 90:138]
+    tracks = sought(learned, [frame] * 10)
+    assert {track.state for track in tracks} == {"absent"}
+    assert tracks[-1].score > Settings().return_score
+
+
+def test_what_is_in_another_place_in_each_frame_is_not_the_object(scene, learned):
+    tracks = sought(learned, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
+    assert {track.state for track in tracks} == {"absent"}
+
+
+def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned):
+    detector = Detector(Settings())
+    detector.seek(learned, START)
+    taught = [len(detector.step(scene((90, 60)))[1].rows) for _ in range(5)]
+    assert not any(taught[:2])
+    assert any(taught)
+
+
+def test_a_search_that_is_resumed_goes_on_bit_for_bit(scene, learned):
+    frame = scene((90, 60))
+    tracks = sought(learned, [frame] * 5)
+    other, before = Detector(Settings()), Detector(Settings())
+    before.seek(learned, START)
+    bearings = [before.step(frame)[1].bearings for _ in range(2)][-1]
+    assert bearings.sightings == 2
+    other.resume(2, bearings, learned)
+    assert [other.step(frame)[0] for _ in range(3)] == tracks[2:]
 
 
 def test_a_model_of_other_features_is_refused():
