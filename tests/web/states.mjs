@@ -47,13 +47,21 @@ const STATES = {
   "the end, and of the server": { closed: true },
 };
 const doing = {
-  drawing: async (page) => {
+  drawing: async (page, viewport) => {
     await page.waitForFunction(() => document.querySelector("#veil").textContent === "");
     const view = await page.locator("#picture").boundingBox();
-    await page.mouse.move(view.x + view.width / 3, view.y + view.height / 3);
-    await page.mouse.down();
-    await page.mouse.move(view.x + view.width / 2, view.y + view.height / 2);
-    await page.mouse.up();
+    const at = (part) => ({ x: view.x + view.width * part, y: view.y + view.height * part });
+    if (viewport === PHONE) { // with a finger
+      const touch = await page.context().newCDPSession(page);
+      for (const [type, ...points] of [["touchStart", at(0.3)], ["touchMove", at(0.4)], ["touchMove", at(0.6)], ["touchEnd"]]) {
+        await touch.send("Input.dispatchTouchEvent", { type, touchPoints: points });
+      }
+    } else {
+      await page.mouse.move(at(0.3).x, at(0.3).y);
+      await page.mouse.down();
+      await page.mouse.move(at(0.6).x, at(0.6).y);
+      await page.mouse.up();
+    }
     await page.waitForSelector("#follow:not([disabled])");
   },
   stopping: async (page) => {
@@ -64,7 +72,7 @@ const doing = {
   "the end, and of the server": (page) => page.evaluate(() => events.onerror()),
 };
 
-const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args: options });
+const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args: options, hasTouch: true });
 const seen = [];
 try {
   for (const [scheme, viewport] of PAGES) {
@@ -80,7 +88,7 @@ try {
     await page.evaluate(axe);
     for (const [name, parts] of Object.entries(STATES)) {
       await page.evaluate((told) => events.onmessage({ data: JSON.stringify(told) }), parts);
-      await doing[name]?.(page);
+      await doing[name]?.(page, viewport);
       const { violations } = await page.evaluate(() => axe.run());
       seen.push({ state: name, scheme, pill: await page.locator("#state").innerText(), veil: await page.locator("#veil").textContent(),
         about: await page.locator("#about").textContent(), frame: await page.locator("#frame").textContent(),
