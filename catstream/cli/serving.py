@@ -48,7 +48,7 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @click.option(
             f"--{prefix}token",
-            "given_token",
+            "token",
             envvar="VIEW_TOKEN",
             show_envvar=True,
             metavar="TOKEN",
@@ -64,8 +64,8 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
             help="File that holds this token.",
         )
         @functools.wraps(command)
-        def with_one(*args: Any, given_token: str | None, token_file: Path | None, **others: Any) -> None:
-            command(*args, token=given_token or (_read(token_file) if token_file else None), **others)
+        def with_one(*args: Any, token: str | None, token_file: Path | None, **others: Any) -> None:
+            command(*args, token=token or (_read(token_file) if token_file else None), **others)
 
         return with_one
 

@@ -53,7 +53,8 @@ async function pause() {
 }
 
 async function follow(box, leave) {
-  const answer = await steer("set-box", { box, keep: $("#keep").checked });
+  const keep = $("#keep").checked && !status.waiting;
+  const answer = await steer("set-box", { box: box.map((side) => Math.round(side * 10) / 10), keep });
   if (answer && leave) {
     await leave();
     say(answer.reason);
@@ -64,6 +65,7 @@ async function follow(box, leave) {
 function showDrawing(drawing, box) {
   $("#watching").hidden = drawing;
   $("#drawing").hidden = !drawing;
+  $("#keep").parentElement.hidden = Boolean(status.waiting); // nothing was learned yet
   $("#follow").disabled = !box;
 }
 
