@@ -15,13 +15,13 @@ class Numbers(Source):
     """So many frames, then what is wrong with the next one."""
 
     def __init__(self, count, problem=None):
-        super().__init__("numbers", count, 25.0, (8, 8))
+        super().__init__("numbers", 25.0, (8, 8))
         self.read, self.readers = 0, set()
-        self._problem = problem
+        self._count, self._problem = count, problem
 
     def __next__(self):
         self.readers.add(threading.current_thread().name)
-        if self.read == self.frames:
+        if self.read == self._count:
             raise self._problem or StopIteration
         self.read += 1
         return Frame(self.read - 1, 0.0, np.zeros((8, 8, 3), np.uint8))
