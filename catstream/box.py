@@ -15,6 +15,8 @@ __all__ = ["Box"]
 class Box(NamedTuple):
     """A rectangle in pixels: its top left corner, its width and its height.
 
+    Examples
+    --------
     >>> Box(10, 20, 30, 40).centre
     (25.0, 40.0)
     >>> Box(0, 0, 10, 10).overlap(Box(5, 0, 10, 10))
@@ -48,6 +50,8 @@ class Box(NamedTuple):
     def held_in(self, width: int, height: int) -> Box:
         """The box moved, where it must be, until its centre is in a frame of this size.
 
+        Examples
+        --------
         >>> Box(90, 10, 20, 20).held_in(80, 60)
         Box(x=69.0, y=10.0, w=20, h=20)
         """
@@ -72,6 +76,8 @@ class Box(NamedTuple):
         BoxError
             If these are not four numbers.
 
+        Examples
+        --------
         >>> Box.of("10,20,30,40")
         Box(x=10.0, y=20.0, w=30.0, h=40.0)
         >>> import numpy as np

@@ -231,6 +231,8 @@ class Track:
     pts : float or None
         Time stamp of the frame in a live stream, seconds of a clock of the stream's own; None of a file.
 
+    Examples
+    --------
     >>> Track(13, 12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
     """
@@ -256,6 +258,8 @@ class Track:
 
         `catstream sink FILE.ndjson` writes the same.
 
+        Examples
+        --------
         >>> Track(13, 12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
         True
         """

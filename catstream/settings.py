@@ -42,6 +42,8 @@ class Settings:
     SettingsError
         For a name that does not exist (names the nearest), or a value that does not fit.
 
+    Examples
+    --------
     >>> Settings(coreset_size=128).coreset_size
     128
     """
@@ -274,10 +276,14 @@ class Settings:
 
         Parameters
         ----------
-        preset : a name of `PRESETS`, or None
-        file : path of a TOML file with `name = value` lines, or None
-        overrides : names and values, or texts `name=value` as `--set` takes them
-        environment : variables, `CATSTREAM_NAME=value`; the process's own where None
+        preset : str or None
+            A name of `PRESETS`.
+        file : path or None
+            A TOML file with `name = value` lines.
+        overrides : mapping of str, or iterable of str
+            Names and values, or texts `name=value` as `--set` takes them.
+        environment : mapping of str, or None
+            Variables, `CATSTREAM_NAME=value`; None for the process's own.
 
         Raises
         ------
@@ -300,6 +306,8 @@ class Settings:
     def of(cls, values: Mapping[str, Any]) -> Settings:
         """Check names and values; texts are read as their setting's type.
 
+        Examples
+        --------
         >>> Settings.of({"ridge": ".5", "lockstep": "true"}) == Settings(ridge=0.5, lockstep=True)
         True
         """
@@ -315,6 +323,8 @@ class Settings:
         SettingsError
             Where there is a share and the length is not known.
 
+        Examples
+        --------
         >>> Settings(coreset_share=0.1).for_length(945).coreset_size
         94
         """
@@ -331,6 +341,8 @@ class Settings:
     def but(self, others: Mapping[str, Any] | Iterable[str]) -> Settings:
         """These, but for some: names and values, or texts `name=value` as `--set` takes them.
 
+        Examples
+        --------
         >>> Settings(lockstep=True).but(["coreset_size=32"]).changed()
         ['lockstep=true', 'coreset_size=32']
         """
@@ -343,6 +355,8 @@ class Settings:
     def changed(self) -> list[str]:
         """Those that differ from their default, as `load` takes them.
 
+        Examples
+        --------
         >>> Settings(lockstep=True, coreset_size=32).changed()
         ['lockstep=true', 'coreset_size=32']
         """

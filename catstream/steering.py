@@ -28,20 +28,25 @@ __all__ = ["Control", "control"]
 
 
 class Control:
-    """The helm of one running pipeline; close it, or use it in a `with`. Any number may hold one.
+    """Sends commands to one running pipeline; close it, or use it in a `with`. Any number of programs may have one.
 
-    endpoint : where it is attached
-    source : that the pipeline follows, empty if that is not known here
-    timeout : seconds that a command may take
+    Attributes
+    ----------
+    endpoint : str
+        Where it is attached.
+    source : str
+        The source that the pipeline follows, empty if that is not known here.
+    timeout : float
+        Seconds that a command may take.
 
     Raises
     ------
     RefusedError
-        From each command, where the pipeline says why it is not carried out.
+        From each command, if the pipeline does not carry it out; says why.
     SilenceError
-        From each command, where no answer came in time; one that is on its way may still be carried out.
+        From each command, if no answer came in time; one that is on its way may still be carried out.
     ServiceError
-        From each command, where the pipeline does not let these keys steer.
+        From each command, if the pipeline does not let these keys steer.
     """
 
     def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> None:
@@ -123,18 +128,21 @@ class Control:
 
 
 def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> Control:
-    """Take the helm of a running pipeline.
+    """Attach to a running pipeline, to steer it.
 
     Parameters
     ----------
-    endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
-    timeout : seconds that a command may take
-    keys : the folder of keys of this client, where the pipeline asks for some; they must be allowed to steer
+    endpoint : str
+        Where it runs, as the setting `endpoint` says it. Empty for the only pipeline of this user.
+    timeout : float
+        Seconds that a command may take.
+    keys : str
+        Folder of the keys of this client, if the pipeline asks for some; they must be allowed to steer.
     source : that the pipeline follows, instead of its endpoint: "walk.mp4"
 
     Raises
     ------
     ServiceError
-        Where `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
+        If `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
     """
     return Control(endpoint, timeout=timeout, keys=keys, source=source)

@@ -258,15 +258,19 @@ def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys
 
     Parameters
     ----------
-    endpoint : where it runs, as the setting `endpoint` says it; empty for the only pipeline of this user
-    channel : "tracks", "models", "health", "samples", "features" or "previews"
-    timeout : seconds without a message after which iterating raises `SilenceError`; None to wait for ever
-    keys : the folder of keys of this client, where the pipeline asks for some
+    endpoint : str
+        Where it runs, or will run, as the setting `endpoint` says it. Empty for the only running pipeline of this user.
+    channel : str
+        "tracks", "models", "health", "samples", "features" or "previews".
+    timeout : float or None
+        Seconds without a message after which iterating raises `SilenceError`; None to wait for ever.
+    keys : str
+        Folder of the keys of this client, if the pipeline asks for some.
 
     Raises
     ------
     ServiceError
-        Where there is no such channel, `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
+        If there is no such channel, `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
     """
     return Subscription(endpoint, channel, timeout=timeout, keys=keys)
 

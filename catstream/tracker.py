@@ -47,8 +47,11 @@ class Tracker:
 
     Parameters
     ----------
-    settings : `Settings`, or names and values of those that are not to have their default
+    settings : Settings or mapping of str
+        Those that are not to have their default.
 
+    Examples
+    --------
     >>> frame = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
     >>> tracker = Tracker()
     >>> tracker.init(frame, (60, 40, 40, 40))
@@ -79,9 +82,12 @@ class Tracker:
 
         Parameters
         ----------
-        frame : the image, as above
-        box : x, y, w, h in pixels: four numbers, or a text such as "120,80,64,48"
-        time : seconds since the start of the video
+        frame : ndarray
+            The image, as above.
+        box : str or four numbers
+            x, y, w, h in pixels, for example `(120, 80, 64, 48)` or `"120,80,64,48"`.
+        time : float
+            Seconds since the start of the video.
 
         Raises
         ------
@@ -106,7 +112,10 @@ class Tracker:
 
         Returns
         -------
-        whether it is there, and where: x, y, w, h in pixels, None where absent
+        found : bool
+            Whether the object is there.
+        box : Box or None
+            Where, x, y, w, h in pixels; None while it is absent.
 
         Raises
         ------

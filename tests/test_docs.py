@@ -262,3 +262,9 @@ def test_one_version_is_told_everywhere():
 if __name__ == "__main__":
     settings = DOCS / "settings.md"
     settings.write_text(_TABLE.sub(lambda found: found[1] + settings_table() + found[2], page("docs/settings.md")))
+
+
+def test_every_name_of_the_library_is_in_the_reference_of_the_api():
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"^::: catstream\.(\w+)", page, re.MULTILINE))
+    assert shown - {"errors"} == set(catstream.__all__) - {"CatstreamError", "__version__"}
