@@ -1,0 +1,135 @@
+"""The files of one run: complete, resumed at the frame that all of them hold, and never written over in silence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import closing
+
+import pytest
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages import Position, Track
+from catstream.sinks.run import RunFiles
+from catstream.sinks.sink import STDOUT, open_sink, reader
+from catstream.video.demo import write
+from catstream.video.source import WHOLE, open_source
+
+NAMES = ["t.ndjson", "t.json", "t.csv", "t.txt", "t.sqlite", "t.parquet", "t.mp4"]
+
+
+def track(frame):
+    box = Box(10.0 + frame, 20.0, 30.0, 40.0) if frame % 4 else None
+    return Track(frame + 1, frame, frame / 30, "present" if box else "absent", box, 0.5, frame // 3)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """The files of a run over a short video, in all formats."""
+    source, _ = write(tmp_path, 12, (320, 240))
+
+    def of(folder, names=NAMES, output=True):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        results = tmp_path / folder / "out" if output else None
+        return RunFiles("demo", str(source), WHOLE, results, output, [tmp_path / folder / name for name in names])
+
+    return of
+
+
+def fill(files, first, last, resume=False):
+    with files.opened(resume=resume) as keep:
+        for frame in range(first, last):
+            keep(track(frame), 0.01)
+
+
+def held(files):
+    """What the files of a run hold, in the form in which two runs can be compared."""
+    texts = [path.read_text() for path in files.files if path.suffix in (".ndjson", ".json", ".csv", ".txt")]
+    rows = [list(reader(path)(path)) for path in files.files if path.suffix in (".sqlite", ".parquet")]
+    results = [(files.output / name).read_text() for name in ("demo.txt", "demo.csv", "demo_confidence.value")]
+    lengths = []
+    for film in [files.output / "demo.mp4", *(path for path in files.files if path.suffix == ".mp4")]:
+        with open_source(film) as frames:
+            lengths.append(sum(1 for _ in frames))
+    return texts, rows, results, lengths
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["ended", "killed"])
+def test_a_run_that_is_resumed_leaves_the_files_of_one_in_one_go(files, tmp_path, killed):
+    whole, broken = files("whole"), files("broken")
+    fill(whole, 0, 12)
+    if killed:
+        with broken.opened() as keep:
+            for frame in range(7):
+                keep(track(frame), 0.01)
+            shutil.copytree(tmp_path / "broken", tmp_path / "left")
+        shutil.rmtree(tmp_path / "broken")
+        (tmp_path / "left").rename(tmp_path / "broken")
+    else:
+        fill(broken, 0, 7)
+    torn = tmp_path / "broken" / "t.ndjson"
+    torn.write_bytes(b"".join(torn.read_bytes().splitlines(keepends=True)[:6]) + b'{"seq": 7')
+    assert broken.position() == Position(6, 5, track(5).box)
+    fill(broken, 6, 12, resume=True)
+    assert held(broken) == held(whole)
+    assert broken.made
+
+
+def test_a_file_that_is_new_when_a_run_is_resumed_gets_all_tracks(files):
+    fill(files("run", ["t.csv"]), 0, 7)
+    more = files("run", ["t.csv", "t.json", "t.txt"])
+    assert not more.made
+    fill(more, more.position().seq, 9, resume=True)
+    assert [row["frame"] for row in json.loads(more.files[1].read_text())] == list(range(9))
+    assert len(more.files[2].read_text().splitlines()) == 6, "MOT text has no line where the object is absent"
+
+
+def test_results_that_are_there_are_refused_and_replaced_together_if_that_is_asked_for(files, tmp_path):
+    earlier = files("run", ["t.csv"])
+    fill(earlier, 0, 9)
+    for again, words in (
+        (files("run", []), "demo.mp4.*--overwrite"),
+        (files("run", ["t.csv"], False), "t.csv.*--over"),
+    ):
+        with pytest.raises(VideoError, match=words):
+            again.check(overwrite=False, resumable=False)
+    without_video = RunFiles("demo", earlier.source, WHOLE, earlier.output, False, earlier.files)
+    without_video.check(overwrite=True, resumable=False)
+    fill(without_video, 0, 3)
+    assert len(earlier.files[0].read_text().splitlines()) == 4
+    assert not (earlier.output / "demo.mp4").exists(), "a video of other results would lie beside them"
+    other = RunFiles("street", earlier.source, WHOLE, earlier.output)
+    other.check(overwrite=False, resumable=False)
+    fill(other, 0, 5)
+    assert len((tmp_path / "run" / "out" / "demo.csv").read_text().splitlines()) == 4, "each source has its own table"
+
+
+@pytest.mark.parametrize(
+    ("names", "resumable", "words"),
+    [
+        (["t.xls"], False, "ends with .ndjson"),
+        (["none/t.csv"], False, "a folder that exists"),
+        (["t.csv", "t.csv"], False, "named twice"),
+        (["t.txt", "t.mp4"], True, "does not hold all tracks"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_the_run(files, names, resumable, words):
+    with pytest.raises(VideoError, match=words):
+        files("run", names, output=False).check(overwrite=False, resumable=resumable)
+
+
+def test_a_file_of_somebody_else_is_not_gone_on_with(files):
+    run = files("run", ["t.csv"], output=False)
+    with closing(open_sink(run.files[0])) as other:
+        other.write(track(0))
+    with pytest.raises(VideoError, match="there already"):
+        run.check(overwrite=False, resumable=True)
+    run.check(overwrite=False, resumable=True, known=run.files)
+
+
+def test_standard_output_has_a_line_of_json_for_each_track(files, capsys):
+    run = RunFiles("demo", files("run").source, WHOLE, files=[STDOUT])
+    run.check(overwrite=False, resumable=True)
+    fill(run, 0, 5)
+    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [track(k).to_dict() for k in range(5)]
