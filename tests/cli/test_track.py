@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import signal
 import time
 from pathlib import Path
@@ -13,6 +14,8 @@ import psutil
 import pytest
 
 from catstream.errors import VideoError
+from catstream.learned import Learned
+from catstream.sinks.parquet import ParquetSink
 from catstream.video.source import open_source
 
 FILES = ["demo.csv", "demo.mp4", "demo.txt", "demo_confidence.value", "demo_time.txt"]
@@ -65,19 +68,30 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, said, tmp_path
 
 def test_two_lockstep_runs_write_the_same_bytes(video, said, tmp_path):
     source, box = video
+    printed = []
     for folder in ("one", "two"):
-        assert said("track", source, "--box", box, "--output", tmp_path / folder, "--lockstep")[0] == 0
+        results = ["--output", tmp_path / folder, "--write", "-", "--save-model", tmp_path / f"{folder}.safetensors"]
+        code, output, errors = said("track", source, "--box", box, *results, "--lockstep")
+        assert code == 0, errors
+        printed.append(output)
+    assert printed[0] == printed[1]
+    assert [json.loads(line)["frame"] for line in printed[0].splitlines()] == list(range(60))
+    assert (tmp_path / "one.safetensors").read_bytes() == (tmp_path / "two.safetensors").read_bytes()
+    newest = int(table(tmp_path / "one" / "demo.csv")[-1]["model_version"])
+    assert Learned.load(tmp_path / "one.safetensors").model.version >= newest
     for file in ("demo.txt", "demo_confidence.value", "demo.csv"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
     assert int(table(tmp_path / "one" / "demo.csv")[-1]["model_version"]) > 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_run_keeps_its_results(video, catstream, tmp_path, number):
+def test_a_stopped_run_keeps_its_results(video, catstream, until, tmp_path, number):
     source, box = video
     # A window of one: the video cannot be over before the signal comes.
-    process = catstream("track", source, "--box", box, "--output", tmp_path, "--set", "window=1", "--lockstep")
+    more = ["--write", tmp_path / "t.parquet", "--write", tmp_path / "t.json", "--save-model", tmp_path / "model"]
+    process = catstream("track", source, "--box", box, "--output", tmp_path, *more, "--set", "window=1", "--lockstep")
     children = started(process, tmp_path / "demo.txt")
+    until(lambda: len((tmp_path / "demo.txt").read_text().splitlines()) > 8)
     process.send_signal(number)
     errors = process.communicate(timeout=60)[1]
     assert process.returncode == 130
@@ -85,6 +99,9 @@ def test_a_stopped_run_keeps_its_results(video, catstream, tmp_path, number):
     rows = np.loadtxt(tmp_path / "demo.txt", delimiter=",", ndmin=2)
     assert len(rows) >= 1
     assert len((tmp_path / "demo.csv").read_text().splitlines()) == len(rows) + 1
+    assert len(list(ParquetSink.tracks(tmp_path / "t.parquet"))) == len(rows)
+    assert len(json.loads((tmp_path / "t.json").read_text())) == len(rows)
+    assert Learned.load(tmp_path / "model").model.version >= 1
     assert not any(map(psutil.pid_exists, children))
 
 
