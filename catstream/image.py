@@ -46,7 +46,7 @@ def _checked(image: Any) -> np.ndarray:
             f"{_WANTED}, got None: a read has failed, as at the end of a video; check what it returns first"
         )
     if not isinstance(image, np.ndarray):
-        raise FrameError(f"{_WANTED}, got {type(image).__name__}: turn it into such an array first")
+        raise FrameError(f"{_WANTED}, got {type(image).__name__}: turn it into such an array first, as np.asarray does")
     shape = image.shape
     if not (image.ndim == 2 or (image.ndim == 3 and shape[2] in _CHANNELS)):
         hint = "give one of this shape"
@@ -65,6 +65,8 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
         return image
     if image.dtype.kind == "u" and image.itemsize == 2:
         return (image >> 8).astype(np.uint8)
+    if image.dtype == bool:
+        raise FrameError(f"{_WANTED}, got bool: a mask is no picture, 255 * frame.astype(np.uint8) would be one")
     if image.dtype.kind != "f":
         raise FrameError(
             f"{_WANTED}, got {image.dtype}: frame.astype(np.uint8) if its values are brightness from 0 to 255"

@@ -26,6 +26,7 @@ from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.learned import Learned
 from catstream.messages import Position
 from catstream.settings import Settings
+from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 
 __all__ = ["TREES", "Origin", "began", "held", "learned", "position"]
@@ -148,7 +149,10 @@ def learned(folder: Path, settings: Settings) -> Learned:
     compressor = Generations(folder / TREES).load(settings)
     if compressor.last_sample is None or compressor.box is None or not compressor.sampled:
         raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
-    return Learned(Trainer(settings).train(compressor.last_sample), compressor.last_sample, compressor.box)
+    trainer = Trainer(settings)
+    with one_thread():  # as the pipeline's own trainer: the model has the same bits
+        model = trainer.train(compressor.last_sample)
+    return Learned(model, compressor.last_sample, compressor.box)
 
 
 @contextlib.contextmanager

@@ -102,7 +102,6 @@ class Tracker:
         detector.prepare()  # a library is held to one thread if it is there when a call begins
         with one_thread():
             first = detector.init(image, start, time)  # if the box is refused, all goes on as before
-            kalman.prepare()
             self.detector, self.compressor, self.trainer = detector, compressor, trainer
             self._size = image.shape[:2]
             self._learn(*first)
@@ -216,3 +215,4 @@ class Tracker:
         sample = self.compressor.take(features)
         if sample is not None:
             self.detector.adopt(self.trainer.train(sample))
+            kalman.prepare()  # a later model brings the motion

@@ -53,7 +53,7 @@ def test_grey_is_expanded(bgr, form):
     [
         (None, "got None: a read has failed"),
         ([[1, 2], [3, 4]], "got list: turn it into"),
-        (np.zeros((4, 5, 3), bool), "got bool: frame.astype"),
+        (np.zeros((4, 5, 3), bool), "got bool: a mask is no picture"),
         (np.zeros((4, 5, 3), np.int64), "got int64: frame.astype"),
         (np.zeros((3, 4, 5), np.uint8), r"got the shape \(3, 4, 5\): the channels come last"),
         (np.zeros((2, 4, 5, 3), np.uint8), r"got the shape \(2, 4, 5, 3\): give one image of a batch"),
