@@ -245,7 +245,7 @@ class Board:
     def _picture_part(self, _: int) -> dict[str, Any] | None:
         if self.newest is None:
             return None
-        preview, _ = self.newest
+        preview = self.newest[0]
         return {"frame": preview.frame, "width": preview.width, "height": preview.height, "box": preview.box}
 
     def _points_part(self, new: int) -> list[list[float | None]]:
