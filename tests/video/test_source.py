@@ -42,6 +42,7 @@ def encoded(suffix: str, frames: int, options: frozenset[tuple[str, str]], rotat
         with av.open(str(path), "w", options=dict(options)) as container:
             stream: Any = container.add_stream(CODECS[suffix], rate=25)
             stream.width, stream.height = 160, 120
+            stream.codec_context.thread_count = 1  # with more, the bytes differ from run to run
             stream.pix_fmt = "yuvj420p" if suffix == ".avi" else "yuv420p"
             if rotation:
                 stream.set_display_rotation(rotation)
