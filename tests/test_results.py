@@ -1,0 +1,69 @@
+"""`docs/results.md` shows what the benchmarks wrote, and README what the page shows."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+BENCHMARKS = ROOT / "benchmarks"
+sys.path.append(str(BENCHMARKS))
+
+import page  # noqa: E402
+from groups import CHECK, TUNED  # noqa: E402
+
+SCRIPTS = {
+    path.relative_to(ROOT).as_posix() for path in BENCHMARKS.rglob("*.py") if "publish(figures" in path.read_text()
+}
+FOUND = page.records()
+EVERY_RECORD = pytest.mark.parametrize("record", FOUND.values(), ids=FOUND.keys())
+
+
+def measured_by(record: page.Record) -> str:
+    """The benchmark, or the verb, that wrote a record."""
+    program, name = record["command"].split()[:2]
+    return name if program == "python" else f"{program} {name}"
+
+
+def test_the_page_is_the_one_that_the_records_give():
+    shown = page.PAGE.read_text(encoding="utf-8")
+    assert shown == page.written(FOUND) == page.written(page.records()), "docs/results.md is old: run `make results`"
+    assert shown.count("\n") <= 200
+
+
+def test_readme_has_the_figures_of_the_records():
+    shown = page.README.read_text(encoding="utf-8")
+    assert shown == page.readme(FOUND, shown), "the figures in README.md are old: run `make results`"
+
+
+def test_every_benchmark_has_a_record_and_every_record_its_place_on_the_page():
+    measured = {measured_by(record) for record in FOUND.values()}
+    assert measured == SCRIPTS | {"catstream evaluate", "catstream loadtest"}, (
+        "benchmarks/results: see docs/benchmarks.md"
+    )
+    assert FOUND.keys() == page.shown(), "benchmarks/page.py does not show a record, or shows one that is not there"
+
+
+@EVERY_RECORD
+def test_a_record_says_what_made_it(record):
+    assert {"version", "commit", "date", "command", "settings", "machine"} <= record.keys()
+    assert re.fullmatch(r"[0-9a-f]{10}", record["commit"]), "measured beside changes that were not committed"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"])
+    assert "--quick" not in record["command"], "the figures of --quick mean nothing"
+    assert {"processor", "cores"} <= record["machine"].keys()
+
+
+@EVERY_RECORD
+def test_a_record_names_no_folder_of_the_machine(record):
+    assert not re.findall(r'"[^"]*(?:^|[ "=])/\w[^"]*"', json.dumps(record)), "a path of the machine"
+
+
+def test_the_sequences_that_the_defaults_were_chosen_on_are_told_apart():
+    names = {row["name"] for row in FOUND["accuracy"]["sequences"]}
+    assert (len(TUNED), len(CHECK), len(TUNED & CHECK)) == (20, 15, 3)
+    assert names >= TUNED | CHECK
+    assert "The defaults were chosen on the first 20" in page.written(FOUND)
