@@ -190,7 +190,7 @@ def test_a_run_that_is_complete_is_not_resumed_and_says_so(video, said, tmp_path
     (source, box), kept, out = video, tmp_path / "kept", tmp_path / "out"
     code, _, errors = said("track", source, "--box", box, "--end", 6, "--output", out, "--state", kept)
     assert code == 0, errors
-    before = (out / "tracks.csv").read_bytes()
+    before = (out / "demo.csv").read_bytes()
     code, output, errors = said("track", "--resume", kept)
     assert (code, output) == (0, "")
     assert f"the run in {kept} is complete, all 6 frames were followed, its results are in {out}" in errors
@@ -198,4 +198,4 @@ def test_a_run_that_is_complete_is_not_resumed_and_says_so(video, said, tmp_path
     assert code == 2
     assert "is complete" in errors
     assert "no frame is left for a box" in " ".join(errors.split())
-    assert (out / "tracks.csv").read_bytes() == before
+    assert (out / "demo.csv").read_bytes() == before
