@@ -24,7 +24,7 @@ $(READY): requirements.lock pyproject.toml
 	@.ci/step "installing $$(grep -c '==' requirements.lock) packages, 900 MB on disk: a minute or more" \
 		$(PIP) --require-hashes -r requirements.lock
 	@.ci/step "installing catstream itself" $(PIP) --no-deps --no-build-isolation --editable .
-	@.ci/step "compiling kernels, once" $(BIN)/python -c 'import catstream.detection.detector'
+	@.ci/step "compiling kernels, once" $(BIN)/python -P -c 'import logging; logging.disable(); import catstream.detection.detector'
 	@touch $@
 
 develop: $(TOOLS)  ## add what tests and checks need, from requirements-dev.lock

@@ -32,7 +32,7 @@ for name in VERBS:
 
 
 def test_following_and_the_help_of_every_verb_need_no_extra():
-    subprocess.run([sys.executable, "-c", BASE], check=True)
+    subprocess.run([sys.executable, "-P", "-c", BASE], check=True)
 
 
 @pytest.mark.parametrize(("package", "extra"), [("catstream.web", "view"), ("catstream.loadtest", "loadtest")])
