@@ -42,7 +42,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     seconds = [watched(go_on, out, chance.randrange(most)) for _ in range(moments - 1)]
     seconds.append(watched(go_on, out, None))
 
-    rows = [track.frame for track in tracks(out)]
+    rows = [track.frame for track in tracks(out, video.stem)]
     stored = Generations(kept / TREES).load(Settings()).seq
     columns = ("killed", "frames", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")
     row = (moments, frames, frames - len(set(rows)), len(rows) - len(set(rows)), stored)

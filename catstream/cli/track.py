@@ -169,6 +169,10 @@ def track(
         [*_written(notes), *([STDOUT] if STDOUT in write else [])],
         pipeline.settings.image_rate,
     )
+    if files.video and output is None:
+        raise click.UsageError("--video needs --output, the folder to write it to")
+    if pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)):
+        raise click.UsageError("a video reads the frames once more, and those of a live source are gone: leave it away")
     files.check(
         overwrite=overwrite,
         resumable=state is not None or resume is not None,

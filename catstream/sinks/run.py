@@ -16,7 +16,6 @@ from catstream.storage import is_writable
 from catstream.video import results
 from catstream.video.frames import RATE
 from catstream.video.results import ResultsWriter
-from catstream.video.source import is_live
 
 __all__ = ["RunFiles"]
 
@@ -55,10 +54,6 @@ class RunFiles:
         resumable : whether the run may be resumed one day
         known : files, and a folder of results, that an earlier part of this run wrote
         """
-        if self.video and self.output is None:
-            raise VideoError("--video needs --output, the folder to write it to")
-        if is_live(self.source) and (self.video or any(file.suffix == ".mp4" for file in self.files)):
-            raise VideoError("a video reads the frames once more, and those of a live source are gone: leave it away")
         if self.output is not None:
             folder = self.output.absolute()
             nearest = next(path for path in (folder, *folder.parents) if path.exists())

@@ -17,12 +17,12 @@ from catstream.wire.sockets import Responder
 
 
 @pytest.fixture
-def pipeline(tmp_path, monkeypatch):
+def pipeline(folder, monkeypatch):
     """Starts a pipeline as far as commands can tell; gives its endpoint and the list of the commands that came.
 
     No pipelines but those of the test are found.
     """
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     with ExitStack() as stack:
         yield lambda source: stack.enter_context(_commanded(source))

@@ -43,8 +43,9 @@ def test_a_caller_that_stops_early_leaves_no_worker():
 
 
 def test_ctrl_c_during_imports_ends_at_once(monkeypatch, capfd):
+    before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(os, "_exit", sys.exit)
     with pytest.raises(SystemExit, match=str(INTERRUPTED)), interruptible():
         signal.raise_signal(signal.SIGINT)
     assert capfd.readouterr().err == "stopped\n"
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before

@@ -189,8 +189,8 @@ def test_the_folder_of_a_killed_process_goes_with_the_next_one_and_that_of_a_liv
         assert set(tmp_path.iterdir()) == {first, second}
 
 
-def test_without_a_place_there_must_be_just_one_pipeline(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # where no others run
+def test_without_a_place_there_must_be_just_one_pipeline(folder, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))  # where no others run
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     with pytest.raises(ServiceError, match="no pipeline of yours is running"):
         find()
