@@ -55,6 +55,9 @@ _SHORT_SECONDS = 0.5
 #: Reading a container that fails so often in a row, without a packet between, has come to its end.
 _MOST_FAILURES = 3
 
+#: Bytes between two packets of a Matroska file that belong to none: the heads of clusters and blocks have far fewer.
+_MOST_BETWEEN = 4096
+
 #: A file larger than this, in bytes, is not read through to count its frames.
 _MOST_COUNTED = 1 << 30
 
@@ -389,8 +392,9 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
     """Packets, the last an empty one, each with what is wrong at its place: the empty text for nothing."""
     import av
 
-    end, failures, stated = 0.0, 0, _stated_seconds(container, stream)
-    packets = container.demux(stream)
+    end, place, failures, stated = 0.0, 0, 0, _stated_seconds(container, stream)
+    matroska = "matroska" in container.format.name
+    packets = container.demux()
     while True:
         try:
             packet = next(packets)
@@ -399,16 +403,21 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
             yield None, reason(error)
             if failures == _MOST_FAILURES:
                 return
-            packets = container.demux(stream)  # it reads on where it is
+            packets = container.demux()  # it reads on where it is
             continue
         failures = 0
+        # FFmpeg passes over a damaged place in a Matroska file without a word.
+        missing = matroska and 0 < place < (packet.pos or 0) - _MOST_BETWEEN
+        place = max(place, (packet.pos or 0) + packet.size)
+        if packet.stream is not stream:
+            continue
         if packet.dts is None and not packet.size:
             short = stated - end > max(_SHORT_SECONDS, 2 / rate)
             yield packet, f"it says it lasts {stated:.1f} s, and ends at {end:.1f} s" if short else ""
             return
         if packet.pts is not None:
             end = max(end, float((packet.pts + (packet.duration or 0) - (stream.start_time or 0)) * stream.time_base))
-        yield packet, "data is missing" if packet.is_corrupt else ""
+        yield packet, "data is missing" if packet.is_corrupt or missing else ""
 
 
 def _stated_seconds(container: Any, stream: Any) -> float:

@@ -39,10 +39,16 @@ def encoded(suffix: str, frames: int, options: frozenset[tuple[str, str]], rotat
     """A file of numbered frames, which many tests read."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"a{suffix}")
-        with av.open(str(path), "w", options=dict(options)) as container:
-            stream: Any = container.add_stream(CODECS[suffix], rate=25)
+        # The same bytes in each run: Matroska has random identifiers, x264's macroblock tree is chaotic.
+        muxing = {
+            "fflags": "bitexact",
+            "cluster_time_limit": "400",
+            **dict(options),
+        }  # a long Matroska has many clusters
+        with av.open(str(path), "w", options=muxing) as container:
+            quick = {"preset": "superfast"} if CODECS[suffix] == "libx264" else {}
+            stream: Any = container.add_stream(CODECS[suffix], rate=25, options=quick)
             stream.width, stream.height = 160, 120
-            stream.codec_context.thread_count = 1  # with more, the bytes differ from run to run
             stream.pix_fmt = "yuvj420p" if suffix == ".avi" else "yuv420p"
             if rotation:
                 stream.set_display_rotation(rotation)
