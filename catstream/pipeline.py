@@ -26,7 +26,7 @@ from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.state import Origin, began, held, learned, position
 from catstream.video.frames import without_password
-from catstream.video.source import WHOLE, is_live, open_source
+from catstream.video.source import WHOLE, is_live, open_source, without_scheme
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.readable import readable
 from catstream.wire.sockets import Receiver, Subscriber
@@ -153,7 +153,7 @@ class Pipeline:
         self.settings = (self._kept.settings if self._kept is not None else Settings()).but(given)
         if source is None:
             raise SettingsError("a new run needs a source: give one")
-        self.source = str(source)
+        self.source = without_scheme(str(source))
         self._box = Box.of(box) if box is not None else None
         self._record = None if record is None else Path(record)
         self._save_model = None if save_model is None else Path(save_model)

@@ -37,7 +37,7 @@ import numpy as np
 from catstream.errors import VideoError
 from catstream.video.frames import RATE, Frame, Source, Upright, reason
 
-__all__ = ["WHOLE", "image_files", "is_live", "natural_order", "open_source"]
+__all__ = ["WHOLE", "image_files", "is_live", "natural_order", "open_source", "without_scheme"]
 
 #: All frames of a source.
 WHOLE = slice(None)
@@ -172,7 +172,12 @@ def open_source(
         from catstream.video.live import LiveSource  # here, as files do without its threads
 
         return LiveSource(str(text), start, since=since, idle=idle)
-    path = _path(text)
+    if str(text) == "-":
+        raise VideoError(
+            "a pipe cannot be read again after a process was restarted, so standard input is no source: "
+            "write the video to a file, or serve it as a stream that can be opened again"
+        )
+    path = Path(without_scheme(str(text)))
     images = partial(_images, part=part, start=start, rate=image_rate)
     video = partial(_video, part=part, start=start, skip_damaged=skip_damaged)
     try:
@@ -187,18 +192,23 @@ def open_source(
     raise VideoError(f"there is no video or folder {str(text)!r}: {_HELP}")
 
 
-def _path(text: str | Path) -> Path:
-    if str(text) == "-":
-        raise VideoError(
-            "a pipe cannot be read again after a process was restarted, so standard input is no source: "
-            "write the video to a file, or serve it as a stream that can be opened again"
-        )
-    if str(text).startswith("file://"):
-        address = urlsplit(str(text))
-        if address.netloc not in ("", "localhost"):
-            raise VideoError(f"{str(text)!r} names a file of another machine: copy it here, or give file:///PATH")
-        return Path(unquote(address.path))
-    return Path(text)
+def without_scheme(text: str) -> str:
+    """The path that a file:// address names; any other text as it is.
+
+    Raises
+    ------
+    VideoError
+        For a file of another machine.
+
+    >>> without_scheme("file:///videos/a%20walk.mp4"), without_scheme("./0")
+    ('/videos/a walk.mp4', './0')
+    """
+    if not text.startswith("file://"):
+        return text
+    address = urlsplit(text)
+    if address.netloc not in ("", "localhost"):
+        raise VideoError(f"{text!r} names a file of another machine: copy it here, or give file:///PATH")
+    return unquote(address.path)
 
 
 def image_files(path: Path) -> list[Path]:

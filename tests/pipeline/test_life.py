@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+from pathlib import Path
 
 import pytest
 
@@ -50,6 +51,11 @@ def test_in_a_with_it_is_iterated_piece_by_piece_and_afterwards_no_more(pipeline
     for again in (lambda: next(iter(pipeline)), pipeline.__enter__):
         with pytest.raises(ServiceError, match="make another Pipeline"):
             again()
+
+
+def test_a_file_address_is_kept_as_a_path_which_a_run_can_be_resumed_by(video):
+    path, boxes = video
+    assert Pipeline(Path(path).as_uri(), str(boxes[0])).source == str(path)
 
 
 def test_before_it_has_started_it_says_what_it_has_not(pipeline):
