@@ -119,8 +119,8 @@ def main(
                     found = _follow(detector, frame, helm.orders)
                 track, features = found
                 line.send(replace(track, pts=frame.pts), features)
-                if track.model_version:
-                    kalman.prepare()  # a later model brings the motion
+                if track.frame >= process.settings.motion_frames // 2:
+                    kalman.prepare()  # so many more, and a model brings the motion
                 line.previews.show(track.frame, frame.image, track.box)
                 if not frames.live:
                     line.wait(detector)

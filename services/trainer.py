@@ -29,7 +29,8 @@ def main(process: Process) -> None:
             if message is not None and not end and message.version != version:
                 process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
-                kalman.prepare()  # a later sample brings the centres
+                if message.frame >= process.settings.motion_frames // 2:
+                    kalman.prepare()  # so many more, and a sample brings the centres
                 version, trained = message.version, trained + 1
             models.welcome()
             process.beat(counters, now=end)

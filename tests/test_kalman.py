@@ -12,16 +12,17 @@ from catstream.settings import Settings
 from catstream.tracker import Tracker
 
 
-def test_the_first_track_and_the_first_model_need_no_filterpy_and_then_its_import_begins(monkeypatch, rng):
+def test_the_first_models_need_no_filterpy_and_its_import_begins_half_a_block_of_centres_ahead(monkeypatch, rng):
     begun = []
     monkeypatch.setitem(sys.modules, "filterpy.kalman", None)  # an import of it fails
-    monkeypatch.setattr(kalman, "prepare", lambda: begun.append(tracker.detector.model.version))
-    frame, tracker = rng.integers(0, 256, (120, 160, 3), np.uint8), Tracker(Settings())
+    monkeypatch.setattr(kalman, "prepare", lambda: begun.append(tracker.track.frame))
+    frame, tracker = rng.integers(0, 256, (120, 160, 3), np.uint8), Tracker(Settings(motion_frames=8))
     tracker.init(frame, (60, 40, 40, 40))
-    while not tracker.detector.model.version:
+    for _ in range(4):
         assert not begun
         tracker.update(frame)
-    assert begun == [1]
+    assert begun == [4]
+    assert tracker.detector.model.version
 
 
 def test_a_filter_asked_for_during_the_import_waits_for_it_without_a_word():
