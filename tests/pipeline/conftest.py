@@ -9,7 +9,7 @@ from contextlib import ExitStack
 import psutil
 import pytest
 
-FRAMES = 90
+FRAMES = 60
 
 
 @pytest.fixture(scope="session")

@@ -57,12 +57,12 @@ def test_a_disk_that_takes_nothing_stops_nothing_and_is_said(video, disk, until,
     with Pipeline(path, boxes[0], SETTINGS, state=state) as pipeline:
         for track in pipeline:
             tracks.append(track.frame)
-            if track.frame == 25:
+            if track.frame == 15:
                 spoil(disk, until)
-            if track.frame == 60:
+            if track.frame == 40:
                 with subscribe(pipeline.endpoint, "health", timeout=60) as reports:
                     said = next(report.trouble for report in reports if report.trouble)
-                assert 0 < Generations(state / TREES).load(SETTINGS).seq < 60, "what was kept before is whole"
+                assert 0 < Generations(state / TREES).load(SETTINGS).seq < 40, "what was kept before is whole"
                 mend(disk)
     assert reason in said
     assert tracks == list(range(len(boxes)))

@@ -20,7 +20,7 @@ def test_no_features_are_missing_and_every_model_comes_out_again(video, tmp_path
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(window=16), record=tmp_path / "run.rec") as pipeline:
         for track in pipeline:
-            if track.frame == 40:
+            if track.frame == 25:
                 for victim in victims:
                     os.kill(pipeline.pids[victim], signal.SIGKILL)
     recording = Recording(tmp_path / "run.rec")
