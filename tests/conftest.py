@@ -51,18 +51,30 @@ def own_places(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def demo_video(tmp_path_factory):
-    """Renders the first frames of the demo video, once for all workers: its path, and the object's boxes."""
+def once(tmp_path_factory):
+    """Gives the folder of a name, which is filled once for all workers."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
-    def rendered(frames):
-        folder = shared / f"demo-{frames}"
-        folder.mkdir(exist_ok=True)
-        with (folder / "lock").open("w") as lock:
+    def filled(name, fill):
+        folder, done = shared / name, shared / f"{name}.done"
+        with (shared / f"{name}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            if not (folder / "groundtruth_rect.txt").exists():  # which is written last
-                write(folder, frames, (320, 240))
+            if not done.exists():
+                folder.mkdir(exist_ok=True)
+                fill(folder)
+                done.touch()
+        return folder
+
+    return filled
+
+
+@pytest.fixture(scope="session")
+def demo_video(once):
+    """Renders the first frames of the demo video, once for all workers: its path, and the object's boxes."""
+
+    def rendered(frames):
+        folder = once(f"demo-{frames}", lambda folder: write(folder, frames, (320, 240)))
         boxes = np.loadtxt(folder / "groundtruth_rect.txt", delimiter=",")
         return folder / "demo.mp4", [Box(*box) for box in boxes.tolist()]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import click
 from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline
+from catstream.cli.interrupts import Interrupts
 from catstream.messages import Run
 from catstream.services.options import with_part
 from catstream.settings import Settings
@@ -60,7 +60,8 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
     """
     for path in files:
         check(path)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    interrupts = Interrupts()
+    interrupts.install()
     written, newest, reach, reason = 0, -1, 0, ""
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
@@ -74,9 +75,10 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
                     break
                 if track.frame <= newest:  # a restarted detector repeats some
                     continue
-                for each in sinks:
-                    each.write(track)
-                written, newest = written + 1, track.frame
+                with interrupts.held():  # a track is in all files, and counted, or in none
+                    for each in sinks:
+                        each.write(track)
+                    written, newest = written + 1, track.frame
                 status.update(f"frame {newest}, {tracks.missed} missed")
         if tracks.end is not None:
             reason = f": {tracks.end.reason}"

@@ -21,6 +21,27 @@ def video(demo_video):
     return str(path), ",".join(map(str, boxes[0]))
 
 
+@pytest.fixture(scope="session")
+def whole_run(video, once):
+    """The folder of a run in lockstep that nothing disturbed.
+
+    out     its results, with a video
+    model   what it has learned
+    rec     its recording
+    stdout  its tracks, as `--write -` prints them
+    stderr  what it told
+    """
+
+    def run(folder):
+        source, box = video
+        command = [sys.executable, "-c", "from catstream.cli import main; main()", "track", source, "--box", box]
+        files = ["--output", "out", "--video", "--save-model", "model", "--record", "rec", "--write", "-"]
+        with (folder / "stdout").open("w") as output, (folder / "stderr").open("w") as errors:
+            subprocess.run([*command, *files, "--lockstep"], cwd=folder, stdout=output, stderr=errors, check=True)
+
+    return once("whole-run", run)
+
+
 @pytest.fixture
 def catstream():
     """Starts the command `catstream`; what still runs after the test is killed."""

@@ -11,39 +11,40 @@ import pytest
 from catstream.messages import Features, Model, Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording, RecordingWriter
+from catstream.recording.learning import learn
 from catstream.settings import Settings
 
 
-@pytest.fixture(scope="module")
-def recorded(video, tmp_path_factory):
+@pytest.fixture
+def recorded(whole_run):
     """A recorded run."""
-    source, box = video
-    path = tmp_path_factory.mktemp("recording") / "run.rec"
-    with Pipeline(source, [float(side) for side in box.split(",")], Settings(coreset_size=16), record=path) as pipeline:
-        assert len(list(pipeline)) == 60
-    return path
+    return whole_run / "rec"
 
 
-def test_a_run_that_is_recorded_says_what_is_in_the_file(video, said, tmp_path):
-    source, box = video
-    code, _, errors = said("track", source, "--box", box, "--record", tmp_path / "run.rec")
-    assert code == 0
-    assert f"recording: {tmp_path / 'run.rec'}, 60 features, " in errors
+def test_a_run_that_is_recorded_says_what_is_in_the_file(whole_run):
+    errors = (whole_run / "stderr").read_text()
+    assert "recording: rec, 60 features, " in errors
     assert "none missing" in errors
+    recording = Recording(whole_run / "rec")
+    assert [features.seq for features in recording.features()] == list(range(1, 61))
+    assert recording.end.totals == {"sent": 60, "stored": 60}
+    assert (recording.missing[Features], recording.missing[Track]) == (0, 0)
+    lesson = learn(recording, recording.settings)
+    assert lesson.identical == recording.counts[Model] > 5
 
 
 def test_the_learning_is_replayed_and_compared_with_other_settings(recorded, said, tmp_path):
     code, output, errors = said(
-        "replay", recorded, "--learn", "--set", "coreset_size=32", "--output", tmp_path / "larger.rec"
+        "replay", recorded, "--learn", "--set", "coreset_size=32", "--output", tmp_path / "smaller.rec"
     )
     assert code == 0, errors
     models = Recording(recorded).counts[Model]
     rows = {line.split("  ")[0]: line.split() for line in output.splitlines()}
     assert rows["the same"][3:6] == [str(models), "of", str(models)]
     assert rows["coreset_size=32"][2:5] == ["0", "of", str(models)]
-    larger = Recording(tmp_path / "larger.rec")
-    assert larger.settings.coreset_size == 32
-    assert str(larger.counts[Model]) == rows["coreset_size=32"][1]
+    smaller = Recording(tmp_path / "smaller.rec")
+    assert smaller.settings.coreset_size == 32
+    assert str(smaller.counts[Model]) == rows["coreset_size=32"][1]
 
 
 def test_a_model_that_does_not_come_out_again_is_an_error(recorded, said, tmp_path):
@@ -85,23 +86,23 @@ def test_a_recording_is_watched_like_a_pipeline(recorded, catstream, tmp_path):
     assert ": the source came to its end" in errors
 
 
-@pytest.mark.parametrize("stopped", [False, True], ids=["to the end", "stopped"])
-def test_what_a_pipeline_says_is_recorded_from_outside(video, catstream, tmp_path, stopped):
+def test_what_a_pipeline_says_is_recorded_from_outside(video, catstream, tmp_path):
     source, box = video
-    settings, path = Settings(window=1, endpoint=str(tmp_path)), tmp_path / "run.rec"
+    settings, paths = Settings(window=1, endpoint=str(tmp_path)), [tmp_path / "whole.rec", tmp_path / "stopped.rec"]
     with Pipeline(source, [float(side) for side in box.split(",")], settings) as pipeline:
         tracks = iter(pipeline)
         next(tracks)
-        recorder = catstream("record", "--output", path, "--endpoint", tmp_path)
+        recorders = [catstream("record", "--output", path, "--endpoint", tmp_path) for path in paths]
         for track in tracks:
-            if path.exists() and stopped and track.frame > 40:
-                recorder.send_signal(signal.SIGINT)
-                recorder.wait(60)
-        errors = recorder.communicate(timeout=60)[1]
-    assert recorder.returncode == 0, errors
-    recording = Recording(path)
-    assert recording.settings.window == 1
-    assert recording.counts[Features]
-    assert recording.counts[Track]
-    assert (recording.end is None) == stopped
-    assert f"{recording.missing[Features]} features" in errors
+            if paths[1].exists() and track.frame > 40 and recorders[1].poll() is None:
+                recorders[1].send_signal(signal.SIGINT)
+                recorders[1].wait(60)
+        told = [recorder.communicate(timeout=60)[1] for recorder in recorders]
+    for path, recorder, errors, stopped in zip(paths, recorders, told, (False, True), strict=True):
+        assert recorder.returncode == 0, errors
+        recording = Recording(path)
+        assert recording.settings.window == 1
+        assert recording.counts[Features]
+        assert recording.counts[Track]
+        assert (recording.end is None) == stopped
+        assert f"{recording.missing[Features]} features" in errors

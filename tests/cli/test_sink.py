@@ -9,8 +9,6 @@ import sqlite3
 import time
 from contextlib import closing
 
-import pytest
-
 from catstream.messages import Health, Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import run_of
@@ -19,31 +17,50 @@ from catstream.video.source import open_source
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
 
+FILES = ["tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet"]
 
-@pytest.mark.parametrize("stopped", [False, True], ids=["to the end", "stopped"])
-def test_tracks_go_to_files_and_stay_there(video, catstream, tmp_path, stopped):
+
+def test_tracks_go_to_files_and_stay_there(video, catstream, tmp_path):
     source, box = video
-    files = [tmp_path / name for name in ("tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet")]
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     with Pipeline(source, [float(side) for side in box.split(",")], Settings(window=1)) as pipeline:
-        sink = catstream("sink", *files, "--source", source, "--endpoint", pipeline.endpoint)
+        sinks = {}
+        for folder in (whole, stopped):
+            folder.mkdir()
+            files = [folder / name for name in FILES]
+            sinks[folder] = catstream("sink", *files, "--source", source, "--endpoint", pipeline.endpoint)
+        waiting = set(sinks)
         for track in pipeline:
-            if sink.poll() is None:
-                select.select([sink.stderr], [], [], 0.3)  # while it starts, few pass
-            if stopped and files[0].exists() and files[0].stat().st_size and track.frame > 30:
-                sink.send_signal(signal.SIGINT)
-                sink.wait(60)
-        errors = sink.communicate(timeout=60)[1]
-    assert sink.returncode == 0, errors
-    frames = [json.loads(line)["frame"] for line in files[0].read_text().splitlines()]
+            if waiting := {folder for folder in waiting if not holds(folder) and sinks[folder].poll() is None}:
+                select.select([sinks[folder].stderr for folder in waiting], [], [], 0.3)  # while they start, few pass
+            if track.frame > 30 and stopped not in waiting and sinks[stopped].poll() is None:
+                sinks[stopped].send_signal(signal.SIGINT)
+                sinks[stopped].wait(60)
+        told = {folder: sink.communicate(timeout=60)[1] for folder, sink in sinks.items()}
+    for folder, sink in sinks.items():
+        assert sink.returncode == 0, told[folder]
+    assert written(whole, told[whole])[-1] == 59
+    assert written(stopped, told[stopped])[-1] < 59
+
+
+def holds(folder):
+    """Whether tracks have come there."""
+    file = folder / FILES[0]
+    return file.exists() and file.stat().st_size > 0
+
+
+def written(folder, errors):
+    """The frames whose tracks are there, in each of the files."""
+    frames = [json.loads(line)["frame"] for line in (folder / "tracks.ndjson").read_text().splitlines()]
     assert frames == list(range(frames[0], frames[0] + len(frames)))
-    assert (frames[-1] == 59) != stopped
     assert f"{len(frames)} tracks, {frames[0]} missed" in errors, "those before it came"
-    with closing(sqlite3.connect(files[1])) as database:
+    with closing(sqlite3.connect(folder / "tracks.sqlite")) as database:
         assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == frames
-    with open_source(str(files[2])) as shown:
+    with open_source(str(folder / "walk.mp4")) as shown:
         assert sum(1 for _ in shown) == len(frames)
-    assert (tmp_path / "t.parquet").stat().st_size > 0
-    assert not files[1].with_name("tracks.sqlite-wal").exists()
+    assert (folder / "t.parquet").stat().st_size > 0
+    assert not (folder / "tracks.sqlite-wal").exists()
+    return frames
 
 
 def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the_end(

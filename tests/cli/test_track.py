@@ -33,22 +33,20 @@ def table(path):
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-def test_it_writes_five_files_with_a_row_a_frame(video, said_by_process, tmp_path):
-    source, box = video
-    code, _, errors = said_by_process("track", source, "--box", box, "--output", tmp_path, "--video")
-    assert code == 0
-    assert "60 messages sent, 60 stored" in errors
-    assert sorted(file.name for file in tmp_path.iterdir()) == FILES
-    boxes = np.loadtxt(tmp_path / "demo.txt", delimiter=",")
+def test_it_writes_five_files_with_a_row_a_frame(whole_run):
+    out = whole_run / "out"
+    assert "60 messages sent, 60 stored" in (whole_run / "stderr").read_text()
+    assert sorted(file.name for file in out.iterdir()) == FILES
+    boxes = np.loadtxt(out / "demo.txt", delimiter=",")
     assert boxes.shape == (60, 4)
-    assert np.loadtxt(tmp_path / "demo_confidence.value").shape == (60,)
-    assert (np.loadtxt(tmp_path / "demo_time.txt") >= 0).sum() == 60
-    rows = table(tmp_path / "demo.csv")
+    assert np.loadtxt(out / "demo_confidence.value").shape == (60,)
+    assert (np.loadtxt(out / "demo_time.txt") >= 0).sum() == 60
+    rows = table(out / "demo.csv")
     assert list(rows[0]) == ["frame", "seconds", "state", "x", "y", "w", "h", "score", "model_version"]
     assert [int(row["frame"]) for row in rows] == list(range(60))
     assert {row["state"] for row in rows} <= {"bootstrapping", "present", "absent"}
     assert [row["x"] == "" for row in rows] == list(np.isnan(boxes[:, 0]))
-    with open_source(tmp_path / "demo.mp4") as film:
+    with open_source(out / "demo.mp4") as film:
         assert sum(1 for _ in film) == 60
 
 
@@ -66,22 +64,17 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, said, tmp_path
             assert np.median(difference) < 8
 
 
-def test_two_lockstep_runs_write_the_same_bytes(video, said, tmp_path):
+def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, said, tmp_path):
     source, box = video
-    printed = []
-    for folder in ("one", "two"):
-        results = ["--output", tmp_path / folder, "--write", "-", "--save-model", tmp_path / f"{folder}.safetensors"]
-        code, output, errors = said("track", source, "--box", box, *results, "--lockstep")
-        assert code == 0, errors
-        printed.append(output)
-    assert printed[0] == printed[1]
-    assert [json.loads(line)["frame"] for line in printed[0].splitlines()] == list(range(60))
-    assert (tmp_path / "one.safetensors").read_bytes() == (tmp_path / "two.safetensors").read_bytes()
-    newest = int(table(tmp_path / "one" / "demo.csv")[-1]["model_version"])
-    assert Learned.load(tmp_path / "one.safetensors").model.version >= newest
-    for file in ("demo.txt", "demo_confidence.value", "demo.csv"):
-        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
-    assert int(table(tmp_path / "one" / "demo.csv")[-1]["model_version"]) > 2
+    results = ["--output", tmp_path / "out", "--write", "-", "--save-model", tmp_path / "model"]
+    code, output, errors = said("track", source, "--box", box, *results, "--lockstep")
+    assert code == 0, errors
+    assert output == (whole_run / "stdout").read_text()
+    assert [json.loads(line)["frame"] for line in output.splitlines()] == list(range(60))
+    for file in ("model", "out/demo.txt", "out/demo_confidence.value", "out/demo.csv"):
+        assert (tmp_path / file).read_bytes() == (whole_run / file).read_bytes()
+    newest = int(table(tmp_path / "out" / "demo.csv")[-1]["model_version"])
+    assert Learned.load(tmp_path / "model").model.version >= newest > 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 
@@ -39,46 +42,40 @@ def kill_everything(process):
     psutil.wait_procs(family, 30)
 
 
-@pytest.fixture
-def killed(video, catstream, tmp_path):
-    """A run that was killed with all its processes, as by a power cut, once it had a checkpoint and some rows."""
-
-    def start(*options, rows=12):
-        source, box = video
-        command = ["track", source, "--box", box, "--output", tmp_path / "out", "--state", tmp_path / "kept"]
-        process = catstream(*command, *OFTEN, *options)
-        deadline = time.monotonic() + 120
-        while not (checkpoints(tmp_path / "kept") and len(frames(tmp_path / "out")) >= rows):
-            assert process.poll() is None, process.communicate()[1]
-            assert time.monotonic() < deadline, "no checkpoint came"
-            time.sleep(0.01)
-        kill_everything(process)
-        return tmp_path / "kept"
-
-    return start
-
-
 @pytest.fixture(scope="module")
-def undisturbed(video, tmp_path_factory):
-    """Results of the same run in one go."""
-    import subprocess
-    import sys
-
+def wreck(video, tmp_path_factory):
+    """What is left of a run that was killed with all its processes, as by a power cut: its place, and a copy of it."""
     source, box = video
-    out = tmp_path_factory.mktemp("undisturbed")
+    place = tmp_path_factory.mktemp("killed") / "run"
     command = [sys.executable, "-c", "from catstream.cli import main; main()", "track", source, "--box", box]
-    subprocess.run([*command, "--output", str(out), *OFTEN], check=True, capture_output=True)
-    return out
+    results = ["--output", place / "out", "--video", "--state", place / "kept"]
+    process = subprocess.Popen([*command, *map(str, results), *OFTEN], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not (len(checkpoints(place / "kept")) > 1 and len(frames(place / "out")) >= 20):
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline, "no checkpoints came"
+        time.sleep(0.01)
+    kill_everything(process)
+    process.stderr.close()
+    return place, shutil.copytree(place, place.with_name("copy"))
 
 
-def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed, undisturbed, said, tmp_path):
-    kept = killed()
-    before = len(frames(tmp_path / "out"))
+@pytest.fixture
+def killed(wreck):
+    """The place of a run that was killed, as it was left: its results in `out`, its state in `kept`."""
+    place, copy = wreck
+    shutil.rmtree(place)
+    return shutil.copytree(copy, place)
+
+
+def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed, whole_run, said, tmp_path):
+    kept, out = killed / "kept", killed / "out"
+    before = len(frames(out))
     assert before < 60
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
     for file in RESULTS:
-        assert (tmp_path / "out" / file).read_bytes() == (undisturbed / file).read_bytes()
+        assert (out / file).read_bytes() == (whole_run / "out" / file).read_bytes()
     assert "60 messages sent, 60 stored" in errors
     assert Generations(kept / TREES).load(Settings()).seq == 60
     code, output, errors = said("save", tmp_path / "one", "--state", kept)
@@ -88,27 +85,27 @@ def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed
     assert saved.model.version == Generations(kept / TREES).load(Settings()).version
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
-    assert frames(tmp_path / "out") == list(range(60)), "a run that is complete gets no row more"
+    assert frames(out) == list(range(60)), "a run that is complete gets no row more"
 
 
-def test_rows_that_a_power_cut_tore_are_cut_off_and_written_again(killed, undisturbed, said, tmp_path):
-    kept = killed("--video")
+def test_rows_that_a_power_cut_tore_are_cut_off_and_written_again(killed, whole_run, said):
+    out = killed / "out"
     for file, cut in [("demo.txt", 60), ("demo.csv", 100)]:
-        path = tmp_path / "out" / file
+        path = out / file
         path.write_bytes(path.read_bytes()[:-cut] + bytes(9))
-    code, _, errors = said("track", "--resume", kept)
+    code, _, errors = said("track", "--resume", killed / "kept")
     assert code == 0, errors
     for file in RESULTS:
-        assert len((tmp_path / "out" / file).read_text().splitlines()) == 60 + (file == "demo.csv")
-    assert (tmp_path / "out" / "demo.csv").read_text().splitlines()[:8] == (
-        (undisturbed / "demo.csv").read_text().splitlines()[:8]
+        assert len((out / file).read_text().splitlines()) == 60 + (file == "demo.csv")
+    assert (out / "demo.csv").read_text().splitlines()[:8] == (
+        (whole_run / "out" / "demo.csv").read_text().splitlines()[:8]
     )
-    with open_source(tmp_path / "out" / "demo.mp4") as film:
+    with open_source(out / "demo.mp4") as film:
         assert sum(1 for _ in film) == 60, "the video is drawn again, whole"
 
 
-def test_a_damaged_checkpoint_is_said_and_the_one_before_goes_on(killed, undisturbed, said, tmp_path):
-    kept = killed(rows=25)
+def test_a_damaged_checkpoint_is_said_and_the_one_before_goes_on(killed, whole_run, said):
+    kept = killed / "kept"
     newest = max(checkpoints(kept))
     damaged = bytearray(newest.read_bytes())
     damaged[len(damaged) // 2] ^= 1
@@ -116,11 +113,11 @@ def test_a_damaged_checkpoint_is_said_and_the_one_before_goes_on(killed, undistu
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
     assert "damaged checkpoints: 1" in errors
-    assert (tmp_path / "out" / "demo.csv").read_bytes() == (undisturbed / "demo.csv").read_bytes()
+    assert (killed / "out" / "demo.csv").read_bytes() == (whole_run / "out" / "demo.csv").read_bytes()
 
 
 def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, catstream, tmp_path):
-    kept, (source, box) = killed(), video
+    kept, out, (source, box) = killed / "kept", killed / "out", video
     refusals = {
         "go on with it": ["track", source, "--box", box, "--state", kept],
         "learned with coreset_size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset_size=32"],
@@ -134,14 +131,14 @@ def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, 
         assert code in (1, 2), errors
         assert word in errors.replace("\n", " ")
     running = catstream("track", "--resume", kept, "--set", "window=1", *OFTEN)
-    rows = len(frames(tmp_path / "out"))
-    while len(frames(tmp_path / "out")) == rows and running.poll() is None:
+    rows = len(frames(out))
+    while len(frames(out)) == rows and running.poll() is None:
         time.sleep(0.01)
     code, _, errors = said("track", "--resume", kept)
     assert code == 1, errors
     assert "a pipeline that runs keeps its state" in errors
     assert running.wait(120) == 0
-    assert frames(tmp_path / "out") == list(range(60))
+    assert frames(out) == list(range(60))
 
 
 def test_settings_that_are_given_again_change_and_all_others_are_kept(video, said, monkeypatch, tmp_path):

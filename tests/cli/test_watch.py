@@ -37,18 +37,25 @@ def resting(video):
         yield running
 
 
-def test_tracks_come_as_lines_of_json_until_the_pipeline_ends(video, catstream):
+def test_tracks_come_as_lines_of_json_until_the_pipeline_ends_and_features_as_lines(video, catstream):
     with pipeline(video) as running:
-        process = catstream("watch", "tracks", "--json", "--endpoint", running.endpoint)
+        place = ["--endpoint", running.endpoint]
+        features = catstream("watch", "features", "--count", 3, *place)
+        tracks = catstream("watch", "tracks", "--json", *place)
         for _ in running:
-            select.select([process.stdout], [], [], 0.3)  # while it starts, few pass
-        output, errors = process.communicate(timeout=SECONDS)
-    tracks = [json.loads(line) for line in output.splitlines()]
-    assert tracks[0].keys() == {field.name for field in dataclasses.fields(Track)}
-    assert [track["frame"] for track in tracks] == list(range(60 - len(tracks), 60))
-    assert process.returncode == 0
-    assert errors.startswith(f"{len(tracks)} tracks, {60 - len(tracks)} missed"), "those before it came"
+            for watcher in (features, tracks):
+                select.select([watcher.stdout], [], [], 0.3)  # while it starts, few pass
+        shown, _ = features.communicate(timeout=SECONDS)
+        output, errors = tracks.communicate(timeout=SECONDS)
+    found = [json.loads(line) for line in output.splitlines()]
+    assert found[0].keys() == {field.name for field in dataclasses.fields(Track)}
+    assert [track["frame"] for track in found] == list(range(60 - len(found), 60))
+    assert errors.startswith(f"{len(found)} tracks, {60 - len(found)} missed"), "those before it came"
     assert errors.endswith(": the source came to its end\n")
+    lines = shown.splitlines()
+    assert len(lines) == 3
+    assert all(word in lines[0] for word in ("frame ", "rows ", "background ", "extents "))
+    assert (tracks.returncode, features.returncode) == (0, 0)
 
 
 def test_a_late_one_gets_the_last_model_with_its_arrays_in_short(resting, said):
@@ -91,18 +98,6 @@ def test_a_terminal_shows_a_table_until_it_is_stopped_which_is_no_error(resting,
 
 
 TERMINAL = {**os.environ, "TERM": "xterm", "COLUMNS": "160"}
-
-
-def test_features_are_shown_as_they_come(video, catstream):
-    with pipeline(video) as running:
-        process = catstream("watch", "features", "--count", 3, "--endpoint", running.endpoint)
-        for _ in running:
-            select.select([process.stdout], [], [], 0.3)  # until it has begun
-        output, _ = process.communicate(timeout=SECONDS)
-    assert process.returncode == 0
-    lines = output.splitlines()
-    assert len(lines) == 3
-    assert all(word in lines[0] for word in ("frame ", "rows ", "background ", "extents "))
 
 
 @pytest.mark.parametrize("arguments", [("watch", "tracks"), ("status",)], ids=" ".join)
