@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import select
 import shutil
 import subprocess
 import sys
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ import pytest
 
 import catstream
 from catstream.errors import SilenceError
+from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.wire.keys import create
@@ -23,34 +26,85 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 MODULES = [EXAMPLES / "node_modules" / name for name in ("zeromq", "@msgpack/msgpack")]
 
 
-def command(example):
-    """How it is started; skips the test where this machine has not what it takes."""
+def missing(example):
+    """What this machine has not that the example takes; None if it has all."""
+    if example.startswith("rerun"):
+        return None if find_spec("rerun") else 'rerun is missing: pip install "catstream[rerun]"'
     if example.endswith(".py"):
-        return [sys.executable, EXAMPLES / example]
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("there is no Node.js on this machine")
+        return None
+    if shutil.which("node") is None:
+        return "there is no Node.js on this machine"
     if not all(module.exists() for module in MODULES):
-        pytest.skip("its modules are missing: npm ci --prefix examples")
-    return [node, EXAMPLES / example]
+        return "its modules are missing: npm ci --prefix examples"
+    return None
 
 
-def test_the_rerun_subscriber_writes_what_the_viewer_would_show(demo_video, tmp_path):
-    pytest.importorskip("rerun", reason='rerun is missing: pip install "catstream[rerun]"')
-    (source, boxes), shown = demo_video(60), tmp_path / "walk.rrd"
-    with (
-        Pipeline(str(source), boxes[0], Settings(window=1)) as pipeline,
-        subprocess.Popen(
-            [sys.executable, EXAMPLES / "rerun_subscriber.py", pipeline.endpoint, "--save", shown],
-            stdout=subprocess.PIPE,
-            text=True,
-        ) as reader,
-    ):
-        for _ in pipeline:
-            if reader.poll() is None and not (shown.exists() and shown.stat().st_size > 20_000):
-                select.select([reader.stdout], [], [], 0.5)  # while it starts, few pass
-        printed = reader.communicate(timeout=60)[0]
-    assert reader.returncode == 0
+def command(example):
+    """How it is started."""
+    return [sys.executable if example.endswith(".py") else "node", EXAMPLES / example]
+
+
+@dataclass
+class Beside:
+    """A run to its end, and what the examples beside it printed: name -> exit code, text.
+
+    tracks  frame -> track
+    norms   version -> norm of the weights, of the models that were heard
+    """
+
+    tracks: dict[int, Track]
+    norms: dict[int, float]
+    printed: dict[str, tuple[int, str]]
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """What the example for Rerun saves."""
+    return tmp_path_factory.mktemp("shown") / "walk.rrd"
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["without keys", "with keys"])
+def beside(request, demo_video, shown, tmp_path_factory):
+    """One run without keys and one with them, each with all examples that this machine can start and that take part."""
+    source, boxes = demo_video(60)
+    keys = str(tmp_path_factory.mktemp("keys") / "keys") if request.param else ""
+    if keys:
+        create(Path(keys))
+    words = {name: [] for name in ("subscriber.py", "subscriber.mjs") if missing(name) is None}
+    if not keys and missing("rerun_subscriber.py") is None:
+        words["rerun_subscriber.py"] = ["--save", shown]
+    with ExitStack() as stack:
+        # A window of one: the pipeline goes on only as its tracks are taken.
+        pipeline = stack.enter_context(Pipeline(str(source), boxes[0], Settings(window=1, keys=keys)))
+        models = stack.enter_context(catstream.subscribe(pipeline.endpoint, "models", timeout=0, keys=keys))
+        readers = {}
+        for name, more in words.items():
+            start = [*command(name), pipeline.endpoint, *([keys] if keys else []), *more]
+            readers[name] = stack.enter_context(subprocess.Popen(start, stdout=subprocess.PIPE, text=True))
+        found, norms = {}, {}
+        for track in pipeline:
+            found[track.frame] = track
+            with suppress(SilenceError):
+                model = next(models)
+                norms[model.version] = float(np.linalg.norm(model.weights))
+            for name, reader in readers.items():
+                if reader.poll() is None and not (name.startswith("rerun") and holds_tracks(shown)):
+                    select.select([reader.stdout], [], [], 0.3)  # while they start, few pass
+        told = {name: reader.communicate(timeout=60)[0] for name, reader in readers.items()}
+    return Beside(found, norms, {name: (reader.returncode, told[name]) for name, reader in readers.items()})
+
+
+def holds_tracks(shown):
+    """Whether there is more than the beginning in the file that is shown."""
+    return shown.exists() and shown.stat().st_size > 20_000
+
+
+@pytest.mark.parametrize("beside", [False], ids=["without keys"], indirect=True)
+def test_the_rerun_subscriber_writes_what_the_viewer_would_show(beside, shown):
+    if why := missing("rerun_subscriber.py"):
+        pytest.skip(why)
+    code, printed = beside.printed["rerun_subscriber.py"]
+    assert code == 0
     losses = r"(0 missed|(\d+) missed, \2 of them before this began to listen)"
     assert re.fullmatch(rf"[1-9]\d* tracks, {losses}: the source came to its end\n", printed)
     data = shown.read_bytes()
@@ -60,34 +114,17 @@ def test_the_rerun_subscriber_writes_what_the_viewer_would_show(demo_video, tmp_
 
 
 @pytest.mark.parametrize("example", ["subscriber.py", "subscriber.mjs"])
-@pytest.mark.parametrize("secured", [False, True], ids=["without keys", "with keys"])
-def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(demo_video, example, secured, tmp_path):
-    words, (source, boxes) = command(example), demo_video(60)
-    keys = str(tmp_path / "keys") if secured else ""
-    if secured:
-        create(tmp_path / "keys")
-    found, norms = {}, {}
-    with (
-        # A window of one: the pipeline goes on only as its tracks are taken.
-        Pipeline(str(source), boxes[0], Settings(window=1, keys=keys)) as pipeline,
-        catstream.subscribe(pipeline.endpoint, "models", timeout=0, keys=keys) as models,
-        subprocess.Popen(
-            [*words, pipeline.endpoint, *([keys] if secured else [])], stdout=subprocess.PIPE, text=True
-        ) as reader,
-    ):
-        for track in pipeline:
-            found[track.frame] = track
-            with contextlib.suppress(SilenceError):
-                model = next(models)
-                norms[model.version] = np.linalg.norm(model.weights)
-            select.select([reader.stdout], [], [], 0.3)  # while it starts, few pass
-        printed = reader.communicate(timeout=60)[0].splitlines()
-    assert reader.returncode == 0
+def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(beside, example):
+    if why := missing(example):
+        pytest.skip(why)
+    code, text = beside.printed[example]
+    printed, norms = text.splitlines(), beside.norms
+    assert code == 0
     assert printed[-1] == "end: the source came to its end, 0 tracks missed"
     tracks = [text.split() for text in printed if text.startswith("track ")]
     assert [int(frame) for _, frame, *_ in tracks] == list(range(60 - len(tracks), 60))
     for _, frame, state, box, score in tracks:
-        track = found[int(frame)]
+        track = beside.tracks[int(frame)]
         assert state == track.state
         assert float(score) == pytest.approx(track.score, abs=0.001)
         sides = None if box == "-" else [float(side) for side in box.split(",")]

@@ -33,13 +33,14 @@ def test_it_is_iterated_without_with_and_leaves_no_process(pipeline):
 
 
 def test_a_loop_that_is_left_ends_the_run(pipeline, alive):
-    pids = []
-    for _ in pipeline:
-        pids = list(pipeline.pids.values())
+    pids, first = [], None
+    for track in pipeline:
+        pids, first = list(pipeline.pids.values()), track
         break
     gc.collect()
     assert len(pids) == 3
     assert not any(map(alive, pids))
+    prints_well_and_is_ready_for_json(first)
 
 
 def test_in_a_with_it_is_iterated_piece_by_piece_and_afterwards_no_more(pipeline):
@@ -130,8 +131,8 @@ def test_a_task_that_is_cancelled_ends_the_run_in_order(video, alive):
     assert not any(map(alive, pids))
 
 
-def test_a_track_prints_well_and_is_ready_for_json(pipeline):
-    track = next(iter(pipeline))
+def prints_well_and_is_ready_for_json(track):
+    """What a person sees of a track, and a program in another language."""
     assert repr(track).startswith("Track(frame=0, time=0.000, state='bootstrapping', box=(")
     assert json.loads(json.dumps(track.to_dict())) == {
         "seq": 1,

@@ -56,17 +56,19 @@ def told(pipeline, condition):
 
 
 @pytest.fixture(scope="module")
-def saved(video, tmp_path_factory):
-    """What was learned in the first half of the video."""
-    path, boxes = video
-    file = tmp_path_factory.mktemp("saved") / "object.safetensors"
-    with steered(path, boxes[0], part=slice(0, 50)) as (pipeline, helm, pool):
-        answer = None
-        for track in pipeline:
-            if answer is None and track.model_version >= 4:
-                answer = pool.submit(helm.save, file)
-        assert answer.result().version >= 4
-    return file
+def saved(video, once):
+    """What was learned in the first part of the video."""
+
+    def save(folder):
+        path, boxes = video
+        with steered(path, boxes[0], part=slice(0, 50)) as (pipeline, helm, pool):
+            answer = None
+            for track in pipeline:
+                if answer is None and track.model_version >= 4:
+                    answer = pool.submit(helm.save, folder / "object.safetensors")
+            assert answer.result().version >= 4
+
+    return once("saved", save) / "object.safetensors"
 
 
 def test_without_a_box_the_first_frame_is_held_and_in_a_pause_a_box_is_for_the_frame_that_is_held(video):
@@ -129,7 +131,7 @@ def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_w
     assert all(track.model_version == 0 or track.model_version > newest for track in after)
 
 
-def test_the_same_object_elsewhere_keeps_its_model(video):
+def test_the_same_object_elsewhere_keeps_its_model_and_stopped_by_a_command_all_is_stored(video):
     path, boxes = video
     tracks = []
     with steered(path, boxes[0]) as (pipeline, helm, pool):
@@ -138,7 +140,11 @@ def test_the_same_object_elsewhere_keeps_its_model(video):
             if track.model_version >= 4:
                 break
         answer = taken(pipeline, tracks, pool.submit(helm.set_box, boxes[len(tracks)], keep=True))
+        taken(pipeline, tracks, pool.submit(helm.stop))
         tracks += pipeline
+    assert answer.frame < len(tracks) < len(boxes)
+    assert [track.frame for track in tracks] == list(range(len(tracks)))
+    assert pipeline.totals == {"sent": len(tracks), "stored": len(tracks)}
     corrected = tracks[answer.frame]
     assert corrected.state == "present"
     assert corrected.box == pytest.approx(boxes[corrected.frame - 1], abs=60)
@@ -191,17 +197,6 @@ def test_orders_are_on_disk_before_they_take_the_place_of_older_ones(tmp_path, m
     Orders(paused=True).save(tmp_path / "orders.json")
     assert done == ["fsync", "replace", "fsync"], "the file, and then its name"
     assert Orders.load(tmp_path / "orders.json") == Orders(paused=True)
-
-
-def test_stopped_by_a_command_all_is_stored_and_nothing_failed(video):
-    path, boxes = video
-    with steered(path, boxes[0]) as (pipeline, helm, pool):
-        tracks = [next(iter(pipeline))]
-        taken(pipeline, tracks, pool.submit(helm.stop))
-        tracks += pipeline
-    assert 0 < len(tracks) < len(boxes)
-    assert [track.frame for track in tracks] == list(range(len(tracks)))
-    assert pipeline.totals == {"sent": len(tracks), "stored": len(tracks)}
 
 
 def test_a_saved_model_finds_the_object_and_learning_goes_on_from_it(video, saved):
