@@ -124,11 +124,11 @@ class Ordeal:
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    cycles = 2 if options.quick else options.cycles
-    source, truth = long(named(options, "TLD_01_david"), 60 if options.quick else 25 * cycles + 100)
+    cycles, modes = (1, ["lockstep"]) if options.quick else (options.cycles, list(RUNS))
+    source, truth = long(named(options, "TLD_01_david"), 30 if options.quick else 25 * cycles + 100)
     box, faults, times, ends = Box(*map(float, truth[0])), schedule(cycles, options.seed), [], []
     calm = undisturbed(source, box)
-    for label in [options.run] if options.run else RUNS:
+    for label in [options.run] if options.run else modes:
         run = endure(source, box, RUNS[label], faults, options.seed)
         times += [(label, *row) for row in quantiles(run.recovery)]
         same = None if label == "default" else "yes" if identical(run, calm) else "NO"

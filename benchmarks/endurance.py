@@ -26,10 +26,10 @@ EARLY = 1_000
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     sequence = named(options, "TLD_01_david")
     turn = 2 * len(sequence) - 2
-    frames, early = (200, turn) if options.quick else (options.frames, EARLY)
+    frames, early = (2 * turn, turn) if options.quick else (options.frames, EARLY)
     order = len(sequence) - 1 - abs(np.arange(frames + turn // 2) % turn - (len(sequence) - 1))
     source = looped(sequence, order)
-    journey = travel(str(source), sequence.boxes[0], Settings(), watch=20 if options.quick else 250)
+    journey = travel(str(source), sequence.boxes[0], Settings(), watch=4 if options.quick else 250)
     draw({"": journey}, options.plot)
 
     before, after = (around(journey, frame, turn) for frame in (early, frames))

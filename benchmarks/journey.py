@@ -85,7 +85,7 @@ def draw(journeys: dict[str, Journey], file: Path, blocks: int = 80) -> None:
 
     figure, (time, work, memory) = pyplot.subplots(3, 1, sharex=True, figsize=(8, 8), layout="constrained")
     for label, journey in journeys.items():
-        parts = np.array_split(journey.milliseconds, blocks)
+        parts = np.array_split(journey.milliseconds, min(blocks, len(journey.milliseconds)))
         time.plot(np.cumsum([len(part) for part in parts]), [np.median(part) for part in parts], label=label)
         for name, looks in journey.looks.items():
             work.plot(*journey.work(name), label=f"{label} {name}".strip())

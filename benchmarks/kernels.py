@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from statistics import median
 from time import perf_counter
 
@@ -26,8 +26,8 @@ SIZES = (64, 256)
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    sequence = rendered(24 if options.quick else 600)
-    work = list(detection(sequence)) + list(learning(sequence)) + list(motion())
+    sequence = rendered(8 if options.quick else 600)
+    work = list(detection(sequence)) + list(learning(sequence, SIZES[:1] if options.quick else SIZES)) + list(motion())
     runs = 1 if options.quick else options.runs
     rows = [(name, milliseconds(call, runs)) for name, call in work]
     yield Table("Kernels", ("step", "ms"), rows, f"median of {runs} after one to warm up")
@@ -55,9 +55,9 @@ def detection(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:
     yield f"score all {windows} windows of it", lambda: cells.respond(weights, 0.0)
 
 
-def learning(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:
+def learning(sequence: Sequence, sizes: Iterable[int]) -> Iterator[tuple[str, Callable[[], object]]]:
     """From what was learned of a whole video, at each coreset size."""
-    for n in SIZES:
+    for n in sizes:
         sample = sample_of(sequence, n)
         rows = np.vstack([sample.object.rows, sample.background.rows])[: 2 * n]
         yield f"reduce {len(rows)} rows to n = {n}", lambda rows=rows, n=n: reduce(rows, n)

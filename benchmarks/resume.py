@@ -31,8 +31,8 @@ TRACK = [sys.executable, "-P", "-c", "from catstream.cli import main; main()", "
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    moments, most = (2, 5) if options.quick else (options.moments, options.rows)
-    frames = moments * most + _REST
+    moments, most, rest = (1, 5, 100) if options.quick else (options.moments, options.rows, _REST)
+    frames = moments * most + rest
     place, chance = scratch(), random.Random(options.seed)
     video, boxes = write(place, frames, (320, 240))
     kept, out = place / "kept", place / "out"

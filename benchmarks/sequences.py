@@ -14,7 +14,7 @@ from catstream.video import demo
 
 __all__ = ["named", "rendered", "scratch", "sequences", "video"]
 
-_QUICK_FRAMES = 24
+_QUICK_FRAMES = 8
 
 
 @cache

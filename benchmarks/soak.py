@@ -87,7 +87,7 @@ class Stream:
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     settings = Settings()
-    messages, through, frames = (2_000, 500, 24) if options.quick else (options.messages, options.through, 200)
+    messages, through, frames = (20, 20, 8) if options.quick else (options.messages, options.through, 200)
     stream = Stream(named(options, "TLD_01_david"), frames, settings)
     here, there = alone(stream, messages, settings), served(stream, through, settings)
     draw(here, options.plot)

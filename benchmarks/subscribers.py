@@ -57,7 +57,7 @@ class Run:
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     frames, readers, frozen, runs = options.frames, options.readers, options.frozen, options.runs
     if options.quick:
-        frames, readers, frozen, runs = 60, 6, 2, 1
+        frames, readers, frozen, runs = 40, 2, 1, 1
     alone, beside = [], []
     for _ in range(runs):  # in turn, so that a machine that gets slower does so for both
         alone.append(travel(frames, 0, 0))

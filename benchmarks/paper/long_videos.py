@@ -43,7 +43,7 @@ _CONTRAST, _BRIGHTNESS, _SHIFT, _NOISE = 0.2, 20.0, 0.05, 4.0
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    frames = 200 if options.quick else options.frames
+    frames = 40 if options.quick else options.frames
     journeys, successes = {}, []
     for name in options.videos[:1] if options.quick else options.videos:
         sequence = named(options, name)

@@ -82,7 +82,7 @@ _PAGODA = np.array(
 
 
 def render(
-    frames: int = FRAMES, size: tuple[int, int] = SIZE, seed: int = 0
+    frames: int = FRAMES, size: tuple[int, int] = SIZE, seed: int = 0, *, begin: int = 0
 ) -> Iterator[tuple[np.ndarray, Box | None]]:
     """Images of the demo in order, each with the dahlia's box.
 
@@ -94,6 +94,7 @@ def render(
     frames : how many
     size : (width, height) of the images; other shapes than 4:3 are stretched
     seed : of the camera's noise
+    begin : number of the first frame in the story
 
     Yields
     ------
@@ -104,7 +105,7 @@ def render(
     stage = _Stage(seed)
     width, height = size
     across, down = width / SIZE[0], height / SIZE[1]
-    for number in range(frames):
+    for number in range(begin, begin + frames):
         image, box = stage.shoot(FRAMES - 1 - abs(number % (2 * FRAMES - 2) - (FRAMES - 1)))
         if (width, height) != SIZE:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -10,7 +10,7 @@ const patience = { timeout: 60_000 };
 const options = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
   "--disable-component-update", "--disable-sync"];
 const browser = await chromium.launchPersistentContext(profile, {
-  executablePath, headless: true, args: options, viewport: { width: 1200, height: 900 },
+  executablePath, headless: true, args: options, viewport: { width: 800, height: 600 },
 });
 
 try {
