@@ -89,7 +89,7 @@ try {
     for (const [name, parts] of Object.entries(STATES)) {
       await page.evaluate((told) => events.onmessage({ data: JSON.stringify(told) }), parts);
       await doing[name]?.(page, viewport);
-      const { violations } = await page.evaluate(() => axe.run());
+      const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));
       seen.push({ state: name, scheme, pill: await page.locator("#state").innerText(), veil: await page.locator("#veil").textContent(),
         about: await page.locator("#about").textContent(), frame: await page.locator("#frame").textContent(),
         shots: await page.locator(".film li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
