@@ -94,7 +94,7 @@ def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
 @pytest.mark.parametrize(("share", "state"), [(0.0, "bootstrapping"), (0.9, "absent")])
 def test_a_score_is_judged_by_the_one_that_the_object_usually_has(scene, share, state):
     detector, there = started(scene, present_share=share), scene((60, 50))
-    for _ in range(300):
+    for _ in range(200):
         detector.step(there)
     track, _ = detector.step(cv2.addWeighted(there, 0.4, scene(), 0.6, 0))
     assert 0.3 < track.score < 0.8
