@@ -6,6 +6,7 @@ import csv
 import json
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -200,17 +201,22 @@ def test_a_disk_that_fills_up_ends_the_run_in_one_line(video, said, tmp_path, fi
     assert "any more: No space left on device" in one_line(errors)
 
 
-def test_a_second_start_at_the_same_place_is_refused_and_older_results_stay(video, catstream, said, tmp_path):
+def test_a_second_start_at_the_same_place_and_under_nohup_a_lost_terminal_end_nothing(video, catstream, said, tmp_path):
     source, box = video
-    place = ["--set", f"endpoint={tmp_path / 'run'}"]
-    first = catstream("track", source, "--box", box, "--output", tmp_path / "one", "--lockstep", *place)
+    place, slowly = ["--set", f"endpoint={tmp_path / 'run'}"], ["--set", "window=1", "--lockstep"]
+    nohup = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN)
+    results = ["--output", tmp_path / "one", "--video"]
+    first = catstream("track", source, "--box", box, *results, *slowly, *place, preexec_fn=nohup)
     started(first, tmp_path / "one" / "demo.txt")
+    first.send_signal(signal.SIGHUP)
     code, _, errors = said("track", source, "--box", box, "--output", tmp_path / "two", *place)
     assert code == 1
     assert "already running" in one_line(errors)
     assert not (tmp_path / "two").exists()
     assert first.wait(120) == 0
     assert len((tmp_path / "one" / "demo.txt").read_text().splitlines()) == 60
+    with open_source(tmp_path / "one" / "demo.mp4") as film:
+        assert sum(1 for _ in film) == 60
 
 
 def encoded(source, path):
