@@ -61,7 +61,7 @@ def browse(tmp_path):
 def test_a_box_drawn_with_the_mouse_is_followed_until_it_leaves_and_after_a_restart(browse, folder, tmp_path, until):
     path, boxes = tmp_path / "demo.mp4", []
     with VideoWriter(path, RATE, SIZE) as video:
-        for image, box in render(60, SIZE, begin=LEAVES - 35):
+        for image, box in render(145, SIZE, begin=LEAVES - 120):
             video.write(image)
             boxes.append(box)
     settings = Settings(endpoint=str(folder), window=4)  # it goes on only as its tracks are taken
