@@ -21,7 +21,7 @@ from catstream.web.guard import Guard, is_loopback
 __all__ = ["Server"]
 
 _FAREWELL_SECONDS = 2
-_ANY = ("0.0.0.0", "::")  # nosec B104  hosts that stand for all addresses of this machine
+_ANY = ("0.0.0.0", "::")  # hosts that stand for all addresses of this machine
 _GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
 
 
