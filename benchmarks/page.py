@@ -37,10 +37,10 @@ class Shown(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A part of the page; `told` is what has to be known to read its tables."""
+    """A part of the page: its heading, an introduction to its tables, and the tables."""
 
     heading: str
-    told: str | Callable[[Mapping[str, Record]], str]
+    introduction: str | Callable[[Mapping[str, Record]], str]
     parts: tuple[Shown, ...]
 
 
@@ -54,8 +54,8 @@ def written(found: Mapping[str, Record]) -> str:
     parts = ["# Results", _filled(_HEAD)]
     for section in SECTIONS:
         blocks = [_block(found[name], tables) for name, tables in section.parts]
-        told = section.told if isinstance(section.told, str) else section.told(found)
-        parts += [f"## {section.heading}", _filled(told), "```console\n" + "\n".join(blocks) + "\n```"]
+        introduction = section.introduction if isinstance(section.introduction, str) else section.introduction(found)
+        parts += [f"## {section.heading}", _filled(introduction), "```console\n" + "\n".join(blocks) + "\n```"]
     return "\n\n".join(parts) + "\n"
 
 
@@ -91,7 +91,7 @@ def of(number: int = 0, *, columns: Sequence[str] = (), without: str = "") -> Ca
 
 
 def strongest(count: int) -> Callable[[Record], Iterator[Table]]:
-    """What costs most to leave out, between nothing left out and the paper's tracker."""
+    """The ingredients whose loss costs most, between nothing left out and the paper's tracker."""
 
     def chosen(record: Record) -> Iterator[Table]:
         columns = ("variant", "AUC", "success", "AUC lost", "± standard error", "runs changed")

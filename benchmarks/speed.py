@@ -30,7 +30,7 @@ PEERS = ("csrt", "kcf", "mil")
 SIZES = ((320, 240), (640, 480), (960, 720), (1280, 720), (1920, 1080))
 CORESETS = (16, 32, 64, 128, 256, 512)
 
-#: What a user writes. Says frames a second without decoding, and a checksum of the boxes.
+#: A user's program. It prints frames per second without decoding, and a checksum of the boxes.
 PROGRAM = """
 import sys, time, zlib, cv2, catstream
 video, tracker, check, seconds = cv2.VideoCapture(sys.argv[1]), catstream.Tracker(), 0, 0.0
@@ -77,10 +77,10 @@ def own_program(options: argparse.Namespace) -> Table:
     found: dict[str, list[tuple[float, str]]] = {name: [] for name in ENVIRONMENTS}
     for _ in range(runs):  # turn about, so that other work on the machine slows both alike
         for name, variables in ENVIRONMENTS.items():
-            told = subprocess.run(
+            printed = subprocess.run(
                 command, env=plain | variables, capture_output=True, text=True, check=True
             ).stdout.split()
-            found[name].append((float(told[0]), told[1]))
+            found[name].append((float(printed[0]), printed[1]))
     rates = {name: median(rate for rate, _ in each) for name, each in found.items()}
     same = len({check for each in found.values() for _, check in each}) == 1
     rows = [(name, rate, rate / list(rates.values())[-1], "yes" if same else "no") for name, rate in rates.items()]
