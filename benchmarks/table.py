@@ -1,4 +1,4 @@
-"""What every benchmark takes and gives: a few options in, tables on the terminal and in a JSON file out.
+"""The options and the output of every benchmark: tables on the terminal and in a JSON file.
 
 `--json benchmarks/results/NAME.json` is the record that `docs/results.md` shows; `make results` writes the page anew.
 """

@@ -1,4 +1,4 @@
-"""How a verb waits for the pipeline that it attaches to."""
+"""Waiting for the pipeline that a verb attaches to."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ __all__ = ["wait_for_pipeline"]
 
 
 def wait_for_pipeline(endpoint: str, keys: str, seconds: float) -> Endpoint:
-    """Where a pipeline runs, once one of its processes is heard; says so on a terminal while it waits.
+    """Wait until a process of the pipeline answers, and return its endpoint; a terminal shows that it waits.
 
     Raises
     ------
     ServiceError
         If `endpoint` is empty and not just one pipeline runs, or the pipeline does not let these keys in.
     SilenceError
-        If none is heard in time.
+        If no process answers in time.
     """
     with Console(stderr=True).status(f"waiting for a pipeline {endpoint and f'at {endpoint}'}"):
         return knock(endpoint, keys, seconds)
