@@ -31,8 +31,8 @@ with atheris.instrument_imports(include=["catstream"]):
     from catstream.learned import Learned
     from catstream.messages import (
         Answer,
-        Bearings,
         Command,
+        DetectorState,
         End,
         Features,
         Health,
@@ -82,19 +82,21 @@ def messages() -> dict[str, tuple[Any, ...]]:
 
     box = Box(4.5, 3.0, 20.0, 10.0)
     motion = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
-    bearings = Bearings("present", box, box, box, 0.9, False, motion, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
+    detector = DetectorState(
+        "present", box, box, box, 0.9, False, motion, array(5, 4, dtype="<f8"), array(6, dtype="<f8")
+    )
     none = np.empty((0, 5), "<f4")
     return {
         "answer": (Answer("7f", True, "followed from frame 9 on", 9, box, 4),),
         "command": (Command("7f", "set-box", box, True), Command("80", "stop")),
         "end": (End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),),
         "features": (
-            Features(3, 2, 0.08, box, array(3, 5), array(3), array(3), array(1, 5), array(1), bearings),
+            Features(3, 2, 0.08, box, array(3, 5), array(3), array(3), array(1, 5), array(1), detector),
             Features(4, 3, 0.12, None, none, array(0), array(0), none, array(0)),
         ),
         "health": (Health("trainer", 1.7e9, {"version": 4.0}),),
         "model": (Model(4, 20, array(5), -0.25, motion, array(5)), Model(1, 0, array(5), 0.0, None)),
-        "position": (Position(5, 4, box, 2, bearings), Position()),
+        "position": (Position(5, 4, box, 2, detector), Position()),
         "preview": (Preview(2, 1280, 720, box, b"\xff\xd8\xff\xe0"),),
         "run": (Run("0.1.0", {"coreset_size": "64", "classifier": "joint"}),),
         "sample": (Sample(4, 20, summary(5), summary(5), summary(7), summary(7), array(2, 2, dtype="<f8")),),

@@ -19,8 +19,8 @@ from catstream.box import Box
 
 __all__ = [
     "Answer",
-    "Bearings",
     "Command",
+    "DetectorState",
     "End",
     "Features",
     "Health",
@@ -55,7 +55,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Bearings:
+class DetectorState:
     """What a detector needs to go on after a frame, besides the newest model.
 
     state      as in `Track`
@@ -96,7 +96,7 @@ class Features:
     weights   float32 (k,): how many ordinary rows each counts for, above 0
     extents   float32 (s, d): the object cut as it is, too small, too large, too wide and too narrow; s may be 0
     fits      float32 (s,): how well each of those fits, 1 as it is, towards 0 far from it
-    bearings  from where a restarted detector goes on; None where the sender has none
+    detector  from where a restarted detector goes on; None where the sender has none
     begins    whether another object begins here: what was learned before is forgotten
     """
 
@@ -109,7 +109,7 @@ class Features:
     weights: np.ndarray
     extents: np.ndarray
     fits: np.ndarray
-    bearings: Bearings | None = None
+    detector: DetectorState | None = None
     begins: bool = False
 
 
@@ -137,7 +137,7 @@ class Position:
     frame     its frame
     box       where the object was last found, None in a new stream
     version   the newest Sample made so far, 0 before the first
-    bearings  those of that message, None where it had none
+    detector  that of that message, None where it had none
     unsaved   how many of those up to `seq`, the last ones, are in memory only: the disk takes nothing
     """
 
@@ -145,7 +145,7 @@ class Position:
     frame: int = 0
     box: Box | None = None
     version: int = 0
-    bearings: Bearings | None = None
+    detector: DetectorState | None = None
     unsaved: int = 0
 
 

@@ -196,10 +196,10 @@ class Tracker:
                 f"its model has {len(model.weights)} weights, the features of this catstream are {row_length()}: "
                 f"catstream {facts['program']} wrote it"
             )
-        seq, bearings = self.compressor.seq, self.compressor.bearings
-        if bearings is None:
+        seq, state = self.compressor.seq, self.compressor.detector
+        if state is None:
             raise ValueError("it does not say where the object was")
-        self.detector.resume(seq, bearings, model)
+        self.detector.resume(seq, state, model)
         self.detector.resume_bootstrap(arrays, facts["bootstrap"])
         height, width = facts["size"]
         self._size = int(height), int(width)

@@ -213,11 +213,11 @@ class _Line:
         first, begins = self._helm.orders.box, max(self._helm.orders.begins, 1)
         if not version:
             start = Position(min(start.seq, begins - 1))
-        bearings = start.bearings
-        if bearings is None and start.box is not None and first is not None:
-            bearings = detector.bearings_at(start.box, first)
-        if start.seq >= begins and bearings is not None and model is not None:
-            detector.resume(start.seq, bearings, model)
+        state = start.detector
+        if state is None and start.box is not None and first is not None:
+            state = detector.state_at(start.box, first)
+        if start.seq >= begins and state is not None and model is not None:
+            detector.resume(start.seq, state, model)
         else:
             detector.seq = start.seq
             if learned is not None and not self._helm.orders.begins:
@@ -259,7 +259,7 @@ class _Line:
         self._tracks.send(track)
         if self._results is not None:
             self._deliver(self._results, track)
-            # Where a run can be repeated, the owner is never behind: the bearings are those of the features.
+            # Where a run can be repeated, the owner is never behind: the detector state is that of the features.
             while self._lockstep and self._results.taken < track.seq and not self._process.ended:
                 self._results.listen(0.02)
                 self._beat()

@@ -1,4 +1,4 @@
-"""What a compressor's checkpoint holds besides the trees: the last sample, and the detector's bearings.
+"""What a compressor's checkpoint holds besides the trees: the last sample, and the detector's state.
 
 The trees grow on after a sample: only the sample itself gives a trainer that starts anew the
 model that the detector goes by. Each is turned into arrays and facts for `storage`, and back.
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from catstream.box import Box
-from catstream.messages import Bearings, Model, Motion, Sample, Summary
+from catstream.messages import DetectorState, Model, Motion, Sample, Summary
 
-__all__ = ["bearings_of", "bearings_state", "model_of", "model_state", "sample_of", "sample_state"]
+__all__ = ["detector_facts", "detector_of", "model_of", "model_state", "sample_of", "sample_state"]
 
 State = tuple[dict[str, np.ndarray], dict[str, Any] | None]
 
@@ -60,26 +60,26 @@ def model_of(arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Model:
     return Model(version, frame, arrays["weights"], float(facts["bias"]), motion, arrays.get("extent"))
 
 
-def bearings_state(bearings: Bearings | None) -> State:
-    """Arrays and facts that `bearings_of` makes these of again."""
-    if bearings is None:
+def detector_facts(detector: DetectorState | None) -> State:
+    """Arrays and facts that `detector_of` makes this state of again."""
+    if detector is None:
         return {}, None
     arrays: dict[str, np.ndarray] = {}
-    if bearings.motion is not None and bearings.centre is not None:
-        parts = {"process": bearings.motion.process, "observation": bearings.motion.observation}
-        arrays = {f"bearings.{name}": array for name, array in {**parts, "centre": bearings.centre}.items()}
-    if bearings.balance is not None:
-        arrays["bearings.balance"] = bearings.balance
+    if detector.motion is not None and detector.centre is not None:
+        parts = {"process": detector.motion.process, "observation": detector.motion.observation}
+        arrays = {f"detector.{name}": array for name, array in {**parts, "centre": detector.centre}.items()}
+    if detector.balance is not None:
+        arrays["detector.balance"] = detector.balance
     names = ("state", "window", "sure", "first", "usual", "elsewhere", "sightings")
-    return arrays, {name: getattr(bearings, name) for name in names}
+    return arrays, {name: getattr(detector, name) for name in names}
 
 
-def bearings_of(arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> Bearings | None:
-    """The bearings, bit for bit; KeyError, TypeError or ValueError where they are none."""
+def detector_of(arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> DetectorState | None:
+    """The state of the detector, bit for bit; KeyError, TypeError or ValueError where it is none."""
     if facts is None:
         return None
-    motion, centre = None, arrays.get("bearings.centre")
+    motion, centre = None, arrays.get("detector.centre")
     if centre is not None:
-        motion = Motion(arrays["bearings.process"], arrays["bearings.observation"])
+        motion = Motion(arrays["detector.process"], arrays["detector.observation"])
     boxes = {name: facts[name] and Box(*facts[name]) for name in ("window", "sure", "first")}
-    return Bearings(**(facts | boxes), motion=motion, centre=centre, balance=arrays.get("bearings.balance"))
+    return DetectorState(**(facts | boxes), motion=motion, centre=centre, balance=arrays.get("detector.balance"))

@@ -18,7 +18,7 @@ from catstream.box import Box
 from catstream.compression import checkpoint
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, SettingsError
-from catstream.messages import Bearings, Features, Position, Sample
+from catstream.messages import DetectorState, Features, Position, Sample
 from catstream.settings import Settings
 
 __all__ = ["Compressor"]
@@ -40,7 +40,7 @@ class Compressor:
     Attributes
     ----------
     last_sample : the newest, None before the first
-    bearings : what came with the last message: a restarted detector goes on from there
+    detector : the state of the detector that came with the last message: a restarted detector goes on from there
     """
 
     def __init__(self, settings: Settings, tree: type[CoresetTree] = CoresetTree) -> None:
@@ -62,7 +62,7 @@ class Compressor:
         self.centres = np.empty((0, 2))
         self._path: list[tuple[float, float]] = []
         self.box: Box | None = None
-        self.bearings: Bearings | None = None
+        self.detector: DetectorState | None = None
         self._sampled_leaves = 0  # 0 before the first sample of an object
 
     @classmethod
@@ -114,7 +114,7 @@ class Compressor:
             self.trees["background"].insert(rows[labels == 0])
         if extents := len(features.extents):
             self.trees["extent"].insert(_loss_rows(features.extents, features.fits, np.ones(extents)))
-        self.seq, self.frame, self.bearings = features.seq, features.frame, features.bearings
+        self.seq, self.frame, self.detector = features.seq, features.frame, features.detector
         if features.box is not None:
             self.box = features.box
         self._follow(features.box)
@@ -128,7 +128,7 @@ class Compressor:
     @property
     def position(self) -> Position:
         """Where the stream of messages goes on, once all that was taken is stored."""
-        return Position(self.seq, max(self.frame, 0), self.box, self.sampled, self.bearings)
+        return Position(self.seq, max(self.frame, 0), self.box, self.sampled, self.detector)
 
     @property
     def leaves(self) -> int:
@@ -168,8 +168,8 @@ class Compressor:
             "trees": {},
         }
         sample, facts["sample"] = checkpoint.sample_state(self.last_sample)
-        bearings, facts["bearings"] = checkpoint.bearings_state(self.bearings)
-        arrays |= sample | bearings
+        detector, facts["detector"] = checkpoint.detector_facts(self.detector)
+        arrays |= sample | detector
         for name, tree in self.trees.items():
             own, facts["trees"][name] = tree.state()
             arrays |= {f"{name}.{key}": array for key, array in own.items()}
@@ -204,7 +204,7 @@ class Compressor:
         self = cls(settings)
         self.seq, self.frame = int(facts["seq"]), int(facts["frame"])
         self.box = Box(*facts["box"]) if facts["box"] else None
-        self.bearings = checkpoint.bearings_of(arrays, facts["bearings"])
+        self.detector = checkpoint.detector_of(arrays, facts["detector"])
         self.last_sample = checkpoint.sample_of(arrays, facts["sample"])
         self._sampled_leaves = int(facts["sampled_leaves"])
         self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]

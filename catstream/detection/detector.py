@@ -17,7 +17,7 @@ from catstream.detection.motion import CentreFilter
 from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
 from catstream.errors import BoxError, ProtocolError
-from catstream.messages import Bearings, Features, Model, State, Track
+from catstream.messages import DetectorState, Features, Model, State, Track
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ class Detector:
             else:
                 self._centre.adopt(model.motion)
 
-    def resume(self, seq: int, bearings: Bearings, model: Model) -> None:
+    def resume(self, seq: int, detector: DetectorState, model: Model) -> None:
         """Go on after message `seq` of a stream that another detector began.
 
         With the model that the other one had by then, it goes on as that would have, bit for bit.
@@ -185,18 +185,18 @@ class Detector:
         Parameters
         ----------
         seq : the last Features that is stored
-        bearings : those of that message, or `bearings_at` where the object was last
+        detector : that of that message, or `state_at` where the object was last
         model : the newest there is
         """
-        self.seq, self.state, self._started = seq, bearings.state, True
-        self._first_box = bearings.first
-        self._box, self._sure_box = bearings.window, bearings.sure
-        self._usual_score, self._elsewhere = bearings.usual, bearings.elsewhere
-        self._sightings = bearings.sightings
-        if bearings.motion is not None and bearings.centre is not None:
-            self._centre = CentreFilter.resumed(bearings.motion, bearings.centre, bearings.state != "absent")
-        if bearings.balance is not None:
-            self._balance = Balance.resumed(bearings.balance)
+        self.seq, self.state, self._started = seq, detector.state, True
+        self._first_box = detector.first
+        self._box, self._sure_box = detector.window, detector.sure
+        self._usual_score, self._elsewhere = detector.usual, detector.elsewhere
+        self._sightings = detector.sightings
+        if detector.motion is not None and detector.centre is not None:
+            self._centre = CentreFilter.resumed(detector.motion, detector.centre, detector.state != "absent")
+        if detector.balance is not None:
+            self._balance = Balance.resumed(detector.balance)
         if not model.version:
             self.model = model  # what stands in before the first one
         self.adopt(model)
@@ -212,10 +212,10 @@ class Detector:
 
             self._scm = SparseCollaborativeModel.resumed(arrays, facts)
 
-    def bearings_at(self, box: Box, first: Box) -> Bearings:
+    def state_at(self, box: Box, first: Box) -> DetectorState:
         """Where nothing is known but where the object was last, and in its first frame."""
         window = box.scaled(self.settings.context)
-        return Bearings("present", window, window, first.scaled(self.settings.context), 0.0, False)
+        return DetectorState("present", window, window, first.scaled(self.settings.context), 0.0, False)
 
     def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
         """Find the object in the next frame."""
@@ -327,12 +327,12 @@ class Detector:
         box = None if self.state == "absent" else self.box
         track = Track(seq, frame, time, self.state, box, float(score), self.model.version)
         rows = lesson.rows, lesson.labels, lesson.weights, lesson.extents, lesson.fits
-        return track, Features(seq, frame, time, box, *rows, self._bearings(), begins)
+        return track, Features(seq, frame, time, box, *rows, self._detector_state(), begins)
 
-    def _bearings(self) -> Bearings | None:
+    def _detector_state(self) -> DetectorState | None:
         if not self._started:
             return None
         motion, centre = (self._centre.motion, self._centre.state) if self._centre is not None else (None, None)
         boxes = self._box, self._sure_box, self._first_box
         usual, balance = float(self._usual_score), self._balance.state.copy()
-        return Bearings(self.state, *boxes, usual, self._elsewhere, motion, centre, balance, self._sightings)
+        return DetectorState(self.state, *boxes, usual, self._elsewhere, motion, centre, balance, self._sightings)

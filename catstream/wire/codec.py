@@ -26,8 +26,8 @@ from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import (
     Answer,
-    Bearings,
     Command,
+    DetectorState,
     End,
     Features,
     Health,
@@ -66,7 +66,7 @@ _ARRAYS: dict[type, dict[str, tuple[np.dtype, tuple[int | str, ...]]]] = {
     },
     Summary: {"rows": (_F32, ("r", "d")), "mean": (_F32, ("d",))},
     Sample: {"centres": (_F64, ("m", 2))},
-    Bearings: {"centre": (_F64, (5, 4)), "balance": (_F64, (6,))},
+    DetectorState: {"centre": (_F64, (5, 4)), "balance": (_F64, (6,))},
     Motion: {"process": (_F64, (4, 4)), "observation": (_F64, (2, 2))},
     Model: {"weights": (_F32, ("d",)), "extent": (_F32, ("d",))},
 }

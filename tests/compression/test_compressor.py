@@ -14,7 +14,7 @@ from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, SettingsError
-from catstream.messages import Bearings, Features, Motion, Sample
+from catstream.messages import DetectorState, Features, Motion, Sample
 from catstream.settings import Settings
 
 WIDTH = 20
@@ -177,16 +177,16 @@ def test_the_last_sample_can_be_had_again_though_the_trees_have_grown(settings, 
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_the_bearings_of_the_last_message_are_kept_bit_for_bit(settings, messages, moving, rng, tmp_path):
+def test_the_detector_state_of_the_last_message_is_kept_bit_for_bit(settings, messages, moving, rng, tmp_path):
     motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
-    bearings = Bearings("absent", *(Box(*rng.random(4)) for _ in range(3)), rng.random(), True)
+    detector = DetectorState("absent", *(Box(*rng.random(4)) for _ in range(3)), rng.random(), True)
     if moving:
-        bearings = dataclasses.replace(bearings, motion=motion, centre=centre, balance=rng.random(6))
+        detector = dataclasses.replace(detector, motion=motion, centre=centre, balance=rng.random(6))
     compressor = Compressor(settings)
-    compressor.take(dataclasses.replace(next(messages), bearings=bearings))
+    compressor.take(dataclasses.replace(next(messages), detector=detector))
     compressor.save(tmp_path / "state")
-    loaded = Compressor.load(tmp_path / "state", settings).bearings
-    assert_equal(dataclasses.asdict(loaded), dataclasses.asdict(bearings))
+    loaded = Compressor.load(tmp_path / "state", settings).detector
+    assert_equal(dataclasses.asdict(loaded), dataclasses.asdict(detector))
 
 
 def test_memory_is_flat_between_doublings(settings, messages):

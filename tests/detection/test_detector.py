@@ -139,14 +139,14 @@ def test_another_detector_goes_on_where_one_stopped(scene):
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
     track, features = detector.step(scene((64, 52)))
-    other.resume(features.seq, other.bearings_at(track.box, START), model)
+    other.resume(features.seq, other.state_at(track.box, START), model)
     track, _ = other.step(scene((68, 54)))
     assert (track.seq, track.state) == (3, "present")
     assert track.box.overlap(Box(68, 54, 48, 40)) > 0.8
 
 
 @pytest.mark.parametrize("absent", [False, True])
-def test_with_the_bearings_of_a_frame_another_detector_goes_on_bit_for_bit(scene, absent):
+def test_with_the_state_after_a_frame_another_detector_goes_on_bit_for_bit(scene, absent):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1, motion=Motion(np.eye(4), np.eye(2)))
     detector.adopt(model)
@@ -154,7 +154,7 @@ def test_with_the_bearings_of_a_frame_another_detector_goes_on_bit_for_bit(scene
         _, features = detector.step(scene((left, 50)))
     if absent:
         _, features = detector.step(scene())
-    other.resume(features.seq, features.bearings, model)
+    other.resume(features.seq, features.detector, model)
     for left in range(84, 100, 4):
         (track, features), (again, repeated) = (stage.step(scene((left, 50))) for stage in (detector, other))
         assert again == track
@@ -165,7 +165,7 @@ def test_a_frame_teaches_the_same_whatever_came_before(scene):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
-    other.resume(1, other.bearings_at(START, START), model)
+    other.resume(1, other.state_at(START, START), model)
     one, two = (stage.step(scene((60, 50)))[1] for stage in (detector, other))
     np.testing.assert_allclose(one.rows, two.rows, atol=1e-5)
 
@@ -298,9 +298,9 @@ def test_a_search_that_is_resumed_goes_on_bit_for_bit(scene, learned):
     tracks = sought(learned, [frame] * 5)
     other, before = Detector(Settings()), Detector(Settings())
     before.seek(learned, START)
-    bearings = [before.step(frame)[1].bearings for _ in range(2)][-1]
-    assert bearings.sightings == 2
-    other.resume(2, bearings, learned)
+    detector = [before.step(frame)[1].detector for _ in range(2)][-1]
+    assert detector.sightings == 2
+    other.resume(2, detector, learned)
     assert [other.step(frame)[0] for _ in range(3)] == tracks[2:]
 
 
@@ -322,5 +322,5 @@ def test_a_corrected_box_is_gone_on_with_and_teaches(scene):
 
 def test_a_corrected_box_says_anew_where_the_colours_lie(scene):
     detector = started(scene)
-    assert detector.step(scene((62, 50)))[1].bearings.balance[0] == 1
-    assert detector.correct(scene((90, 60)), Box(90, 60, 48, 40))[1].bearings.balance[0] == 0
+    assert detector.step(scene((62, 50)))[1].detector.balance[0] == 1
+    assert detector.correct(scene((90, 60)), Box(90, 60, 48, 40))[1].detector.balance[0] == 0

@@ -15,8 +15,8 @@ from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import (
     Answer,
-    Bearings,
     Command,
+    DetectorState,
     End,
     Features,
     Health,
@@ -43,17 +43,17 @@ def summary(columns: int) -> Summary:
 
 MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
 BOXES = Box(4.0, 2.0, 25.0, 12.5), Box(4.5, 2.0, 25.0, 12.5), Box(9.0, 2.0, 25.0, 12.5)
-BEARINGS = Bearings("present", *BOXES, 0.9, False, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
+DETECTOR = DetectorState("present", *BOXES, 0.9, False, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
 EXAMPLES = {
     "answer": Answer("7f", True, "followed from frame 9 on", 9, Box(4.5, 3.0, 20.0, 10.0), 4),
     "command": Command("7f", "set-box", Box(4.5, 3.0, 20.0, 10.0), True),
     "end": End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),
     "features": Features(
-        3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5), array(1), BEARINGS
+        3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5), array(1), DETECTOR
     ),
     "health": Health("detector", 1.7e9, {"sent": 4.0}, "the disk is full", "walk.mp4"),
     "model": Model(4, 20, array(5), -0.25, MOTION, array(5)),
-    "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2, BEARINGS),
+    "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2, DETECTOR),
     "preview": Preview(2, 1280, 720, Box(4.5, 3.0, 20.0, 10.0), b"\xff\xd8\xff\xe0 and so on"),
     "run": Run("0.1.0", {"coreset_size": "64", "classifier": "joint"}),
     "sample": Sample(4, 20, summary(5), summary(5), summary(7), summary(7), np.array([[1.0, 2.0], [np.nan, np.nan]])),

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from catstream.box import Box
-from catstream.messages import Bearings, End, Motion, Stored, Summary, Track
+from catstream.messages import DetectorState, End, Motion, Stored, Summary, Track
 from catstream.wire import codec
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
-MESSAGES = [*codec.KINDS.values(), Bearings, Summary, Motion]
+MESSAGES = [*codec.KINDS.values(), DetectorState, Summary, Motion]
 
 
 def block(language):
