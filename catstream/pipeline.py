@@ -24,7 +24,7 @@ from catstream.learned import Learned
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.state import Origin, began, held, learned, position
+from catstream.state import Origin, began, learned, locked, position
 from catstream.video.frames import without_password
 from catstream.video.source import WHOLE, is_live, open_source, without_scheme
 from catstream.wire.endpoint import meeting_place, private_folder
@@ -416,7 +416,7 @@ class Pipeline:
 @contextmanager
 def _begun(folder: Path, kept: Origin | None, origin: Origin) -> Iterator[None]:
     """Hold the folder of the state, and write there how the pipeline was started if that is new."""
-    with held(folder):
+    with locked(folder):
         if kept is None and began(folder):
             raise ServiceError(
                 f"a pipeline was kept in {str(folder)!r} already: go on with it (--resume {folder}), "

@@ -1,7 +1,7 @@
 """The state of a pipeline on disk: what it needs to go on after a power cut.
 
     DIR/origin.safetensors  what it was started with, for its owner alone: the source may have a password in it
-    DIR/orders.json         what was commanded: see `catstream.services.helm`
+    DIR/desired_state.json         what was commanded: see `catstream.services.commands`
     DIR/trees/              the compressor's checkpoints: see `catstream.compression.generations`
 
 A pipeline holds DIR for itself, and its compressor DIR/trees: by locks of the kernel, which are
@@ -29,7 +29,7 @@ from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 
-__all__ = ["TREES", "Origin", "began", "held", "learned", "position"]
+__all__ = ["TREES", "Origin", "began", "learned", "locked", "position"]
 
 #: Folder of the checkpoints, in that of the state.
 TREES = "trees"
@@ -66,7 +66,7 @@ class Origin:
     model: str = ""
 
     def save(self, folder: Path) -> None:
-        """Begin the state in a folder that is held; or change what it says, where it goes on.
+        """Begin the state in a folder that is locked; or change what it says, where it goes on.
 
         Raises
         ------
@@ -156,7 +156,7 @@ def learned(folder: Path, settings: Settings) -> Learned:
 
 
 @contextlib.contextmanager
-def held(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
+def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
     """Hold a folder, made where it is not there, for this process alone.
 
     Parameters

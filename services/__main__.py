@@ -25,9 +25,9 @@ from catstream.settings import Settings
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.option("--parent", type=int, hidden=True, help="Process id of the one to end with.")
-@click.option("--pulse", type=int, hidden=True, help="File descriptor of the pulse that it watches.")
+@click.option("--watchdog", type=int, hidden=True, help="File descriptor of the watchdog that it watches.")
 @click.pass_context
-def main(context: click.Context, parent: int | None, pulse: int | None) -> None:
+def main(context: click.Context, parent: int | None, watchdog: int | None) -> None:
     """The processes of a catstream pipeline.
 
     They meet at an endpoint: a folder that holds their sockets, or tcp://127.0.0.1:PORT. All need
@@ -40,7 +40,7 @@ def main(context: click.Context, parent: int | None, pulse: int | None) -> None:
       python -P -m catstream.services detector   --set endpoint=run walk.mp4 --box 120,80,64,48
     """
     logging.basicConfig(format=f"{context.invoked_subcommand}: %(message)s", level=logging.INFO)
-    context.obj = None if parent is None else Parent(parent, pulse)
+    context.obj = None if parent is None else Parent(parent, watchdog)
 
 
 _source = click.argument("source")

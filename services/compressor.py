@@ -15,7 +15,7 @@ from catstream.messages import End, Features, Position
 from catstream.recording.file import RecordingWriter
 from catstream.services.loop import Process
 from catstream.services.recorder import Recorder
-from catstream.state import TREES, held
+from catstream.state import TREES, locked
 from catstream.wire.sockets import Publisher, Receiver
 
 __all__ = ["main"]
@@ -41,7 +41,7 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
     with ExitStack() as stack:
         generations = None
         if state is not None:
-            generations = Generations(stack.enter_context(held(state / TREES, _LOCK_SECONDS)))
+            generations = Generations(stack.enter_context(locked(state / TREES, _LOCK_SECONDS)))
         compressor = generations.load(settings) if generations else Compressor(settings)
         if model is not None and not compressor.seq:
             compressor = Compressor.of(Learned.load(model).sample, settings)

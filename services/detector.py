@@ -14,7 +14,7 @@ from catstream.detection.detector import Detector
 from catstream.errors import ProtocolError, VideoError
 from catstream.learned import Learned
 from catstream.messages import End, Features, Model, Position, Track
-from catstream.services.helm import Helm, Orders
+from catstream.services.commands import CommandHandler, DesiredState
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
 from catstream.video.ahead import ahead
@@ -67,17 +67,17 @@ def main(
     process.source = _shown(source)
     with ExitStack() as stack:
         learned = Learned.load(model) if model is not None else None
-        file = state / "orders.json" if state is not None else None
-        orders = Orders(box, begins=1) if box is not None else Orders(learned.box if learned else None)
+        file = state / "desired_state.json" if state is not None else None
+        desired = DesiredState(box, begins=1) if box is not None else DesiredState(learned.box if learned else None)
         if resume and file is not None and file.exists():
             try:
-                orders = Orders.load(file)
+                desired = DesiredState.load(file)
             except ProtocolError as error:  # what was learned is whole, and goes on
                 process.trouble = str(error)
                 _log.warning("%s", error)
         detector = Detector(process.settings)
-        helm = stack.enter_context(Helm(process.endpoint, detector, orders, file))
-        line = _Line(process, stack, helm, owned)
+        commands = stack.enter_context(CommandHandler(process.endpoint, detector, desired, file))
+        line = _Line(process, stack, commands, owned)
         line.wait_for_subscribers(recorded)
         if resume:
             kalman.prepare()  # while the others say where they are
@@ -109,14 +109,14 @@ def main(
                 found = line.held(frame, detector.seq)
                 if line.over:
                     break
-                if found is None and helm.holds:
+                if found is None and commands.holds:
                     line.skipped += 1
                     continue
                 if found is None:
                     line.adopt(detector)
-                    if detector.seq < max(helm.orders.begins, 1):
+                    if detector.seq < max(commands.desired.begins, 1):
                         process.allow(_OPEN_SECONDS)
-                    found = _follow(detector, frame, helm.orders)
+                    found = _follow(detector, frame, commands.desired)
                 track, features = found
                 line.send(replace(track, pts=frame.pts), features)
                 if track.frame >= process.settings.motion_frames // 2:
@@ -147,13 +147,13 @@ def _shown(source: str) -> str:
     return text.encode(errors="replace").decode()[:_LONGEST_SOURCE]  # the name of a file may be no text
 
 
-def _follow(detector: Detector, frame: Frame, orders: Orders) -> tuple[Track, Features]:
+def _follow(detector: Detector, frame: Frame, desired: DesiredState) -> tuple[Track, Features]:
     """What a frame gives that was not followed before, by this detector or the one before it."""
     seq = detector.seq + 1
-    if seq < orders.begins:  # of the object before, of which all is forgotten; only its owner lacks these tracks
+    if seq < desired.begins:  # of the object before, of which all is forgotten; only its owner lacks these tracks
         return detector.miss(frame.time)
-    if seq == orders.begins and orders.box is not None:
-        return detector.init(frame.image, orders.box, frame.time)
+    if seq == desired.begins and desired.box is not None:
+        return detector.init(frame.image, desired.box, frame.time)
     return detector.step(frame.image, frame.time)
 
 
@@ -164,9 +164,9 @@ class _Line:
     skipped : frames of it that were taken, and not followed as that is not wanted now
     """
 
-    def __init__(self, process: Process, stack: ExitStack, helm: Helm, owned: bool) -> None:
+    def __init__(self, process: Process, stack: ExitStack, commands: CommandHandler, owned: bool) -> None:
         window, endpoint = process.settings.window, process.endpoint
-        self._process, self._helm = process, helm
+        self._process, self._commands = process, commands
         self._features = stack.enter_context(Sender("features", endpoint, window))
         self._results = stack.enter_context(Sender("results", endpoint, window)) if owned else None
         self._tracks = stack.enter_context(Publisher("tracks", endpoint))
@@ -183,7 +183,7 @@ class _Line:
     @property
     def over(self) -> str:
         """Why no frame is followed any more, empty before."""
-        return "it was stopped" if self._process.ended else self._helm.over
+        return "it was stopped" if self._process.ended else self._commands.over
 
     def wait_for_subscribers(self, recorded: bool) -> None:
         """Wait for the recorder, however long it takes, and a few seconds for subscribers that announced themselves."""
@@ -210,7 +210,7 @@ class _Line:
                 break
             model = self.models.receive(0.05) or model
         start = min(positions, key=lambda position: position.seq)
-        first, begins = self._helm.orders.box, max(self._helm.orders.begins, 1)
+        first, begins = self._commands.desired.box, max(self._commands.desired.begins, 1)
         if not version:
             start = Position(min(start.seq, begins - 1))
         state = start.detector
@@ -220,7 +220,7 @@ class _Line:
             detector.resume(start.seq, state, model)
         else:
             detector.seq = start.seq
-            if learned is not None and not self._helm.orders.begins:
+            if learned is not None and not self._commands.desired.begins:
                 detector.seek(learned.model, learned.box)
         for sender, position in zip(self._senders, positions, strict=True):
             sender.resume(start.seq, position.seq)
@@ -240,7 +240,7 @@ class _Line:
         """What the frame gives by a box that was commanded for it; of a file it is held for as long as is wanted."""
         self._beat()
         found = self._begun(frame)
-        if found is None and self._helm.holds:
+        if found is None and self._commands.holds:
             self.previews.show(number, frame.image, None)
             while found is None and self._waits:
                 time.sleep(_HELD_SECONDS)
@@ -249,9 +249,9 @@ class _Line:
         return found
 
     def _begun(self, frame: Frame) -> tuple[Track, Features] | None:
-        if self._helm.wanted:
+        if self._commands.wanted:
             self._process.allow(_OPEN_SECONDS)
-        return self._helm.follow(frame)
+        return self._commands.follow(frame)
 
     def send(self, track: Track, features: Features) -> None:
         """Send what one frame gave; wait where a window is full."""
@@ -287,12 +287,12 @@ class _Line:
         self.previews.turn()
         self._beat()
         if self.source is not None and self.source.counters.get("lost_seconds"):
-            self._helm.refuse_boxes("the source is lost, and there is no frame for a box: ask again once it is back")
+            self._commands.refuse_boxes("the source is lost, so there is no frame for a box: ask again once it is back")
         return bool(self.over)
 
     def end(self, seq: int, reason: str, failed: bool) -> None:
         """Say that nothing follows, and wait until all is stored; where the run was stopped, not for long."""
-        self._helm.end(reason)
+        self._commands.end(reason)
         totals: dict[str, float] = {}
         for sender in self._senders:
             seconds = _OWNER_SECONDS if sender is self._results else _FAREWELL_SECONDS
@@ -302,7 +302,7 @@ class _Line:
                 self._beat()
             if sender is self._features:
                 totals = {"sent": float(seq), "stored": float(min(sender.stored, seq))}
-        self._helm.release()
+        self._commands.release()
         for publisher in (self._tracks, self._lessons):
             publisher.send(End(seq + 1, reason, failed, totals))
         self._process.beat(self._counters, now=True)
@@ -326,10 +326,10 @@ class _Line:
     @property
     def _waits(self) -> bool:
         """Whether a frame in hand waits; one of a live source does not."""
-        return self._helm.holds and not self.over and self.source is not None and not self.source.live
+        return self._commands.holds and not self.over and self.source is not None and not self.source.live
 
     def _beat(self) -> None:
-        self._process.beat(self._counters, now=self._helm.listen())
+        self._process.beat(self._counters, now=self._commands.listen())
 
     def _counters(self) -> dict[str, float]:
         counters = self.source.counters if self.source else {}
@@ -340,6 +340,6 @@ class _Line:
             "taken": self._features.taken,
             "stored": self._features.stored,
             "model_version": self._version,
-            **self._helm.counters,
+            **self._commands.counters,
             **counters,
         }

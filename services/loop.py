@@ -13,7 +13,7 @@ from typing import NamedTuple
 from catstream.errors import CatstreamError, SetBackError
 from catstream.messages import Health, Run
 from catstream.recording.file import run_of
-from catstream.services.pulse import PATIENCE, Pulse
+from catstream.services.watchdog import PATIENCE, Watchdog
 from catstream.settings import Settings
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.refusals import refusals
@@ -37,11 +37,11 @@ class Parent(NamedTuple):
     """Who started a process, and is not to be outlived.
 
     pid    its process id
-    pulse  file descriptor of the memory in which it watches the pulse; None where it does not
+    watchdog  file descriptor of the memory in which it watches the watchdog; None where it does not
     """
 
     pid: int
-    pulse: int | None
+    watchdog: int | None
 
 
 class Process:
@@ -52,7 +52,7 @@ class Process:
     broken : whether the stream ended before it should, as its `End` tells
     """
 
-    def __init__(self, name: str, settings: Settings, pulse: int | None = None) -> None:
+    def __init__(self, name: str, settings: Settings, watchdog: int | None = None) -> None:
         self.name = name
         self.settings = settings
         self.endpoint = Endpoint.parse(settings.endpoint, settings.keys)
@@ -60,7 +60,7 @@ class Process:
         self.broken = False
         # All but the detector turn in a time that grows with the coreset size.
         factor = 1.0 if name == "detector" else max(1.0, (settings.coreset_size / _QUICK_SIZE) ** 2)
-        self._pulse = Pulse(pulse, PATIENCE * factor)
+        self._watchdog = Watchdog(watchdog, PATIENCE * factor)
         self._asked = float("inf")  # when it was asked to end
         self._health = Publisher("health", self.endpoint, sender=name)
         self._beat = 0.0
@@ -83,9 +83,9 @@ class Process:
 
     def beat(self, counters: Callable[[], dict[str, float]], now: bool = False) -> None:
         """Tell how it is, once a second; cheap, and to be called in every turn of a loop."""
-        self._pulse.beat()
+        self._watchdog.beat()
         if now:  # it may be the last turn, after which sockets take their time to close
-            self._pulse.allow(_CLOSE_SECONDS)
+            self._watchdog.allow(_CLOSE_SECONDS)
         if now or time.monotonic() - self._beat >= 1:
             self._beat = time.monotonic()
             self._health.send(Health(self.name, time.time(), counters() | refusals(), self.trouble, self.source))
@@ -94,11 +94,11 @@ class Process:
 
     def allow(self, seconds: float) -> None:
         """Say that this turn of the loop may take so long: it is not stuck before."""
-        self._pulse.allow(seconds)
+        self._watchdog.allow(seconds)
 
     def allow_each(self, seconds: float) -> None:
         """Say that each turn of the loop from now on may take so much longer."""
-        self._pulse.allow_each(seconds)
+        self._watchdog.allow_each(seconds)
 
     def close(self) -> None:
         """Send the last health, then close."""
@@ -123,7 +123,7 @@ def run(name: str, main: Callable[[Process], None], settings: Settings, parent: 
     if parent is not None:
         die_with(parent.pid)
     try:
-        process = Process(name, settings, parent.pulse if parent else None)
+        process = Process(name, settings, parent.watchdog if parent else None)
         try:
             main(process)
         finally:

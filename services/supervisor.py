@@ -18,8 +18,8 @@ from typing import IO
 from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.services.loop import BROKEN, REFUSED
-from catstream.services.pulse import Pulse
 from catstream.services.start import environment, service_command
+from catstream.services.watchdog import Watchdog
 from catstream.settings import Settings
 from catstream.video.frames import without_password
 from catstream.video.source import WHOLE, is_live
@@ -48,7 +48,7 @@ class _Child:
 
     name: str
     log: IO[bytes]
-    pulse: Pulse = field(default_factory=Pulse)
+    watchdog: Watchdog = field(default_factory=Watchdog)
     process: subprocess.Popen[bytes] | None = None
     restarts: deque[float] = field(default_factory=deque)
     due: float = 0.0
@@ -65,13 +65,13 @@ class _Child:
 
     def hangs(self, seconds: float) -> bool:
         """Whether its loop has stood still for too long, having been watched for so many seconds more."""
-        turns = self.pulse.turns
+        turns = self.watchdog.turns
         if turns != self.turns:
             self.turns, self.silent, self.stopped = turns, 0.0, 0.0
             return False
         self.silent += seconds
         self.stopped = self.stopped + seconds if self.silent > _BLINK_SECONDS and self._is_stopped() else 0.0
-        return self.silent > self.pulse.patience or self.stopped > _STOPPED_SECONDS
+        return self.silent > self.watchdog.patience or self.stopped > _STOPPED_SECONDS
 
     def _is_stopped(self) -> bool:
         with contextlib.suppress(OSError):  # it is gone
@@ -231,13 +231,13 @@ class Supervisor:
                     child.process.kill()
                     child.process.wait()
                 child.log.close()
-                child.pulse.close()
+                child.watchdog.close()
 
     def _start(self, child: _Child) -> None:
-        child.pulse.close()
-        child.pulse, child.hung = Pulse(), False
+        child.watchdog.close()
+        child.watchdog, child.hung = Watchdog(), False
         child.turns, child.silent, child.stopped = 0.0, 0.0, 0.0
-        watched = ["--parent", str(os.getpid()), "--pulse", str(child.pulse.handle)]
+        watched = ["--parent", str(os.getpid()), "--watchdog", str(child.watchdog.handle)]
         command = service_command(*watched, child.name)
         for pair in self._settings.changed():
             command += ["--set", pair]
@@ -257,7 +257,7 @@ class Supervisor:
             env=environment(),
             stdin=subprocess.DEVNULL,
             stderr=child.log,
-            pass_fds=[child.pulse.handle],
+            pass_fds=[child.watchdog.handle],
             start_new_session=True,  # Ctrl-C is for the parent, which then ends them in order
         )
 

@@ -15,7 +15,7 @@ import zmq
 from catstream.errors import ProtocolError, RefusedError, ServiceError, SettingsError
 from catstream.learned import Learned
 from catstream.pipeline import Pipeline
-from catstream.services.helm import Orders
+from catstream.services.commands import DesiredState
 from catstream.settings import Settings
 from catstream.steering import control
 from catstream.subscription import subscribe
@@ -31,13 +31,13 @@ PATCH = (20, 150, 70, 60)  # of the lake, which the object does not come to
 
 @contextmanager
 def steered(source, box=None, **options):
-    """A pipeline, its helm, and somewhere to steer from while its tracks are taken."""
+    """A pipeline, its steering, and somewhere to steer from while its tracks are taken."""
     with (
         Pipeline(source, box, SETTINGS, **options) as pipeline,
-        control(pipeline.endpoint, timeout=SECONDS) as helm,
+        control(pipeline.endpoint, timeout=SECONDS) as steering,
         ThreadPoolExecutor(1) as pool,
     ):
-        yield pipeline, helm, pool
+        yield pipeline, steering, pool
 
 
 def taken(pipeline, tracks, answer):
@@ -61,11 +61,11 @@ def saved(video, once):
 
     def save(folder):
         path, boxes = video
-        with steered(path, boxes[0], part=slice(0, 50)) as (pipeline, helm, pool):
+        with steered(path, boxes[0], part=slice(0, 50)) as (pipeline, steering, pool):
             answer = None
             for track in pipeline:
                 if answer is None and track.model_version >= 4:
-                    answer = pool.submit(helm.save, folder / "object.safetensors")
+                    answer = pool.submit(steering.save, folder / "object.safetensors")
             assert answer.result().version >= 4
 
     return once("saved", save) / "object.safetensors"
@@ -73,14 +73,14 @@ def saved(video, once):
 
 def test_without_a_box_the_first_frame_is_held_and_in_a_pause_a_box_is_for_the_frame_that_is_held(video):
     path, boxes = video
-    with steered(path) as (pipeline, helm, _):
+    with steered(path) as (pipeline, steering, _):
         assert told(pipeline, lambda counters: counters["waiting"])["sent"] == 0
-        helm.pause()
-        refuses_what_cannot_be_done(pipeline, helm)
-        assert helm.set_box(boxes[0]).frame == 0
-        assert helm.set_box(boxes[1]).frame == 1
+        steering.pause()
+        refuses_what_cannot_be_done(pipeline, steering)
+        assert steering.set_box(boxes[0]).frame == 0
+        assert steering.set_box(boxes[1]).frame == 1
         told(pipeline, lambda counters: counters["paused"] and counters["sent"] == 2)
-        helm.resume()
+        steering.resume()
         tracks = list(pipeline)
         assert pipeline.restarts == 0
     assert [track.frame for track in tracks] == list(range(len(boxes)))
@@ -90,13 +90,13 @@ def test_without_a_box_the_first_frame_is_held_and_in_a_pause_a_box_is_for_the_f
     assert pipeline.totals == {"sent": len(boxes), "stored": len(boxes)}
 
 
-def refuses_what_cannot_be_done(pipeline, helm):
+def refuses_what_cannot_be_done(pipeline, steering):
     """A pipeline that has no box yet says why, and counts what is no command."""
     for box, why in (((400, 10, 20, 20), "outside the frame"), ((10, 10, 1, 9), "at least 2 pixels")):
         with pytest.raises(RefusedError, match=why):
-            helm.set_box(box)
+            steering.set_box(box)
     with pytest.raises(RefusedError, match="nothing was learned"):
-        helm.save("never.safetensors")
+        steering.save("never.safetensors")
     with zmq.Context.instance().socket(zmq.DEALER) as stranger:
         stranger.connect(Endpoint.parse(pipeline.endpoint).address(CHANNELS["control"]))
         for data in (b"", b"\xc1", b"\x93\x01\xa4", bytes(9000)):
@@ -108,13 +108,13 @@ def refuses_what_cannot_be_done(pipeline, helm):
 def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_whoever_dies(video, victims):
     path, boxes = video
     tracks = []
-    with steered(path, PATCH) as (pipeline, helm, pool):
+    with steered(path, PATCH) as (pipeline, steering, pool):
         for track in pipeline:
             tracks.append(track)
             if track.model_version >= 4:
                 break
         wanted = boxes[len(tracks) + SETTINGS.window // 2]
-        answer = taken(pipeline, tracks, pool.submit(helm.set_box, wanted))
+        answer = taken(pipeline, tracks, pool.submit(steering.set_box, wanted))
         for victim in victims:
             os.kill(pipeline.pids[victim], signal.SIGKILL)
         tracks += pipeline
@@ -134,13 +134,13 @@ def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_w
 def test_the_same_object_elsewhere_keeps_its_model_and_stopped_by_a_command_all_is_stored(video):
     path, boxes = video
     tracks = []
-    with steered(path, boxes[0]) as (pipeline, helm, pool):
+    with steered(path, boxes[0]) as (pipeline, steering, pool):
         for track in pipeline:
             tracks.append(track)
             if track.model_version >= 4:
                 break
-        answer = taken(pipeline, tracks, pool.submit(helm.set_box, boxes[len(tracks)], keep=True))
-        taken(pipeline, tracks, pool.submit(helm.stop))
+        answer = taken(pipeline, tracks, pool.submit(steering.set_box, boxes[len(tracks)], keep=True))
+        taken(pipeline, tracks, pool.submit(steering.stop))
         tracks += pipeline
     assert answer.frame < len(tracks) < len(boxes)
     assert [track.frame for track in tracks] == list(range(len(tracks)))
@@ -155,13 +155,13 @@ def test_the_same_object_elsewhere_keeps_its_model_and_stopped_by_a_command_all_
 
 def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
     path, boxes = video
-    with steered(path) as (pipeline, helm, pool):
-        helm.pause()
-        helm.set_box(boxes[0])
+    with steered(path) as (pipeline, steering, pool):
+        steering.pause()
+        steering.set_box(boxes[0])
         killed = pipeline.pids["detector"]
         os.kill(killed, signal.SIGKILL)
         # Supervised while its tracks are taken: of which there is one.
-        resumed = pool.submit(lambda: (told(pipeline, lambda counters: counters["paused"]), helm.resume()))
+        resumed = pool.submit(lambda: (told(pipeline, lambda counters: counters["paused"]), steering.resume()))
         tracks = list(pipeline)
         assert resumed.result()[0]["sent"] <= 1
     assert pipeline.restarts == 1
@@ -169,17 +169,17 @@ def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
 
 
 @pytest.mark.parametrize("torn", ["", "{", "null", '{"box": [1, 2]}'], ids=repr)
-def test_orders_that_a_power_cut_tore_are_an_error(tmp_path, torn):
-    (tmp_path / "orders.json").write_text(torn)
+def test_commands_that_a_power_cut_tore_are_an_error(tmp_path, torn):
+    (tmp_path / "desired_state.json").write_text(torn)
     with pytest.raises(ProtocolError, match="what was commanded cannot be read"):
-        Orders.load(tmp_path / "orders.json")
+        DesiredState.load(tmp_path / "desired_state.json")
 
 
-def test_orders_that_a_power_cut_tore_are_said_and_the_run_goes_on(video, tmp_path):
+def test_commands_that_a_power_cut_tore_are_said_and_the_run_goes_on(video, tmp_path):
     path, boxes = video
     with Pipeline(path, boxes[0], SETTINGS, state=tmp_path / "kept") as pipeline:
         before = next(track for track in pipeline if track.model_version >= 2)
-    (tmp_path / "kept" / "orders.json").write_text("{")
+    (tmp_path / "kept" / "desired_state.json").write_text("{")
     with Pipeline(resume=tmp_path / "kept", settings=SETTINGS) as pipeline:
         tracks = list(pipeline)
     assert "what was commanded cannot be read" in pipeline.trouble["detector"]
@@ -189,14 +189,14 @@ def test_orders_that_a_power_cut_tore_are_said_and_the_run_goes_on(video, tmp_pa
     assert tracks[-1].frame == len(boxes) - 1
 
 
-def test_orders_are_on_disk_before_they_take_the_place_of_older_ones(tmp_path, monkeypatch):
+def test_commands_are_on_disk_before_they_take_the_place_of_older_ones(tmp_path, monkeypatch):
     done = []
     for module, name in ((os, "fsync"), (Path, "replace")):
         call = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *given, call=call, name=name: (done.append(name), call(*given))[1])
-    Orders(paused=True).save(tmp_path / "orders.json")
+    DesiredState(paused=True).save(tmp_path / "desired_state.json")
     assert done == ["fsync", "replace", "fsync"], "the file, and then its name"
-    assert Orders.load(tmp_path / "orders.json") == Orders(paused=True)
+    assert DesiredState.load(tmp_path / "desired_state.json") == DesiredState(paused=True)
 
 
 def test_a_saved_model_finds_the_object_and_learning_goes_on_from_it(video, saved):
@@ -247,18 +247,18 @@ def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera
     with open_source(path) as source:
         image = next(source).image
     still = camera(lambda _: image)
-    with steered(still.url) as (pipeline, helm, _):
+    with steered(still.url) as (pipeline, steering, _):
         told(pipeline, lambda counters: counters["waiting"] and counters["skipped"] >= 3)
-        helm.set_box(boxes[0])
-        helm.pause()
+        steering.set_box(boxes[0])
+        steering.pause()
         passed = told(pipeline, lambda counters: counters["paused"])
         assert told(pipeline, lambda counters: counters["skipped"] > passed["skipped"])["sent"] == passed["sent"]
-        helm.resume()
+        steering.resume()
         tracks = []
         for track in pipeline:
             tracks.append(track)
             if len(tracks) == passed["sent"] + 3:
-                helm.stop()
+                steering.stop()
     assert tracks[0].box == pytest.approx(boxes[0])
     assert [track.frame for track in tracks] == list(range(len(tracks)))
     assert all(track.box.overlap(boxes[0]) > 0.8 for track in tracks)

@@ -1,4 +1,4 @@
-"""The pulse of a process: turns of its loop, counted where the one that watches over it can see them.
+"""The watchdog of a process: turns of its loop, counted where the one that watches over it can see them.
 
 The two share a few bytes of memory. Nothing is sent, so that nothing can be late, full or lost; who was
 asleep sees the newest count at once; and the count stands still as soon as the loop does, whatever
@@ -11,7 +11,7 @@ import mmap
 import os
 import time
 
-__all__ = ["PATIENCE", "Pulse"]
+__all__ = ["PATIENCE", "Watchdog"]
 
 #: Seconds without a turn after which a loop counts as stuck, where its turns are short.
 PATIENCE = 2.5
@@ -23,7 +23,7 @@ _TURNS_LONG = 5.0  # a turn may take so many times what the slowest of late took
 _FADES = 0.99  # with each turn: what the slowest of late was
 
 
-class Pulse:
+class Watchdog:
     """Shared by the loop, which calls `beat`, `allow` and `allow_each`, and by who watches: `turns` and `patience`.
 
     handle : file descriptor of the memory, inherited; None to make it
@@ -32,7 +32,7 @@ class Pulse:
 
     def __init__(self, handle: int | None = None, least: float = PATIENCE) -> None:
         made = handle is None
-        self.handle = os.memfd_create("pulse") if handle is None else handle
+        self.handle = os.memfd_create("watchdog") if handle is None else handle
         if made:
             os.truncate(self.handle, _SIZE)
         self._cells = memoryview(mmap.mmap(self.handle, _SIZE)).cast("d")

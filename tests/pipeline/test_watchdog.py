@@ -1,4 +1,4 @@
-"""The pulse: who is slow is given time, who stands still is noticed."""
+"""The watchdog: who is slow is given time, who stands still is noticed."""
 
 from __future__ import annotations
 
@@ -11,57 +11,57 @@ from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.recording.file import run_of
 from catstream.services import compressor, detector
-from catstream.services.pulse import PATIENCE, Pulse
+from catstream.services.watchdog import PATIENCE, Watchdog
 from catstream.settings import Settings
 from catstream.wire.endpoint import Endpoint
 
 
 @pytest.fixture
-def pulse():
-    pulse = Pulse()
-    yield pulse
-    pulse.close()
+def watchdog():
+    watchdog = Watchdog()
+    yield watchdog
+    watchdog.close()
 
 
-def test_who_watches_sees_each_turn(pulse):
-    loop = Pulse(pulse.handle)
+def test_who_watches_sees_each_turn(watchdog):
+    loop = Watchdog(watchdog.handle)
     for turn in range(1, 4):
         loop.beat()
-        assert pulse.turns == turn
-    assert pulse.patience == PATIENCE
+        assert watchdog.turns == turn
+    assert watchdog.patience == PATIENCE
 
 
-def test_who_is_starting_has_longer_than_who_turns(pulse):
-    assert pulse.patience > 20 * PATIENCE
+def test_who_is_starting_has_longer_than_who_turns(watchdog):
+    assert watchdog.patience > 20 * PATIENCE
 
 
-def test_a_long_step_that_is_announced_has_its_time_and_the_next_has_not(pulse):
-    pulse.beat()
-    pulse.allow(60)
-    assert pulse.patience == 60
-    pulse.beat()
-    assert pulse.patience == PATIENCE
+def test_a_long_step_that_is_announced_has_its_time_and_the_next_has_not(watchdog):
+    watchdog.beat()
+    watchdog.allow(60)
+    assert watchdog.patience == 60
+    watchdog.beat()
+    assert watchdog.patience == PATIENCE
 
 
-def test_where_turns_are_slow_patience_is_longer_until_they_are_quick_again(pulse, monkeypatch):
+def test_where_turns_are_slow_patience_is_longer_until_they_are_quick_again(watchdog, monkeypatch):
     clock = [time.monotonic()]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     for seconds in (0.0, 0.0, 4.0):
         clock[0] += seconds
-        pulse.beat()
-    assert pulse.patience == pytest.approx(20, rel=0.1)
+        watchdog.beat()
+    assert watchdog.patience == pytest.approx(20, rel=0.1)
     for _ in range(500):
-        pulse.beat()
-    assert pulse.patience == PATIENCE
+        watchdog.beat()
+    assert watchdog.patience == PATIENCE
 
 
-def test_where_each_turn_is_longer_each_has_its_time(pulse):
-    pulse.allow_each(6)
+def test_where_each_turn_is_longer_each_has_its_time(watchdog):
+    watchdog.allow_each(6)
     for _ in range(3):
-        pulse.beat()
-        assert pulse.patience == PATIENCE + 6
-    pulse.allow(60)
-    assert pulse.patience == 60
+        watchdog.beat()
+        assert watchdog.patience == PATIENCE + 6
+    watchdog.allow(60)
+    assert watchdog.patience == 60
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from catstream.video.frames import Frame
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Responder
 
-__all__ = ["STOPPED", "Helm", "Orders"]
+__all__ = ["STOPPED", "CommandHandler", "DesiredState"]
 
 #: Why a stream ended that a command stopped.
 STOPPED = "it was stopped by a command"
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Orders:
+class DesiredState:
     """What holds until something else is ordered.
 
     box      the object in its first frame; of a saved model about its size; None while a box is waited for
@@ -69,37 +69,37 @@ class Orders:
             ) from None
 
 
-class Helm:
+class CommandHandler:
     """Hears commands, carries them out and answers them.
 
     Parameters
     ----------
     detector : the one that is steered
-    orders : what holds at the start
+    desired : what holds at the start
     file : where that is kept as it changes, None for nowhere
 
     Attributes
     ----------
-    orders : what holds now
+    desired : what holds now
     over : why no frame will be followed any more, empty before
     """
 
-    def __init__(self, endpoint: Endpoint, detector: Detector, orders: Orders, file: Path | None) -> None:
-        self.orders, self.over = orders, STOPPED if orders.stopped else ""
+    def __init__(self, endpoint: Endpoint, detector: Detector, desired: DesiredState, file: Path | None) -> None:
+        self.desired, self.over = desired, STOPPED if desired.stopped else ""
         self._detector, self._file = detector, file
         self._boxes: deque[tuple[Command, Box]] = deque()  # that wait for a frame
         self._commands = Responder("control", endpoint)
-        self._hold(orders)
+        self._hold(desired)
 
     @property
     def holds(self) -> bool:
         """Whether frames are not followed now."""
-        return self.orders.paused or self.orders.box is None
+        return self.desired.paused or self.desired.box is None
 
     @property
     def counters(self) -> dict[str, float]:
         """What health tells of it."""
-        return {"paused": float(self.orders.paused), "waiting": float(self.orders.box is None)}
+        return {"paused": float(self.desired.paused), "waiting": float(self.desired.box is None)}
 
     @property
     def wanted(self) -> bool:
@@ -123,7 +123,7 @@ class Helm:
         while self._boxes:
             command, box = self._boxes.popleft()
             keeps = command.keep and self._detector.model.version > 0
-            first = self.orders.box is None
+            first = self.desired.box is None
             try:
                 place = self._detector.correct if keeps else self._detector.init
                 found = place(frame.image, box, frame.time)
@@ -131,7 +131,7 @@ class Helm:
                 self._answer(command, False, str(error))
                 continue
             if not keeps:
-                self._hold(replace(self.orders, box=box, begins=found[0].seq))
+                self._hold(replace(self.desired, box=box, begins=found[0].seq))
             what = "the same object goes on" if keeps else "the object begins" if first else "another object begins"
             self._answer(command, True, f"{what} at {box} in frame {found[0].frame}")
             return found
@@ -149,7 +149,7 @@ class Helm:
 
     def release(self) -> None:
         """All is done: a detector that goes on from here one day is not stopped."""
-        self._hold(replace(self.orders, stopped=False))
+        self._hold(replace(self.desired, stopped=False))
 
     def close(self) -> None:
         """Hear no more."""
@@ -165,24 +165,24 @@ class Helm:
         """Carry out what needs no frame; whether it was, and what or why not."""
         after = f"after frame {self._detector.seq - 1}" if self._detector.seq else "before the first frame"
         if command.verb == "pause":
-            self._hold(replace(self.orders, paused=True))
+            self._hold(replace(self.desired, paused=True))
             return True, f"paused {after}"
         if command.verb == "resume":
-            self._hold(replace(self.orders, paused=False))
+            self._hold(replace(self.desired, paused=False))
             return True, "it waits for a box" if self.holds else f"it goes on {after}"
         if command.verb == "stop":
-            self._hold(replace(self.orders, stopped=True))
+            self._hold(replace(self.desired, stopped=True))
             self.end(STOPPED)
             return True, f"the stream ends {after}"
         if not self._detector.model.version or self._detector.box is None:
             return False, "nothing was learned of the object yet: ask again once there is a model (catstream status)"
         return True, f"model {self._detector.model.version} {after}"
 
-    def _hold(self, orders: Orders) -> None:
-        self.orders = orders
+    def _hold(self, desired: DesiredState) -> None:
+        self.desired = desired
         if self._file is not None:
             try:
-                orders.save(self._file)
+                desired.save(self._file)
             except OSError as error:  # a full disk stops nothing
                 _log.warning("what was commanded cannot be kept in %s (%s)", self._file, error.strerror)
 
