@@ -11,9 +11,7 @@ gone with the process that had them, however it ended.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -36,7 +34,6 @@ TREES = "trees"
 
 _FILE = "origin.safetensors"
 _HELP = "give another folder"
-_PAUSE_SECONDS = 0.05
 
 #: Settings that change nothing of what is learned: a run may go on with others.
 _FREE = {"endpoint", "keys", "lockstep", "lag_frames", "window", "checkpoint_seconds"}
@@ -157,16 +154,16 @@ def learned(folder: Path, settings: Settings) -> Learned:
 
 @contextlib.contextmanager
 def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
-    """Hold a folder, made where it is not there, for this process alone.
+    """Lock a folder for this process alone; the folder is made if it does not exist.
 
     Parameters
     ----------
-    seconds : to wait at most for one that holds it
+    seconds : how long to wait if another process has locked it
 
     Raises
     ------
     ServiceError
-        Where another one holds it, or it cannot be made.
+        If another process keeps it locked, or it cannot be made.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -174,19 +171,8 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
     except OSError as error:
         raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
     try:
-        deadline = time.monotonic() + seconds
-        while not _locked(handle):
-            if time.monotonic() >= deadline:
-                raise ServiceError(f"a pipeline that runs keeps its state in {str(folder)!r}: stop it, or {_HELP}")
-            time.sleep(_PAUSE_SECONDS)
+        if not storage.lock(handle, seconds):
+            raise ServiceError(f"a pipeline that runs keeps its state in {str(folder)!r}: stop it, or {_HELP}")
         yield folder
     finally:
         os.close(handle)
-
-
-def _locked(handle: int) -> bool:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

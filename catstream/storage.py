@@ -1,11 +1,13 @@
-"""Files that are there whole or not at all; arrays and facts in one safetensors file, checked, and no code in it."""
+"""Atomic writes, locks of the kernel, and safetensors files of arrays and facts with a checksum (no code in them)."""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import tempfile
+import time
 import zlib
 from pathlib import Path
 
@@ -13,10 +15,11 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 
-__all__ = ["is_writable", "place", "read", "write"]
+__all__ = ["is_locked", "is_writable", "lock", "place", "read", "write"]
 
 _KEY = "catstream"  # one metadata key only: with more, their order and so the bytes would vary
 _VERSION = 1  # of what the metadata means
+_PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
 def place(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
@@ -53,6 +56,34 @@ def is_writable(folder: Path) -> bool:
             return True
     except OSError:
         return False
+
+
+def lock(handle: int, seconds: float = 0.0) -> bool:
+    """Lock an open file or folder for this process alone; False if another process keeps it locked for `seconds`.
+
+    The kernel releases the lock when the handle is closed, or when the process ends, however that happens.
+    """
+    from filelock import lock_descriptor
+
+    deadline = time.monotonic() + seconds
+    while not lock_descriptor(handle, blocking=False):
+        if time.monotonic() >= deadline:
+            return False
+        time.sleep(_PAUSE_SECONDS)
+    return True
+
+
+def is_locked(handle: int) -> bool:
+    """Whether another process has locked an open file.
+
+    The question is asked with a shared lock, which filelock does not offer: two processes that ask at the same moment
+    do not take each other for an owner.
+    """
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    return False
 
 
 def write(

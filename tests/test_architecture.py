@@ -43,6 +43,7 @@ HOMES = {
     "filterpy": ["catstream/kalman.py"],
     "numba": ["catstream/detection/compiled.py"],
     "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
+    "filelock": ["catstream/storage.py"],
     "safetensors": ["catstream/storage.py"],
     "pyarrow": ["catstream/sinks/parquet.py"],
     "supervision": ["catstream/adapters.py"],
@@ -61,7 +62,7 @@ HOMES = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"sklearn", "av", "scipy", "filterpy", "pyarrow", "supervision"}
+SLOW = {"filelock", "sklearn", "av", "scipy", "filterpy", "pyarrow", "supervision"}
 
 #: What a stage does not touch: it could run on a desert island.
 MAINLAND = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

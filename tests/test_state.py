@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
+import subprocess
+import sys
 
 import pytest
 
 from catstream import storage
 from catstream.box import Box
+from catstream.errors import ServiceError
 from catstream.settings import Settings
-from catstream.state import Origin
+from catstream.state import Origin, locked
 
 ORIGIN = Origin("rtsp://me:secret@10.0.0.7/one", Box(1, 2, 30, 40), slice(0, None, 1), Settings(), (320, 240), 1e9)
 
@@ -38,3 +42,29 @@ def test_what_holds_no_secret_is_for_whom_the_umask_says(tmp_path, umask):
     umask(0o027)
     storage.write(tmp_path / "tree", {}, {})
     assert stat.S_IMODE((tmp_path / "tree").stat().st_mode) == 0o640
+
+
+def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path):
+    script = (
+        "import pathlib, time\nfrom catstream.state import locked\n"
+        f"with locked(pathlib.Path({str(tmp_path)!r})):\n    print(flush=True)\n    time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as owner:
+        owner.stdout.readline()
+        with pytest.raises(ServiceError, match="stop it, or give another folder"), locked(tmp_path):
+            pass
+        owner.kill()
+    with locked(tmp_path):
+        pass
+
+
+def test_two_processes_that_ask_whether_a_file_is_locked_do_not_see_each_other(tmp_path):
+    path = tmp_path / "note"
+    path.touch()
+    with path.open() as one, path.open() as other, path.open() as owner:
+        assert not storage.is_locked(one.fileno())
+        assert not storage.is_locked(other.fileno()), "the first one still holds its shared lock"
+        for asking in (one, other):
+            fcntl.flock(asking, fcntl.LOCK_UN)
+        assert storage.lock(owner.fileno())
+        assert storage.is_locked(one.fileno())

@@ -8,13 +8,14 @@ frame, and waits until the subscriber's own topic (`Subscriber`, parameter `read
 from __future__ import annotations
 
 import contextlib
-import fcntl
+import math
 import os
 import secrets
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Self
 
+from catstream.storage import is_locked, lock
 from catstream.wire.endpoint import Endpoint, homes
 
 __all__ = ["Announcement", "readers_of"]
@@ -47,7 +48,7 @@ class Announcement:
             path = homes()[0] / f"{_PREFIX}{self.reader}"
             hidden = path.with_name(f".{path.name}")
             self._file = hidden.open("x")
-            fcntl.flock(self._file, fcntl.LOCK_EX)
+            lock(self._file.fileno(), math.inf)
             self._file.write(text)
             self._file.flush()
             self._path = hidden.rename(path)  # never there without its lock
@@ -74,7 +75,7 @@ def readers_of(endpoint: Endpoint) -> dict[str, set[str]]:
             with contextlib.suppress(OSError), path.open() as file:  # it may be gone by now, or another user's
                 if os.fstat(file.fileno()).st_uid != os.geteuid():
                     continue
-                if _dead(file):
+                if not is_locked(file.fileno()):
                     path.unlink()
                     continue
                 place, *channels = file.read().split("\n")
@@ -87,12 +88,3 @@ def readers_of(endpoint: Endpoint) -> dict[str, set[str]]:
 def _place(endpoint: Endpoint) -> str:
     """The same for all that name this endpoint in their own way."""
     return str(Path(endpoint.folder).resolve()) if endpoint.folder is not None else str(endpoint)
-
-
-def _dead(file: IO[str]) -> bool:
-    """Whether nobody holds its lock."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

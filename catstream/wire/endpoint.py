@@ -9,8 +9,8 @@ host may be one that others can reach, and processes may have hosts of their own
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import ipaddress
+import math
 import os
 import re
 import shutil
@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from catstream.errors import ServiceError
+from catstream.storage import is_locked, lock
 from catstream.wire.channels import CHANNELS, Channel
 from catstream.wire.keys import Keys
 
@@ -175,7 +176,7 @@ def private_folder() -> Iterator[Path]:
     _sweep(home)
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=home))
     with (folder / ".mark").open("w") as mark:
-        fcntl.flock(mark, fcntl.LOCK_EX)  # until this process is gone
+        lock(mark.fileno(), math.inf)  # until this process is gone
         (folder / ".mark").rename(folder / _MARK)  # never there without its lock
         try:
             yield folder
@@ -187,7 +188,7 @@ def _sweep(home: Path) -> None:
     """Remove the private folders whose owner was killed."""
     for path in home.glob(f"{_PREFIX}*/{_MARK}"):
         with contextlib.suppress(OSError), path.open("r+") as mark:  # it may be gone by now, or another user's
-            if os.fstat(mark.fileno()).st_uid == os.geteuid() and not _locked(mark.fileno()):
+            if os.fstat(mark.fileno()).st_uid == os.geteuid() and not is_locked(mark.fileno()):
                 shutil.rmtree(path.parent, ignore_errors=True)
 
 
@@ -221,13 +222,11 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "") ->
         facts = os.fstat(handle)
         if facts.st_uid != os.geteuid() or facts.st_mode & 0o022:
             raise ServiceError(f"other users may write to {text!r}: give a folder of your own, chmod 700")
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not lock(handle):
             raise ServiceError(
                 f"a pipeline is already running on {text!r}: "
                 "wait for it, or give another folder (--set endpoint=FOLDER)"
-            ) from None
+            )
         try:
             endpoint = Endpoint.parse(str(folder), keys)
             with _noted(endpoint, default, source):
@@ -248,7 +247,7 @@ def _noted(endpoint: Endpoint, folder: Path, source: str) -> Iterator[None]:
     """
     path = folder / _NOTE
     with path.open("w") as note:
-        fcntl.flock(note, fcntl.LOCK_EX)
+        lock(note.fileno(), math.inf)
         (folder / _SOURCE).write_text(source)
         note.write("\n".join([str(endpoint), *([str(endpoint.keys.folder)] if endpoint.keys is not None else [])]))
         note.flush()
@@ -266,7 +265,7 @@ def running() -> list[Endpoint]:
         for path in home.glob(f"{_PREFIX}*/{_NOTE}"):
             with contextlib.suppress(OSError), path.open() as note:  # it may be gone by now, or another user's
                 text = note.read()
-                if text and os.fstat(note.fileno()).st_uid == os.geteuid() and _locked(note.fileno()):
+                if text and os.fstat(note.fileno()).st_uid == os.geteuid() and is_locked(note.fileno()):
                     endpoint = Endpoint.parse(*text.split("\n"))
                     endpoints.append(replace(endpoint, source=_read(path.with_name(_SOURCE))))
     return endpoints
@@ -334,11 +333,3 @@ def homes() -> list[Path]:
     """Where private folders are made, the best place first: a pipeline of a timer has no runtime folder."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     return [Path(home) for home in (runtime, tempfile.gettempdir()) if os.access(home, os.W_OK)]
-
-
-def _locked(handle: int) -> bool:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    return False
