@@ -1,13 +1,33 @@
-"""Waiting for the pipeline that a verb attaches to."""
+"""How a verb attaches to a running pipeline: the options that select it, and the wait until it answers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
 from rich.console import Console
 
 from catstream.subscription import knock
 from catstream.wire.endpoint import Endpoint
 
-__all__ = ["wait_for_pipeline"]
+__all__ = ["wait_for_pipeline", "with_endpoint", "with_wait"]
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+_ENDPOINT = click.option(
+    "--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; not needed if only one does."
+)
+_KEYS = click.option("--keys", default="", metavar="DIR", help="Folder of keys, if the pipeline requires keys.")
+
+with_wait = click.option(
+    "--wait", default=30.0, metavar="SECONDS", help="How long to wait for a pipeline that has not started."
+)
+
+
+def with_endpoint(command: _Command) -> _Command:
+    """Add `--endpoint` and `--keys`, which select a running pipeline; the command gets both as texts."""
+    return _ENDPOINT(_KEYS(command))
 
 
 def wait_for_pipeline(endpoint: str, keys: str, seconds: float) -> Endpoint:

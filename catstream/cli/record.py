@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from catstream.cli.attach import wait_for_pipeline
+from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.errors import RecordingError
 from catstream.messages import End, Features, Run
 from catstream.recording.file import Recording, RecordingWriter
@@ -26,9 +26,8 @@ _END_SECONDS = 1.0  # between the end of the tracks and that of the features
 
 @click.command()
 @click.option("--output", required=True, type=click.Path(path_type=Path), help="The file; it must not be there yet.")
-@click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
-@click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
-@click.option("--wait", default=30.0, metavar="SECONDS", help="To wait for a pipeline that has not begun.")
+@with_endpoint
+@with_wait
 def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
     """Keep what a running pipeline says, in one file, until it ends or Ctrl-C.
 

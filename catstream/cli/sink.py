@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from catstream.cli.attach import wait_for_pipeline
+from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.interrupts import Interrupts
 from catstream.messages import Run
 from catstream.services.options import with_part
@@ -25,9 +25,8 @@ _RUN_SECONDS = 1.0  # that a detector which follows frames may take to say what 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
-@click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
-@click.option("--wait", default=30.0, metavar="SECONDS", help="To wait for a pipeline that has not begun.")
+@with_endpoint
+@with_wait
 @click.option("--source", metavar="SOURCE", help="What the pipeline follows, for an MP4.")
 @with_part
 def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source: str | None, part: slice) -> None:

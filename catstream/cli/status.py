@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from catstream.cli.attach import with_endpoint
 from catstream.errors import SilenceError
 from catstream.messages import Health
 from catstream.subscription import subscribe
@@ -20,8 +21,7 @@ _NAMES = CHANNELS["health"].senders
 
 
 @click.command()
-@click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
-@click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
+@with_endpoint
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0), help="Seconds to listen at most.")
 def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from catstream.box import Box
+from catstream.cli.attach import with_endpoint
 from catstream.errors import ServiceError
 from catstream.state import Origin, learned
 from catstream.steering import Control, control
@@ -53,11 +54,8 @@ class _Meant:
 def _with_pipeline(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that say which pipeline is meant; the command gets them as one argument `meant`."""
 
-    @click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs.")
+    @with_endpoint
     @click.option("--source", default="", metavar="SOURCE", help="The source that it follows, instead of --endpoint.")
-    @click.option(
-        "--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some."
-    )
     @click.option(
         "--timeout", default=5.0, show_default=True, type=click.FloatRange(0), help="Seconds to wait for an answer."
     )

@@ -6,14 +6,14 @@ import signal
 
 import click
 
+from catstream.cli.attach import with_endpoint
 from catstream.cli.serving import PORT, with_token
 
 __all__ = ["view"]
 
 
 @click.command()
-@click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
-@click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
+@with_endpoint
 @click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen.")
 @click.option("--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="0 for any that is free.")
 @with_token()

@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from catstream.box import Box
-from catstream.cli.attach import wait_for_pipeline
+from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.messages import Features, Health, Model, Preview, Sample, Track
 from catstream.subscription import Subscription, subscribe
 
@@ -107,9 +107,8 @@ _CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
 
 @click.command()
 @click.argument("channel", type=click.Choice(list(_CELLS)))
-@click.option("--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; the only one where not given.")
-@click.option("--keys", default="", metavar="DIR", help="Folder of the keys that it lets in, where it asks for some.")
-@click.option("--wait", default=30.0, metavar="SECONDS", help="To wait for a pipeline that has not begun.")
+@with_endpoint
+@with_wait
 @click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
 @click.option("--count", type=click.IntRange(min=1), help="End after so many messages.")
 def watch(channel: str, endpoint: str, keys: str, wait: float, as_json: bool, count: int | None) -> None:
