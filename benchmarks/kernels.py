@@ -12,10 +12,10 @@ from sequences import rendered
 from table import Table, command, publish
 
 from catstream.compression.reduce import reduce
-from catstream.detection.cells import Cells
-from catstream.detection.colours import shades
-from catstream.detection.hog import grid
 from catstream.evaluation.datasets import Sequence
+from catstream.features.cells import Cells
+from catstream.features.colours import shades
+from catstream.features.hog import grid
 from catstream.messages import Sample
 from catstream.settings import Settings
 from catstream.tracker import Tracker

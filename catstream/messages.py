@@ -4,7 +4,7 @@ Each message is a noun, frozen, and complete by itself. In one process the
 stages hand them over as they are; between processes `catstream.wire` turns
 them into msgpack and back, and checks every field on arrival.
 
-`d` is the length of a feature row (`catstream.detection.cells.row_length`), `n`
+`d` is the length of a feature row (`catstream.features.cells.row_length`), `n`
 the coreset size, frames count from 0.
 """
 

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from catstream.box import Box
-from catstream.detection import COMPILING
 from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
+from catstream.features import COMPILING
 from catstream.learned import Learned
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor

@@ -20,9 +20,9 @@ from catstream import kalman, storage
 from catstream.box import Box
 from catstream.compression import checkpoint
 from catstream.compression.compressor import Compressor
-from catstream.detection.cells import row_length
 from catstream.detection.detector import Detector
 from catstream.errors import BoxError, FrameError, ProtocolError, ServiceError
+from catstream.features.cells import row_length
 from catstream.image import as_bgr
 from catstream.messages import Features, Track
 from catstream.settings import Settings

@@ -19,6 +19,8 @@ FLOORS = [
     {"errors", "threads"},
     {"box", "image", "storage", "extras"},
     {"messages", "settings", "ridge", "kalman", "html"},
+    {"features"},
+    {"paper"},
     {"detection", "compression", "training", "wire", "video", "adapters"},
     {"learned"},
     {"tracker", "subscription", "steering", "recording", "sinks", "state"},
@@ -34,15 +36,17 @@ HOMES = {
     "numpy": ["catstream", "services"],
     "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
     "cv2": [
+        "catstream/features",
         "catstream/detection",
+        "catstream/paper",
         "catstream/video",
         "catstream/threads.py",
         "catstream/evaluation/peers.py",
         "services/__main__.py",
     ],
     "filterpy": ["catstream/kalman.py"],
-    "numba": ["catstream/detection/compiled.py"],
-    "sklearn": ["catstream/detection/scm.py", "catstream/training/one_class.py", "catstream/video/demo.py"],
+    "numba": ["catstream/features/compiled.py"],
+    "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/demo.py"],
     "filelock": ["catstream/storage.py"],
     "safetensors": ["catstream/storage.py"],
     "pyarrow": ["catstream/sinks/parquet.py"],
@@ -149,7 +153,7 @@ def test_slow_libraries_are_imported_where_they_are_used():
 
 
 def touched(path: Path) -> Iterator[str]:
-    if unit(dotted(path)) in {"detection", "compression", "training"}:
+    if unit(dotted(path)) in {"features", "paper", "detection", "compression", "training"}:
         for module in set(imports(path)) & MAINLAND:
             yield f"imports {module}: sockets, threads, clocks and chance are handed to a stage"
 

@@ -15,11 +15,10 @@ from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.detection.detector import Detector
-from catstream.detection.scm import SparseCollaborativeModel
-from catstream.detection.search import Found
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import starts_of
 from catstream.evaluation.runs import Run
+from catstream.paper.scm import SparseCollaborativeModel
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.threads import one_thread
@@ -60,7 +59,7 @@ def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: int) -> l
     """Runs of each recipe on one sequence, from the same frame."""
     runs = []
     # SCM depends on none of what recipes differ in, and takes longer than all else: each frame once for all of them.
-    with patch("catstream.detection.scm.SparseCollaborativeModel", Shared()):
+    with patch("catstream.paper.scm.SparseCollaborativeModel", Shared()):
         for name, recipe in recipes.items():
             runs.append(follow(name, recipe, sequence, start))
             print(f"{name}: {sequence.name}", file=sys.stderr)
@@ -73,7 +72,7 @@ class Shared:
     model: SparseCollaborativeModel
 
     def __init__(self) -> None:
-        self.found: list[Found] = []
+        self.found: list[tuple[float, Box]] = []
 
     def __call__(self, image: np.ndarray, box: Box, rng: np.random.Generator) -> Shared:
         if not self.found:
@@ -81,7 +80,7 @@ class Shared:
         self.told = 0
         return self
 
-    def step(self, image: np.ndarray) -> Found:
+    def step(self, image: np.ndarray) -> tuple[float, Box]:
         """As the model's own."""
         if self.told == len(self.found):
             self.found.append(self.model.step(image))

@@ -23,10 +23,10 @@ from table import Table, command, publish
 from catstream.box import Box
 from catstream.compression.tree import CoresetTree
 from catstream.detection import affine
-from catstream.detection.cells import row_length
-from catstream.detection.pyramid import Pyramid
 from catstream.evaluation.datasets import Sequence
-from catstream.training.one_class import one_class
+from catstream.features.cells import row_length
+from catstream.features.pyramid import Pyramid
+from catstream.paper.one_class import one_class
 
 SIZES = (32, 64, 128, 256)
 _ORIGIN = np.zeros(row_length(), np.float32)

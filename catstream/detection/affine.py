@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from catstream.box import Box
-from catstream.detection.cells import Cells
-from catstream.detection.hog import CELL, MARGIN, WINDOW
-from catstream.detection.pyramid import Pyramid
+from catstream.features.cells import Cells
+from catstream.features.hog import CELL, MARGIN, WINDOW
+from catstream.features.pyramid import Pyramid
 
 __all__ = ["copies"]
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from catstream.box import Box
-from catstream.detection.colours import SIDE
-from catstream.detection.hog import WINDOW
 from catstream.detection.windows import Scored
+from catstream.features.colours import SIDE
+from catstream.features.hog import WINDOW
 
 __all__ = ["Balance"]
 

@@ -10,18 +10,18 @@ import numpy as np
 from catstream.box import Box
 from catstream.detection import bootstrap, extent, lessons, search
 from catstream.detection.balance import Balance
-from catstream.detection.cells import COLOURS, row_length
-from catstream.detection.hog import WINDOW
 from catstream.detection.lessons import Lesson
 from catstream.detection.motion import CentreFilter
-from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
 from catstream.errors import BoxError, ProtocolError
+from catstream.features.cells import COLOURS, row_length
+from catstream.features.hog import WINDOW
+from catstream.features.pyramid import Pyramid
 from catstream.messages import DetectorState, Features, Model, State, Track
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
-    from catstream.detection.scm import SparseCollaborativeModel
+    from catstream.paper.scm import SparseCollaborativeModel
 
 __all__ = ["Detector"]
 
@@ -68,7 +68,7 @@ class Detector:
     def prepare(self) -> None:
         """Import what `init` needs, if that takes long."""
         if self.settings.bootstrap == "scm":
-            from catstream.detection import scm
+            from catstream.paper import scm
 
             scm.prepare()
 
@@ -97,7 +97,7 @@ class Detector:
         box = Box(*map(float, box)).inside(*frame.size)
         window, scm = box.scaled(self.settings.context), None
         if self.settings.bootstrap == "scm":
-            from catstream.detection.scm import SparseCollaborativeModel  # compiles a kernel of its own
+            from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
             scm = SparseCollaborativeModel(image, box, self._random())
             lesson = lessons.near(frame, window, None, self._random(), self.settings)
@@ -208,7 +208,7 @@ class Detector:
     def resume_bootstrap(self, arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> None:
         """Go on with the sparse collaborative model that another detector followed the object by, after `resume`."""
         if facts is not None:
-            from catstream.detection.scm import SparseCollaborativeModel
+            from catstream.paper.scm import SparseCollaborativeModel
 
             self._scm = SparseCollaborativeModel.resumed(arrays, facts)
 
@@ -227,9 +227,9 @@ class Detector:
             self._box = self._box.centred(*self._centre.predict())
         frame = Pyramid.of(image)
         if self._scm is not None:
-            found = self._scm.step(image)  # it has no word for absent
-            self._box = found.box.scaled(settings.context).held_in(*frame.size)
-            return self._answer(time, found.score, self._lesson(frame, found))
+            score, box = self._scm.step(image)  # it has no word for absent
+            self._box = box.scaled(settings.context).held_in(*frame.size)
+            return self._answer(time, score, self._lesson(frame, Found(score, self._box)))
         found = self._find(frame) if self._first_box else self._seek(frame)
         self._elsewhere &= found.score < settings.trust_score
         there = self._first_box is not None and self._there(found.score)

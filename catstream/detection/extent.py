@@ -13,9 +13,9 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection import search, windows
-from catstream.detection.hog import WINDOW
-from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
+from catstream.features.hog import WINDOW
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Model
 from catstream.settings import Settings
 

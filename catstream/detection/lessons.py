@@ -13,10 +13,10 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection import affine, extent, search, windows
-from catstream.detection.cells import COLOURS, row_length
-from catstream.detection.hog import WINDOW
-from catstream.detection.pyramid import Pyramid
 from catstream.detection.windows import Scored
+from catstream.features.cells import COLOURS, row_length
+from catstream.features.hog import WINDOW
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Model
 from catstream.settings import Settings
 

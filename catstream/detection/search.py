@@ -12,9 +12,9 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection import windows
-from catstream.detection.hog import CELL, WINDOW
-from catstream.detection.pyramid import Pyramid
 from catstream.detection.windows import Scored
+from catstream.features.hog import CELL, WINDOW
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Model
 from catstream.settings import Settings
 

@@ -9,9 +9,9 @@ import numpy as np
 from catstream import ridge
 from catstream.errors import ProtocolError
 from catstream.messages import Model, Motion, Sample
+from catstream.paper.one_class import one_class
 from catstream.settings import Settings
 from catstream.training.motion_em import learn_motion
-from catstream.training.one_class import one_class
 
 __all__ = ["Trainer"]
 

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from catstream.detection.cells import row_length
+from catstream.features.cells import row_length
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.services.supervisor import NAMES

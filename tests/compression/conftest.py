@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.detection import hog
-from catstream.detection.cells import Cells
+from catstream.features import hog
+from catstream.features.cells import Cells
 
 ROWS = 208  #: 13 leaves of 16: levels 3, 2 and 0
 

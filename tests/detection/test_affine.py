@@ -5,8 +5,8 @@ import pytest
 
 from catstream.box import Box
 from catstream.detection import affine
-from catstream.detection.cells import COLOURS, Cells
-from catstream.detection.pyramid import Pyramid
+from catstream.features.cells import COLOURS, Cells
+from catstream.features.pyramid import Pyramid
 
 BOX = Box(64, 48, 64, 64)
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.detection import colours, search
+from catstream.detection import search
 from catstream.detection.balance import Balance
-from catstream.detection.cells import COLOURS, row_length
-from catstream.detection.pyramid import Pyramid
+from catstream.features import colours
+from catstream.features.cells import COLOURS, row_length
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Model
 
 RED, GREEN = (40, 40, 200), (60, 160, 60)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.detection.cells import COLOURS, row_length
 from catstream.detection.detector import Detector
 from catstream.errors import BoxError, ProtocolError
+from catstream.features.cells import COLOURS, row_length
 from catstream.messages import Model, Motion
 from catstream.settings import Settings
 

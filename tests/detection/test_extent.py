@@ -6,9 +6,9 @@ import pytest
 
 from catstream.box import Box
 from catstream.detection import extent, windows
-from catstream.detection.hog import WINDOW
-from catstream.detection.pyramid import Pyramid
 from catstream.detection.search import Found
+from catstream.features.hog import WINDOW
+from catstream.features.pyramid import Pyramid
 from catstream.settings import Settings
 from catstream.tracker import Tracker
 

@@ -5,9 +5,9 @@ import pytest
 
 from catstream.box import Box
 from catstream.detection import lessons, search
-from catstream.detection.cells import row_length
-from catstream.detection.hog import WINDOW
-from catstream.detection.pyramid import Pyramid
+from catstream.features.cells import row_length
+from catstream.features.hog import WINDOW
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Model
 from catstream.settings import Settings
 

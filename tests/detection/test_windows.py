@@ -5,10 +5,10 @@ import pytest
 
 from catstream.box import Box
 from catstream.detection import windows
-from catstream.detection.cells import Cells
-from catstream.detection.hog import WINDOW
-from catstream.detection.pyramid import Pyramid
 from catstream.detection.windows import Scored
+from catstream.features.cells import Cells
+from catstream.features.hog import WINDOW
+from catstream.features.pyramid import Pyramid
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import numba
 import psutil
 import pytest
 
-from catstream.detection import COMPILING
 from catstream.errors import BoxError, ServiceError, VideoError
+from catstream.features import COMPILING
 from catstream.pipeline import Pipeline
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings

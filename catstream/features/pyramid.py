@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from catstream.detection.compiled import kernel
+from catstream.features.compiled import kernel
 
 __all__ = ["Pyramid"]
 

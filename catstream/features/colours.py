@@ -13,8 +13,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from catstream.detection.compiled import kernel
-from catstream.detection.hog import CELL, WINDOW
+from catstream.features.compiled import kernel
+from catstream.features.hog import CELL, WINDOW
 
 __all__ = ["SHADES", "SIDE", "add_scores", "histogram", "shades"]
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.detection.pyramid import Pyramid
+from catstream.features.pyramid import Pyramid
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.detection.hog import CELL, CHANNELS, MARGIN, grid
+from catstream.features.hog import CELL, CHANNELS, MARGIN, grid
 
 
 @pytest.fixture

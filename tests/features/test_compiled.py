@@ -5,11 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-from catstream.detection import COMPILING, compiled
+from catstream.features import COMPILING, compiled
 
 
 def test_a_first_start_says_that_it_compiles_and_a_second_needs_no_compiler(tmp_path):
-    script = "from catstream.detection import hog; print(sum(hog._count.stats.cache_hits.values()))"
+    script = "from catstream.features import hog; print(sum(hog._count.stats.cache_hits.values()))"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     starts = [
         subprocess.run([sys.executable, "-c", script], env=environment, check=True, capture_output=True, text=True)

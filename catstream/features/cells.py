@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from catstream.detection import colours
-from catstream.detection.colours import SHADES
-from catstream.detection.compiled import kernel
-from catstream.detection.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
+from catstream.features import colours
+from catstream.features.colours import SHADES
+from catstream.features.compiled import kernel
+from catstream.features.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
 
 __all__ = ["COLOURS", "Cells", "row_length"]
 

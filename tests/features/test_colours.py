@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.detection import colours
-from catstream.detection.colours import SHADES
+from catstream.features import colours
+from catstream.features.colours import SHADES
 
 
 def of(image, row=0, column=0):

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy import float32
 
-from catstream.detection.compiled import kernel
+from catstream.features.compiled import kernel
 
 __all__ = ["CELL", "CHANNELS", "MARGIN", "WINDOW", "grid"]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from catstream.detection.cells import COLOURS, Cells, row_length
+from catstream.features.cells import COLOURS, Cells, row_length
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from pathlib import Path
 import numba
 from numba.core.event import Event, Listener, install_listener
 
-from catstream.detection import COMPILING
+from catstream.features import COMPILING
 
 __all__ = ["kernel"]
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.svm import OneClassSVM
 
 from catstream.errors import ProtocolError
-from catstream.training.one_class import one_class
+from catstream.paper.one_class import one_class
 
 
 def rows_around(mean: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

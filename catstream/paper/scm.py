@@ -21,9 +21,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from catstream.box import Box
-from catstream.detection.compiled import kernel
-from catstream.detection.pyramid import Pyramid
-from catstream.detection.search import Found
+from catstream.features.compiled import kernel
+from catstream.features.pyramid import Pyramid
 
 __all__ = ["SparseCollaborativeModel", "prepare"]
 
@@ -93,7 +92,7 @@ class SparseCollaborativeModel:
         self._generative = _Generative(*(arrays[f"scm.{name}"] for name in ("atoms", "first", "histogram")))
         return self
 
-    def step(self, image: np.ndarray) -> Found:
+    def step(self, image: np.ndarray) -> tuple[float, Box]:
         """Find the object in the next frame, of the size of the first.
 
         Returns
@@ -114,7 +113,7 @@ class SparseCollaborativeModel:
         if self._frames % _EVERY == 0:
             self._discriminative = _Discriminative.of(self._discriminative.positives, self._background(grey))
             self._generative.update(cuts[best])
-        return Found(confidence / (1 + confidence), self._box)
+        return confidence / (1 + confidence), self._box
 
     @property
     def _box(self) -> Box:
