@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 from accuracy import MEANS, accuracy_command, changed, compared, difference, means, spread, videos
@@ -23,38 +22,38 @@ _LONGER_THAN_ANY_VIDEO = 1 << 30
 
 #: Ingredient -> the settings that are without it.
 WITHOUT: dict[str, dict[str, Any]] = {
-    "loss tree": {"classifier": "least-squares"},
-    "least squares, a one-class SVM instead": {"classifier": "one-class"},
-    "hard negatives of the whole frame": {"far_negatives": 0},
-    "near misses": {"near_misses": 0},
-    "weight of the object's row": {"object_weight": 1.0},
-    "distrust of a window found elsewhere": {"trust_score": _NEVER},
-    "search of the whole frame": {"sure_score": _NEVER, "lost_score": _NEVER},
-    "affine copies of each frame": {"copies": 0},
-    "mirrored copies": {"mirrored": 0},
-    "other backgrounds behind the first copies": {"other_backgrounds": 0.0},
-    "histogram of colours": {"colours": False},
-    "box drawn after the colours": {"balance_slack": 1.0},
-    "search over scales": {"scale_count": 1},
-    "cost of distance": {"distance_penalty": 0.0},
-    "extent tree": {"extent_weight": 0.0},
-    "another aspect than the first": {"aspect_count": 1},
-    "prior of the first extent": {"extent_prior": 0.0},
-    "cost of a change of extent": {"extent_penalty": 0.0},
-    "extent held where unsure": {"extent_score": _NEVER},
-    "size followed slowly": {"scale_rate": 1.0},
-    "Kalman filter": {"motion_frames": _LONGER_THAN_ANY_VIDEO},
-    "window wider than the object": {"context": 1.0},
-    "no answer where absent": {"present_score": _NEVER, "present_share": 0.0},
-    "thresholds that follow the usual score": {"present_share": 0.0, "return_share": 0.0},
-    "no lesson where unsure": {"teach_score": _NEVER},
+    "loss tree": {"teaching.classifier": "least-squares"},
+    "least squares, a one-class SVM instead": {"teaching.classifier": "one-class"},
+    "hard negatives of the whole frame": {"teaching.hard_negatives": 0},
+    "near misses": {"teaching.near_misses": 0},
+    "weight of the object's row": {"teaching.object_weight": 1.0},
+    "distrust of a window found elsewhere": {"belief.trust_score": _NEVER},
+    "search of the whole frame": {"belief.confident_score": _NEVER, "belief.lost_score": _NEVER},
+    "affine copies of each frame": {"teaching.copies": 0},
+    "mirrored copies": {"teaching.mirrored": 0},
+    "other backgrounds behind the first copies": {"teaching.other_backgrounds": 0.0},
+    "histogram of colours": {"teaching.colours": False},
+    "box drawn after the colours": {"extent.colour_slack": 1.0},
+    "search over scales": {"extent.size_count": 1},
+    "cost of distance": {"search.distance_penalty": 0.0},
+    "extent tree": {"extent.weight": 0.0},
+    "another aspect than the first": {"extent.aspect_count": 1},
+    "prior of the first extent": {"extent.prior": 0.0},
+    "cost of a change of extent": {"extent.penalty": 0.0},
+    "extent held where unsure": {"belief.extent_score": _NEVER},
+    "size followed slowly": {"extent.size_rate": 1.0},
+    "Kalman filter": {"search.motion_frames": _LONGER_THAN_ANY_VIDEO},
+    "window wider than the object": {"search.context": 1.0},
+    "no answer where absent": {"belief.present_score": _NEVER, "belief.present_share": 0.0},
+    "thresholds that follow the usual score": {"belief.present_share": 0.0, "belief.return_share": 0.0},
+    "no lesson where unsure": {"belief.teach_score": _NEVER},
 }
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     base = Settings()
     variants = {"nothing left out": base}
-    variants |= {f"without {name}": replace(base, **changes) for name, changes in WITHOUT.items()}
+    variants |= {f"without {name}": base.but(changes) for name, changes in WITHOUT.items()}
     if options.only:
         variants = {
             name: settings
@@ -69,7 +68,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     note = f"{len(whole)} runs each; spread: standard deviation over {options.starts} starts, mean over the sequences"
     yield Table("Ablation", COLUMNS, beside(whole, runs), note)
     if not options.quick and not options.only:  # last and alone, as SCM takes longer than all that is above
-        paper = compared(options, found, {"the paper's tracker": Settings(**PRESETS["one-class-paper"])})
+        paper = compared(options, found, {"the paper's tracker": Settings.of(PRESETS["one-class-paper"])})
         yield Table("The paper's tracker", COLUMNS, beside(whole, paper), note)
 
 

@@ -169,7 +169,7 @@ class Arena:
                 stack.callback(link.close)
             (self._folder / "sitecustomize.py").write_text(_CLOCK)
             self._results = stack.enter_context(
-                Receiver("results", self._places["detector"], Position(), self._settings.window)
+                Receiver("results", self._places["detector"], Position(), self._settings.run.unstored_frames)
             )
             self._models = stack.enter_context(Subscriber("models", self._places["trainer"]))
             stack.callback(self._stop)
@@ -247,7 +247,7 @@ class Arena:
 
     def _start(self, name: str) -> None:
         command: list[Any] = service_command("--parent", str(os.getpid()), name)
-        for pair in (*self._settings.changed(), f"endpoint={self._places[name]}"):
+        for pair in (*self._settings.changed(), f"run.endpoint={self._places[name]}"):
             command += ["--set", pair]
         if name == "detector":
             command += [self._source, "--box", ",".join(map(repr, self._first)), "--resume", "--owned"]

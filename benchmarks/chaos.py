@@ -41,7 +41,7 @@ SECONDS = (0.1, 1.0)  # that a freeze, a cut, a slow link or a full disk lasts
 DELAY = (0.005, 0.05)  # of each 64 KiB on a slow link
 HOUR = 3600.0
 FULL = "disk full"
-RUNS = {"lockstep": Settings(lockstep=True), "default": Settings()}
+RUNS = {"lockstep": Settings(run={"lockstep": True}), "default": Settings()}
 
 Fault = Callable[[Arena, np.random.Generator], None]
 

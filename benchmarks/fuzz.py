@@ -54,7 +54,7 @@ with atheris.instrument_imports(include=["catstream"]):
 SECONDS = 5  # an input may take
 MEGABYTES = 64  # resident memory may grow by
 LONGEST = 4096  # bytes of an input, or as long as the longest seed
-SETTINGS = Settings(coreset_size=2)
+SETTINGS = Settings(coreset={"size": 2})
 
 COLUMNS = ("decoder", "inputs", "taken", "refused", "inputs a second", "MB more", "crashes", "hangs")
 
@@ -98,7 +98,7 @@ def messages() -> dict[str, tuple[Any, ...]]:
         "model": (Model(4, 20, array(5), -0.25, motion, array(5)), Model(1, 0, array(5), 0.0, None)),
         "position": (Position(5, 4, box, 2, detector), Position()),
         "preview": (Preview(2, 1280, 720, box, b"\xff\xd8\xff\xe0"),),
-        "run": (Run("0.1.0", {"coreset_size": "64", "classifier": "joint"}),),
+        "run": (Run("0.1.0", {"coreset.size": "64", "teaching.classifier": "joint"}),),
         "sample": (Sample(4, 20, summary(5), summary(5), summary(7), summary(7), array(2, 2, dtype="<f8")),),
         "stored": (Stored(5, 7, 2),),
         "track": (
@@ -155,7 +155,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
             folder / "d.toml",
             lambda path: Settings.load(file=path, environment={}),
             SettingsError,
-            b"coreset_size = 128\nclassifier = 'joint'\nlockstep = true\n",
+            b"[coreset]\nsize = 128\n[teaching]\nclassifier = 'joint'\n",
         ),
         "keys": filed(
             folder / "keys" / "client.key",

@@ -62,13 +62,13 @@ def learning(sequence: Sequence, sizes: Iterable[int]) -> Iterator[tuple[str, Ca
         rows = np.vstack([sample.object.rows, sample.background.rows])[: 2 * n]
         yield f"reduce {len(rows)} rows to n = {n}", lambda rows=rows, n=n: reduce(rows, n)
         for classifier in ("joint", "least-squares", "one-class"):
-            trainer = Trainer(Settings(coreset_size=n, classifier=classifier))
+            trainer = Trainer(Settings(coreset={"size": n}, teaching={"classifier": classifier}))
             yield f"train, {classifier}, n = {n}", lambda trainer=trainer, sample=sample: trainer.train(sample)
 
 
 def sample_of(sequence: Sequence, n: int) -> Sample:
     """What the trees hold once the tracker has followed the whole sequence."""
-    tracker = Tracker(Settings(coreset_size=n))
+    tracker = Tracker(Settings(coreset={"size": n}))
     for row, image in enumerate(sequence.frames()):
         if row == 0:
             tracker.init(image, sequence.boxes[0])

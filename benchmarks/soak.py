@@ -71,7 +71,7 @@ class Stream:
         self._object, self._background = rows[labels == 1], rows[labels == 0]
         self._extents = np.vstack([one.extents for one in lessons])
         self._fits = np.concatenate([one.fits for one in lessons])
-        self._box, self._random = lessons[-1].box, np.random.default_rng(settings.seed)
+        self._box, self._random = lessons[-1].box, np.random.default_rng(settings.run.seed)
 
     def message(self, seq: int) -> Features:
         """A row of the object, one of the background and two of its extent."""
@@ -92,7 +92,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     here, there = alone(stream, messages, settings), served(stream, through, settings)
     draw(here, options.plot)
     note = (
-        f"time is the processor's; law: log2(p/n) + 1 nodes of n = {settings.coreset_size} rows a tree; {options.plot}"
+        f"time is the processor's; law: log2(p/n) + 1 nodes of n = {settings.coreset.size} rows a tree; {options.plot}"
     )
     yield Table("In one process", COLUMNS, list(doubling(here)), note)
     note = "the compressor's process, with its checkpoints, over a Unix socket: from the sender's side, all stored"
@@ -145,10 +145,10 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
     rows = []
     with private_folder() as folder:
         command = service_command("compressor")
-        options = ["--set", f"endpoint={folder}", "--state", folder / "state"]
+        options = ["--set", f"run.endpoint={folder}", "--state", folder / "state"]
         with (
             subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL) as process,
-            Sender("features", Endpoint.parse(str(folder)), settings.window) as sender,
+            Sender("features", Endpoint.parse(str(folder)), settings.run.unstored_frames) as sender,
         ):
             seen, part, begin = psutil.Process(process.pid), messages // 5, 0.0
             for seq in range(1, messages + 1):

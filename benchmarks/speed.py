@@ -55,13 +55,13 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield steps([named(options, "TLD_01_david")])
     sizes, modes, coresets, frames = SIZES, MODES, CORESETS, 300
     if options.quick:  # one run of the pipeline has a figure for both tables
-        sizes, modes, coresets, frames = ((640, 480),), ("local",), (Settings().coreset_size,), 8
+        sizes, modes, coresets, frames = ((640, 480),), ("local",), (Settings().coreset.size,), 8
     rows = [
-        (f"{width}x{height}", *(rate(frames, (width, height), Settings(detection=mode)) for mode in modes))
+        (f"{width}x{height}", *(rate(frames, (width, height), Settings(search={"mode": mode})) for mode in modes))
         for width, height in sizes
     ]
     yield Table("Frames/s against the size of the image", ("pixels", *modes), rows, "three processes, with decoding")
-    rows = [(n, rate(frames, (640, 480), Settings(coreset_size=n))) for n in coresets]
+    rows = [(n, rate(frames, (640, 480), Settings(coreset={"size": n}))) for n in coresets]
     yield Table(
         "Frames/s against the size of the coreset", ("n", "640x480, local"), rows, "three processes, with decoding"
     )

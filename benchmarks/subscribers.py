@@ -96,7 +96,7 @@ def travel(frames: int, readers: int, frozen: int) -> Run:
     sequence, run, ended = rendered(frames, SIZE), Run(), threading.Event()
     with private_folder() as folder, Crowd(str(folder), readers, frozen=frozen) as crowd:
         late = threading.Thread(target=join, args=(str(folder), ended, run.joined))
-        with Pipeline(video(sequence), sequence.boxes[0], Settings(endpoint=str(folder))) as pipeline:
+        with Pipeline(video(sequence), sequence.boxes[0], Settings(run={"endpoint": str(folder)})) as pipeline:
             try:
                 for track in pipeline:
                     run.moments.append(perf_counter())

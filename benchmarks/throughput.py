@@ -42,7 +42,7 @@ def repeated(sequence: Sequence, mode: str, runs: int) -> tuple[float, float, fl
     """Median and least frames a second of some runs, and the success of the last."""
     rates = []
     for _ in range(runs):
-        journey = travel(video(sequence), sequence.boxes[0], Settings(detection=mode))
+        journey = travel(video(sequence), sequence.boxes[0], Settings(search={"mode": mode}))
         rates.append(journey.rate)
     return median(rates), min(rates), score(np.array(journey.boxes), sequence.boxes).success
 
@@ -53,7 +53,7 @@ def steps(videos: list[Sequence]) -> Table:
     rows = []
     for sequence in videos:
         for mode in MODES:
-            spent = np.array(costs(sequence, Settings(detection=mode))) / len(sequence)
+            spent = np.array(costs(sequence, Settings(search={"mode": mode}))) / len(sequence)
             rows.append((sequence.name, mode, *spent.tolist(), float(spent.sum())))
     return Table("Milliseconds a frame, on one core", columns, rows, "in the pipeline the last three run side by side")
 

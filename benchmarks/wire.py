@@ -21,7 +21,7 @@ from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint, private_folder
 from catstream.wire.sockets import Receiver, Sender
 
-WINDOW = Settings().window
+WINDOW = Settings().run.unstored_frames
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:

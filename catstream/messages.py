@@ -316,7 +316,7 @@ class Run:
     """What a pipeline runs with: who keeps its features can learn from them once more, detector -> anyone.
 
     program   version of catstream
-    settings  name -> value of all settings but `endpoint` and `keys`, each as the text that `--set` takes
+    settings  name -> value of all settings but `run.endpoint` and `run.keys`, each as the text that `--set` takes
     """
 
     program: str

@@ -13,7 +13,6 @@ import time
 import warnings
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -164,12 +163,12 @@ class Pipeline:
             Learned.load(self._model)
         self._end: End | None = None
         self._health: dict[str, Health] = {}
-        if self.settings.lockstep and is_live(self.source):
+        if self.settings.run.lockstep and is_live(self.source):
             raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
         if self._record is not None and self._record.exists() and self._kept is None:
             raise RecordingError(f"{record} is there already: give another name, or remove it")
         # The detector opens the source once more: a camera shows its picture to one at a time.
-        image_rate, skip_damaged = self.settings.image_rate, self.settings.skip_damaged
+        image_rate, skip_damaged = self.settings.run.image_rate, self.settings.run.skip_damaged
         with open_source(self.source, part=self.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
@@ -189,15 +188,17 @@ class Pipeline:
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
             source = without_password(self._origin.source)
-            endpoint = stack.enter_context(meeting_place(self.settings.endpoint, folder, self.settings.keys, source))
+            endpoint = stack.enter_context(
+                meeting_place(self.settings.run.endpoint, folder, self.settings.run.keys, source)
+            )
             state = self._state
             if state is not None:
                 stack.enter_context(_begun(state, self._kept, self._origin))
             start = self._start(state) if state is not None and self._kept is not None else Position()
             self._box = start.box or self._box
-            self._results = stack.enter_context(Receiver("results", endpoint, start, self.settings.window))
+            self._results = stack.enter_context(Receiver("results", endpoint, start, self.settings.run.unstored_frames))
             self._reports = stack.enter_context(Subscriber("health", endpoint))
-            settings = replace(self.settings, endpoint=str(endpoint))
+            settings = self.settings.but({"run.endpoint": str(endpoint)})
             if self._save_model is not None:  # by the compressor's last checkpoint
                 stack.enter_context(_saved(self._save_model, state or folder, settings))
             supervisor = Supervisor(

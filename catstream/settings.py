@@ -1,8 +1,8 @@
-"""Settings: every number that the paper and the design name, with its unit, default and bounds.
+"""Settings: every number that the paper and the design name, in groups, with its unit, default and bounds.
 
-Values come, each over the one before, from the defaults here, a preset, a TOML
-file, environment variables (`CATSTREAM_CORESET_SIZE=128`), and what the program
-or the command line sets (`--set coreset_size=128`).
+A setting has the name `group.name`, for example `coreset.size`. Values come, each overriding the one before, from the
+defaults here, a preset, a TOML file (a table for each group), environment variables (`CATSTREAM_CORESET_SIZE=128`),
+and the program or the command line (`--set coreset.size=128`).
 """
 
 from __future__ import annotations
@@ -15,27 +15,311 @@ import os
 import reprlib
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from numbers import Number
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Self, get_type_hints
 
 import msgspec
 from msgspec import Meta
 
 from catstream.errors import SettingsError
 
-__all__ = ["PRESETS", "Settings", "describe"]
+__all__ = [
+    "PRESETS",
+    "BeliefSettings",
+    "CoresetSettings",
+    "ExtentSettings",
+    "RunSettings",
+    "SearchSettings",
+    "Settings",
+    "TeachingSettings",
+    "describe",
+]
 
 
 def _about(description: str, **bounds: float) -> Meta:
     return Meta(description=description, **bounds)  # type: ignore[call-overload]
 
 
+class _Group:
+    """A group of settings: it checks the names and the values that it is made of."""
+
+    group: ClassVar[str]
+
+    def __new__(cls, *unnamed: Any, **values: Any) -> Self:
+        if unnamed:
+            raise SettingsError(f"settings are given by name, got {unnamed[0]!r}: for example {cls.__name__}(name=1)")
+        for name in values:
+            _check_name(f"{cls.group}.{name}")
+        return super().__new__(cls)
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:  # type: ignore[attr-defined]
+            object.__setattr__(self, name, _checked(f"{self.group}.{name}", getattr(self, name)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings(_Group):
+    """How a pipeline runs; nothing here changes what is learned from a frame."""
+
+    group = "run"
+
+    endpoint: Annotated[
+        str,
+        _about(
+            "Where the processes meet: a folder for ipc:// sockets (empty: a new private one), "
+            "or tcp://HOST:PORT, the first of the ports that the channels use."
+        ),
+    ] = ""
+    keys: Annotated[
+        str,
+        _about(
+            "Folder of keys from `catstream keys new` (empty: none). With keys, all connections are encrypted, every "
+            "client must be allowed, and other hosts may reach the endpoint."
+        ),
+    ] = ""
+    lockstep: Annotated[
+        bool,
+        _about("Make a run repeatable bit for bit: the detector waits for each model before it continues."),
+    ] = False
+    lag_frames: Annotated[
+        int,
+        _about(
+            "Frames of a file by which the detector may be ahead of learning: it waits for the model that results from "
+            "the frame so many frames ago (0: as lockstep).",
+            ge=0,
+            le=65536,
+        ),
+    ] = 25
+    seed: Annotated[int, _about("Seed of all random numbers.", ge=0)] = 0
+    image_rate: Annotated[
+        float,
+        _about("Frames per second of a folder or a pattern of images, which have no timestamps.", gt=0, le=1000),
+    ] = 25.0
+    skip_damaged: Annotated[
+        bool,
+        _about(
+            "Continue after a damaged place in a video file: frames that cannot be decoded are skipped and counted. "
+            "Without it, the run ends there."
+        ),
+    ] = False
+    unstored_frames: Annotated[
+        int,
+        _about("Features messages that may be sent and not yet stored by the compressor.", ge=1, le=65536),
+    ] = 256
+    checkpoint_seconds: Annotated[
+        float,
+        _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600),
+    ] = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoresetSettings(_Group):
+    """The coreset trees (paper, section "Coreset Tree")."""
+
+    group = "coreset"
+
+    size: Annotated[int, _about("n in the paper: rows of a node of a coreset tree.", ge=2, le=4096)] = 64
+    share: Annotated[
+        float, _about("n as a share of the video's frames, as in the paper (0: coreset.size is used).", ge=0, le=0.5)
+    ] = 0.0
+    sample_interval: Annotated[
+        int,
+        _about(
+            "Frames between two samples from which the trainer learns; fewer as long as the trees are small and grow "
+            "by an eighth sooner.",
+            ge=1,
+        ),
+    ] = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchSettings(_Group):
+    """Where in a frame the object is searched for."""
+
+    group = "search"
+
+    mode: Annotated[
+        Literal["local", "full"],
+        _about(
+            "Search around the predicted place, and the whole frame if the score is low (local), or every whole "
+            "frame (full)."
+        ),
+    ] = "local"
+    context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
+    area: Annotated[float, _about("Side of the local search area as a multiple of the window's.", ge=1.5, le=6)] = 2.5
+    distance_penalty: Annotated[
+        float,
+        _about(
+            "Weight of the squared displacement, in window widths, that is subtracted from the score in the local "
+            "search.",
+            ge=0,
+        ),
+    ] = 0.1
+    whole_interval: Annotated[
+        int, _about("Frames between two searches of the whole frame while the score is not confident.", ge=1)
+    ] = 10
+    motion_frames: Annotated[
+        int,
+        _about("Frames in a block of centres from which EM learns the parameters of the Kalman filter.", ge=8),
+    ] = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeliefSettings(_Group):
+    """What a score means: about 0 on background, about 1 on the object."""
+
+    group = "belief"
+
+    present_score: Annotated[float, _about("Score below which the object is reported as absent.")] = 0.3
+    present_share: Annotated[
+        float,
+        _about("The same threshold as a share of the object's mean score; the higher of the two counts.", ge=0, le=1),
+    ] = 0.45
+    return_score: Annotated[float, _about("Score from which an absent object is reported as present again.")] = 0.5
+    return_share: Annotated[
+        float,
+        _about("The same threshold as a share of the object's mean score; the higher of the two counts.", ge=0, le=1),
+    ] = 0.65
+    sighting_lead: Annotated[
+        float,
+        _about(
+            "Difference of score to the best window elsewhere in the frame that an object of a saved model needs to be "
+            "detected for the first time."
+        ),
+    ] = 0.25
+    sighting_frames: Annotated[
+        int, _about("Successive frames that must agree before an object of a saved model is detected.", ge=1)
+    ] = 3
+    confident_score: Annotated[
+        float, _about("Score below which the whole frame is searched every search.whole_interval frames.")
+    ] = 0.55
+    lost_score: Annotated[float, _about("Score below which the whole frame is searched in every frame.")] = 0.3
+    jump_margin: Annotated[
+        float, _about("Difference of score by which a window elsewhere in the frame must exceed the local one.")
+    ] = 0.4
+    trust_score: Annotated[
+        float,
+        _about("Score from which a redetected object is trusted: it is learned from again."),
+    ] = 0.75
+    teach_score: Annotated[float, _about("Score below which no training rows are cut from a frame.")] = 0.4
+    mine_score: Annotated[float, _about("Score below which no hard negatives are searched for.")] = 0.6
+    extent_score: Annotated[float, _about("Score below which size and aspect ratio do not change.")] = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeachingSettings(_Group):
+    """Which training rows are cut from a frame, and how a model is learned from them."""
+
+    group = "teaching"
+
+    bootstrap: Annotated[
+        Literal["copies", "scm"],
+        _about(
+            "Source of the first model: n affine copies of the first box (copies), or the boxes of the sparse "
+            "collaborative model, which follows the object until there are n of them, as in the paper (scm)."
+        ),
+    ] = "copies"
+    classifier: Annotated[
+        Literal["joint", "least-squares", "one-class"],
+        _about(
+            "How a model is learned: least squares of the object's and the background's trees, plus that of the loss "
+            "tree (joint), the former alone (least-squares), or the paper's one-class linear SVM (one-class)."
+        ),
+    ] = "joint"
+    ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 1.0
+    loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
+    extent_ridge: Annotated[float, _about("Lambda of the least squares of the extent tree.", gt=0)] = 0.1
+    colours: Annotated[bool, _about("Use the histogram of the window's colours as a feature.")] = True
+    copies: Annotated[
+        int, _about("Affine copies of the object in each frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)
+    ] = 3
+    mirrored: Annotated[int, _about("How many of these copies are mirrored left to right.", ge=0)] = 1
+    other_backgrounds: Annotated[
+        float,
+        _about(
+            "Share of the first frame's affine copies that are put on another background, so that the background "
+            "behind the object is not learned with it.",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.9
+    object_weight: Annotated[
+        float, _about("Weight of a frame's object row in the loss tree; an ordinary row has weight 1.", gt=0)
+    ] = 8.0
+    near_misses: Annotated[
+        int, _about("Windows beside the object in each frame, with a label between 0 and 1.", ge=0)
+    ] = 12
+    near_sigma: Annotated[
+        float,
+        _about(
+            "Standard deviation, in cells, of the Gaussian label of a window beside the object: "
+            "exp(-d^2 / (2 sigma^2)).",
+            gt=0,
+        ),
+    ] = 0.9
+    near_negatives: Annotated[int, _about("Background windows around the object in each frame.", ge=1)] = 12
+    hard_negatives: Annotated[
+        int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
+    ] = 10
+    mining_interval: Annotated[int, _about("Frames between two searches for hard negatives.", ge=1)] = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExtentSettings(_Group):
+    """Size and aspect ratio of the object."""
+
+    group = "extent"
+
+    size_count: Annotated[int, _about("Sizes that a search may try, an odd number.", ge=1, le=15)] = 7
+    size_step: Annotated[float, _about("Relative change of size from one to the next.", gt=0, le=0.5)] = 0.04
+    size_rate: Annotated[float, _about("Share of a change of size that is applied in one frame.", ge=0, le=1)] = 0.7
+    aspect_count: Annotated[
+        int,
+        _about("Aspect ratios that a search may try, an odd number (1: the ratio never changes).", ge=1, le=15),
+    ] = 5
+    aspect_step: Annotated[float, _about("Relative change of aspect ratio from one to the next.", gt=0, le=0.5)] = 0.08
+    aspect_rate: Annotated[
+        float, _about("Share of a change of aspect ratio that is applied in one frame.", ge=0, le=1)
+    ] = 0.2
+    penalty: Annotated[
+        float, _about("Weight of |log f|, for a change of size or aspect ratio by the factor f.", ge=0)
+    ] = 0.3
+    prior: Annotated[
+        float,
+        _about(
+            "Weight of (log f)^2, for a size or aspect ratio that differs from the first box's by the factor f.", ge=0
+        ),
+    ] = 0.5
+    weight: Annotated[
+        float,
+        _about("Weight of the extent head beside the appearance score if size and aspect ratio are chosen.", ge=0),
+    ] = 1.0
+    sigma: Annotated[
+        float, _about("Standard deviation, in steps, of the Gaussian label of a size or an aspect ratio.", gt=0)
+    ] = 1.0
+    interval: Annotated[int, _about("Frames between two sets of training rows for the extent head.", ge=1)] = 2
+    colour_slack: Annotated[
+        float,
+        _about(
+            "Drift of the colours' centroid, in windows, beyond its first place or the middle of the window, from "
+            "which the box is moved after it (1: never).",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.14
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """All settings of a run, checked. Frozen: `dataclasses.replace` makes a changed copy.
+    """All settings of a run, in groups, checked. Frozen: `but` makes a changed copy.
+
+    Parameters
+    ----------
+    run, coreset, search, belief, teaching, extent : the group, or a mapping of its names to values
+        What is left out has its default.
 
     Raises
     ------
@@ -44,206 +328,37 @@ class Settings:
 
     Examples
     --------
-    >>> Settings(coreset_size=128).coreset_size
+    >>> Settings(coreset={"size": 128}).coreset.size
     128
     """
 
-    # --- running -------------------------------------------------------------------------------
-    endpoint: Annotated[
-        str,
-        _about(
-            "Where the processes meet: a folder for ipc:// sockets (empty: a fresh private one), "
-            "or tcp://HOST:PORT, the first of the ports that the channels take."
-        ),
-    ] = ""
-    keys: Annotated[
-        str,
-        _about(
-            "Folder of keys from `catstream keys new` (empty: none): with it all is encrypted, who connects must be "
-            "allowed, and others may reach the endpoint."
-        ),
-    ] = ""
-    lockstep: Annotated[
-        bool,
-        _about("Repeat a run bit for bit: the detector waits for each model before it goes on."),
-    ] = False
-    lag_frames: Annotated[
-        int,
-        _about(
-            "Frames of a file that the detector may be ahead of learning: it waits for the model to which "
-            "the frame so long ago led (0: as lockstep).",
-            ge=0,
-            le=65536,
-        ),
-    ] = 25
-    seed: Annotated[int, _about("Seed of everything random.", ge=0)] = 0
-    image_rate: Annotated[
-        float,
-        _about(
-            "Frames per second of a folder or a pattern of images, which have no clock of their own.", gt=0, le=1000
-        ),
-    ] = 25.0
-    skip_damaged: Annotated[
-        bool,
-        _about(
-            "Read a video file on after a damaged place: frames that cannot be decoded are left out and counted. "
-            "Without it, the run ends there."
-        ),
-    ] = False
-    window: Annotated[
-        int,
-        _about("Features messages that may be sent and not yet stored.", ge=1, le=65536),
-    ] = 256
-    checkpoint_seconds: Annotated[
-        float,
-        _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600),
-    ] = 1.0
+    run: RunSettings = field(default_factory=RunSettings)
+    coreset: CoresetSettings = field(default_factory=CoresetSettings)
+    search: SearchSettings = field(default_factory=SearchSettings)
+    belief: BeliefSettings = field(default_factory=BeliefSettings)
+    teaching: TeachingSettings = field(default_factory=TeachingSettings)
+    extent: ExtentSettings = field(default_factory=ExtentSettings)
 
-    # --- the coreset trees (paper, "Coreset Tree") -----------------------------------------------
-    coreset_size: Annotated[int, _about("n: rows of a node of a coreset tree.", ge=2, le=4096)] = 64
-    coreset_share: Annotated[
-        float, _about("n as a share of the video's frames, as the paper sets it (0: coreset_size holds).", ge=0, le=0.5)
-    ] = 0.0
-    train_frames: Annotated[
-        int,
-        _about(
-            "Frames between two samples that the trainer learns from; fewer where the trees grew by an eighth.",
-            ge=1,
-        ),
-    ] = 5
-
-    bootstrap: Annotated[
-        Literal["copies", "scm"],
-        _about(
-            "What the first model is learned from: n affine copies of the first box (copies), or the boxes of the "
-            "sparse collaborative model, which follows the object until there are n, as in the paper (scm)."
-        ),
-    ] = "copies"
-
-    # --- training --------------------------------------------------------------------------------
-    classifier: Annotated[
-        Literal["joint", "least-squares", "one-class"],
-        _about(
-            "How a model is learned: least squares of the two trees, joined with that of the loss tree (joint), "
-            "of the two trees alone (least-squares), or the paper's one-class linear SVM (one-class)."
-        ),
-    ] = "joint"
-    ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 1.0
-    loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
-    extent_ridge: Annotated[float, _about("Lambda of the least squares of the extent tree.", gt=0)] = 0.1
-    motion_frames: Annotated[
-        int, _about("Frames in a block of centres, from which the Kalman filter's parameters are learned.", ge=8)
-    ] = 64
-
-    # --- detection ---------------------------------------------------------------------------------
-    detection: Annotated[
-        Literal["local", "full"],
-        _about("Search around the object and the whole frame when unsure (local), or all of every frame (full)."),
-    ] = "local"
-
-    colours: Annotated[bool, _about("Learn which colours the object has, wherever in it they are.")] = True
-    context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
-    search_area: Annotated[float, _about("Side of the local search as a multiple of the window's.", ge=1.5, le=6)] = 2.5
-    scale_count: Annotated[int, _about("Sizes that a search may try, an odd number.", ge=1, le=15)] = 7
-    scale_step: Annotated[float, _about("Change of size from one to the next.", gt=0, le=0.5)] = 0.04
-    scale_rate: Annotated[float, _about("Share of a change of size that is followed at once.", ge=0, le=1)] = 0.7
-    aspect_count: Annotated[
-        int,
-        _about("Ratios of width to height that a search may try, an odd number (1: it never changes).", ge=1, le=15),
-    ] = 5
-    aspect_step: Annotated[float, _about("Change of this ratio from one to the next.", gt=0, le=0.5)] = 0.08
-    aspect_rate: Annotated[float, _about("Share of a change of this ratio that is followed at once.", ge=0, le=1)] = 0.2
-    extent_score: Annotated[float, _about("Score below which size and ratio are held.")] = 0.5
-    extent_penalty: Annotated[
-        float, _about("Score that a change of size or ratio costs, times the logarithm of its factor.", ge=0)
-    ] = 0.3
-    extent_prior: Annotated[
-        float,
-        _about(
-            "Score that being of another size or ratio than the first box costs, times the square of the logarithm "
-            "of its factor.",
-            ge=0,
-        ),
-    ] = 0.5
-    extent_weight: Annotated[
-        float, _about("Weight of the extent model beside the appearance model where size and ratio are chosen.", ge=0)
-    ] = 1.0
-    extent_sigma: Annotated[
-        float, _about("Steps of size or ratio at which a window fits exp(-1/2) as well as the right one.", gt=0)
-    ] = 1.0
-    extent_frames: Annotated[int, _about("Frames from one lesson of size and ratio to the next.", ge=1)] = 2
-    balance_slack: Annotated[
-        float,
-        _about(
-            "Share of the window that the centre of the object's colours may come to lie beyond its first place, or "
-            "the middle, before the box follows it (1: it never does).",
-            ge=0,
-            le=1,
-        ),
-    ] = 0.14
-    distance_penalty: Annotated[
-        float, _about("Score that a window's width of distance costs in the local search.", ge=0)
-    ] = 0.1
-    present_score: Annotated[float, _about("Score below which the object counts as absent.")] = 0.3
-    present_share: Annotated[
-        float,
-        _about("The same as a share of the score that the object usually has: the higher one counts.", ge=0, le=1),
-    ] = 0.45
-    return_score: Annotated[float, _about("Score at which an absent object counts as present again.")] = 0.5
-    return_share: Annotated[
-        float,
-        _about("The same as a share of the score that the object usually has: the higher one counts.", ge=0, le=1),
-    ] = 0.65
-    sighting_lead: Annotated[
-        float,
-        _about("Score by which the object of a saved model must lead the rest of the frame where it is first found."),
-    ] = 0.25
-    sighting_frames: Annotated[int, _about("Frames in a row that must agree on a first sighting.", ge=1)] = 3
-    sure_score: Annotated[float, _about("Score below which the whole frame is searched now and then.")] = 0.55
-    lost_score: Annotated[float, _about("Score below which the whole frame is searched in every frame.")] = 0.3
-    jump_margin: Annotated[float, _about("Score by which a window elsewhere must be better than the one near.")] = 0.4
-    trust_score: Annotated[
-        float, _about("Score from which on a window found elsewhere teaches, and the whole frame is searched no more.")
-    ] = 0.75
-    whole_frames: Annotated[int, _about("Frames from one whole search to the next while unsure.", ge=1)] = 10
-    teach_score: Annotated[float, _about("Score below which a frame teaches nothing.")] = 0.4
-    copies: Annotated[
-        int, _about("Affine copies of the object a frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)
-    ] = 3
-    mirrored: Annotated[int, _about("How many of them are turned left to right.", ge=0)] = 1
-    other_backgrounds: Annotated[
-        float,
-        _about(
-            "Share of the first frame's affine copies that are put on another background: what is behind the object "
-            "there is not learned with it.",
-            ge=0,
-            le=1,
-        ),
-    ] = 0.9
-    object_weight: Annotated[
-        float, _about("Ordinary rows that the object's row of a frame counts for in the loss tree.", gt=0)
-    ] = 8.0
-    near_misses: Annotated[int, _about("Windows a frame that lie beside the object.", ge=0)] = 12
-    near_sigma: Annotated[
-        float, _about("Distance, in cells, at which a near miss is worth exp(-1/2) of the object.", gt=0)
-    ] = 0.9
-    near_negatives: Annotated[int, _about("Background windows a frame around the object.", ge=1)] = 12
-    far_negatives: Annotated[int, _about("Hard negatives from a whole frame.", ge=0)] = 10
-    mine_frames: Annotated[int, _about("Frames from one search for hard negatives to the next.", ge=1)] = 8
-    mine_score: Annotated[float, _about("Score below which none are searched for.")] = 0.6
-
-    def __new__(cls, *unnamed: Any, **given: Any) -> Settings:
+    def __new__(cls, *unnamed: Any, **groups: Any) -> Self:
         if unnamed:
             raise SettingsError(
-                f"settings are given by name, got {unnamed[0]!r}: for example Settings(coreset_size=128)"
+                f"settings are given by name, got {unnamed[0]!r}: for example Settings(coreset={{'size': 128}})"
             )
-        for name in given:
-            _check_name(name)
+        for name in groups:
+            if name not in _groups():
+                _check_name(name)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
-        for name in _kinds():
-            object.__setattr__(self, name, _checked(name, getattr(self, name)))
+        for name, group in _groups().items():
+            value = getattr(self, name)
+            if isinstance(value, Mapping):
+                object.__setattr__(self, name, group(**value))
+            elif not isinstance(value, group):
+                raise SettingsError(
+                    f"the group of settings {name} cannot be {reprlib.repr(value)}: give a {group.__name__}, or names "
+                    f"and values, for example Settings({name}={{...}})"
+                )
 
     @classmethod
     def load(
@@ -254,7 +369,7 @@ class Settings:
         overrides: Mapping[str, Any] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> Settings:
-        """Gather settings from all their places: those that `given` finds, the others by default.
+        """Collect settings from all their sources: those that `given` finds, the others by default.
 
         Raises
         ------
@@ -272,18 +387,18 @@ class Settings:
         overrides: Mapping[str, Any] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> dict[str, Any]:
-        """Names and values that are given somewhere, as `of` and `but` check them.
+        """Names and values that are set in some source, as `of` and `but` check them.
 
         Parameters
         ----------
         preset : str or None
             A name of `PRESETS`.
         file : path or None
-            A TOML file with `name = value` lines.
+            A TOML file with a table for each group.
         overrides : mapping of str, or iterable of str
-            Names and values, or texts `name=value` as `--set` takes them.
+            Names and values, or texts `group.name=value` as `--set` takes them.
         environment : mapping of str, or None
-            Variables, `CATSTREAM_NAME=value`; None for the process's own.
+            Variables, `CATSTREAM_GROUP_NAME=value`; None for the process's own.
 
         Raises
         ------
@@ -296,115 +411,139 @@ class Settings:
                 raise SettingsError(f"there is no preset {preset!r}: there are {', '.join(PRESETS)}")
             values.update(PRESETS[preset])
         if file is not None:
-            values.update(_read(Path(file)))
+            values.update(_flat(_read(Path(file))))
         for variable, text in (os.environ if environment is None else environment).items():
             if variable.startswith("CATSTREAM_"):
-                values[variable.removeprefix("CATSTREAM_").lower()] = text
+                values[variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)] = text
         return values | _named(overrides)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Settings:
-        """Check names and values; texts are read as their setting's type.
+        """Check names and values, flat (`coreset.size`) or in groups; texts are read as their setting's type.
 
         Examples
         --------
-        >>> Settings.of({"ridge": ".5", "lockstep": "true"}) == Settings(ridge=0.5, lockstep=True)
-        True
+        >>> Settings.of({"coreset.share": ".5", "run": {"lockstep": True}}).changed()
+        ['run.lockstep=true', 'coreset.share=0.5']
         """
-        return cls(
-            **{name: _read_text(name, value) if isinstance(value, str) else value for name, value in values.items()}
-        )
+        groups: dict[str, dict[str, Any]] = {}
+        for name, value in _flat(values).items():
+            _check_name(name)
+            group, _, short = name.partition(".")
+            groups.setdefault(group, {})[short] = _read_text(name, value) if isinstance(value, str) else value
+        made: dict[str, Any] = {group: _groups()[group](**named) for group, named in groups.items()}
+        return cls(**made)
 
     def for_length(self, frames: int | None) -> Settings:
-        """These settings for a video of so many frames: `coreset_share` becomes a `coreset_size`.
+        """These settings for a video of so many frames: `coreset.share` becomes a `coreset.size`.
 
         Raises
         ------
         SettingsError
-            Where there is a share and the length is not known.
+            If there is a share and the length is not known.
 
         Examples
         --------
-        >>> Settings(coreset_share=0.1).for_length(945).coreset_size
+        >>> Settings(coreset={"share": 0.1}).for_length(945).coreset.size
         94
         """
-        if not self.coreset_share:
+        if not self.coreset.share:
             return self
         if frames is None:
             raise SettingsError(
-                f"coreset_share={self.coreset_share:g} is a share of the video's length, and this source has none: "
-                "set coreset_size instead"
+                f"coreset.share={self.coreset.share:g} is a share of the video's length, and the length of this source "
+                "is not known: set coreset.size instead"
             )
-        size = {"coreset_size": max(2, round(self.coreset_share * frames)), "coreset_share": 0.0}
-        return Settings.of(self.values() | size)
+        return self.but({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
 
     def but(self, others: Mapping[str, Any] | Iterable[str]) -> Settings:
-        """These, but for some: names and values, or texts `name=value` as `--set` takes them.
+        """A copy with some of them changed: names and values, or texts `group.name=value` as `--set` takes them.
 
         Examples
         --------
-        >>> Settings(lockstep=True).but(["coreset_size=32"]).changed()
-        ['lockstep=true', 'coreset_size=32']
+        >>> Settings(run={"lockstep": True}).but(["coreset.size=32"]).changed()
+        ['run.lockstep=true', 'coreset.size=32']
         """
-        return Settings.of(self.values() | _named(others))
+        return Settings.of(self.values() | _flat(_named(others)))
 
     def values(self) -> dict[str, Any]:
-        """All of them, by name."""
-        return dataclasses.asdict(self)
+        """All values, by full name."""
+        return _flat(dataclasses.asdict(self))
 
     def changed(self) -> list[str]:
         """Those that differ from their default, as `load` takes them.
 
         Examples
         --------
-        >>> Settings(lockstep=True, coreset_size=32).changed()
-        ['lockstep=true', 'coreset_size=32']
+        >>> Settings(run={"lockstep": True}, coreset={"size": 32}).changed()
+        ['run.lockstep=true', 'coreset.size=32']
         """
-        fields, texts = dataclasses.fields(self), self.texts()
-        return [f"{field.name}={texts[field.name]}" for field in fields if getattr(self, field.name) != field.default]
+        default, texts = _defaults(), self.texts()
+        return [f"{name}={texts[name]}" for name, value in self.values().items() if value != default[name]]
 
     def texts(self) -> dict[str, str]:
-        """All of them as texts, by name; `of` reads them."""
+        """All values as texts, by full name; `of` reads them."""
         values = self.values().items()
         return {name: value if isinstance(value, str) else json.dumps(value) for name, value in values}
 
 
 _PAPER = {
-    "classifier": "one-class",
-    "detection": "full",
-    "bootstrap": "scm",
-    "extent_weight": 0.0,
-    "extent_prior": 0.0,
-    "colours": False,
-    "balance_slack": 1.0,
-    "other_backgrounds": 0.0,
-    "mirrored": 0,
-    "present_share": 0.0,
-    "return_share": 0.0,
-    "trust_score": 0.0,
+    "teaching.classifier": "one-class",
+    "search.mode": "full",
+    "teaching.bootstrap": "scm",
+    "extent.weight": 0.0,
+    "extent.prior": 0.0,
+    "teaching.colours": False,
+    "extent.colour_slack": 1.0,
+    "teaching.other_backgrounds": 0.0,
+    "teaching.mirrored": 0,
+    "belief.present_share": 0.0,
+    "belief.return_share": 0.0,
+    "belief.trust_score": 0.0,
 }
 
-#: What the paper set, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.
+#: Settings of the paper, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.
 PRESETS: dict[str, dict[str, Any]] = {
-    "one-class-paper": _PAPER | {"copies": 4},
-    "cat10": _PAPER | {"coreset_share": 0.10, "copies": 1},
-    "cat25": _PAPER | {"coreset_share": 0.25, "copies": 0},
+    "one-class-paper": _PAPER | {"teaching.copies": 4},
+    "cat10": _PAPER | {"coreset.share": 0.10, "teaching.copies": 1},
+    "cat25": _PAPER | {"coreset.share": 0.25, "teaching.copies": 0},
 }
 
 
 def describe() -> list[tuple[str, str, Any, str]]:
-    """Name, type, default and meaning of every setting: for `--help` and the docs."""
-    kinds = _kinds()
-    return [
-        (field.name, _takes(field.name), field.default, kinds[field.name].__metadata__[0].description)
-        for field in dataclasses.fields(Settings)
-    ]
+    """Full name, type, default and meaning of every setting: for `--help` and the docs."""
+    default = _defaults()
+    return [(name, _takes(name), default[name], kind.__metadata__[0].description) for name, kind in _kinds().items()]
+
+
+@cache
+def _groups() -> dict[str, type[_Group]]:
+    """Name and class of each group."""
+    return get_type_hints(Settings)
 
 
 @cache
 def _kinds() -> dict[str, Any]:
-    """Type and bounds of each setting."""
-    return get_type_hints(Settings, include_extras=True)
+    """Type and bounds of each setting, by its full name."""
+    hints = {name: get_type_hints(group, include_extras=True) for name, group in _groups().items()}
+    return {f"{name}.{each}": kind for name, kinds in hints.items() for each, kind in kinds.items() if each != "group"}
+
+
+@cache
+def _defaults() -> dict[str, Any]:
+    """Default of each setting, by its full name."""
+    return Settings().values()
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by full name, from values by full name or in groups."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{name}.{short}": each for short, each in value.items()}
+        else:
+            flat[name] = value
+    return flat
 
 
 def _takes(name: str) -> str:
@@ -422,9 +561,15 @@ def _takes(name: str) -> str:
 
 def _check_name(name: str) -> None:
     if name not in _kinds():
-        near = [repr(other) for other in difflib.get_close_matches(name, _kinds(), n=3)]
+        near = [repr(other) for other in _nearest(name)]
         meant = f", did you mean {' or '.join(near)}?" if near else ":"
         raise SettingsError(f"there is no setting {name!r}{meant} `catstream settings` lists all {len(_kinds())}")
+
+
+def _nearest(name: str) -> list[str]:
+    """Full names that are similar, or that end as the name does."""
+    similar = difflib.get_close_matches(name.replace("_", "."), _kinds(), n=3)
+    return similar or [full for full in _kinds() if full.partition(".")[2] == name]
 
 
 def _checked(name: str, value: Any) -> Any:
@@ -442,7 +587,6 @@ def _checked(name: str, value: Any) -> Any:
 
 def _read_text(name: str, text: str) -> Any:
     """The value that a text means, of the type of its setting."""
-    _check_name(name)
     kind = _kinds()[name].__origin__
     try:
         if kind is bool:
@@ -463,7 +607,7 @@ def _named(given: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
 def _pair(text: str) -> tuple[str, str]:
     name, sign, value = text.partition("=")
     if not sign:
-        raise SettingsError(f"a setting is given as name=value, got {text!r}")
+        raise SettingsError(f"a setting is given as group.name=value, got {text!r}")
     return name.strip(), value.strip()
 
 

@@ -36,7 +36,7 @@ _FILE = "origin.safetensors"
 _HELP = "give another folder"
 
 #: Settings that change nothing of what is learned: a run may go on with others.
-_FREE = {"endpoint", "keys", "lockstep", "lag_frames", "window", "checkpoint_seconds"}
+_FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,7 +133,7 @@ def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source:
     Parameters
     ----------
     endpoint : str
-        Where it runs, as the setting `endpoint` says it. Empty for the only pipeline of this user.
+        Where it runs, as the setting `run.endpoint` says it. Empty for the only pipeline of this user.
     timeout : float
         Seconds that a command may take.
     keys : str

@@ -259,7 +259,7 @@ def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys
     Parameters
     ----------
     endpoint : str
-        Where it runs, or will run, as the setting `endpoint` says it. Empty for the only running pipeline of this user.
+        Where it runs, or will run, as the setting `run.endpoint` says. Empty for the user's only running pipeline.
     channel : str
         "tracks", "models", "health", "samples", "features" or "previews".
     timeout : float or None

@@ -215,5 +215,5 @@ class Tracker:
         sample = self.compressor.take(features)
         if sample is not None:
             self.detector.adopt(self.trainer.train(sample))
-        if track.frame >= self.settings.motion_frames // 2:
+        if track.frame >= self.settings.search.motion_frames // 2:
             kalman.prepare()  # so many more, and a sample brings the centres

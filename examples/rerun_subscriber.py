@@ -1,7 +1,7 @@
 """A running pipeline in the Rerun viewer: pictures, box, score, state and model, frame by frame.
 
     pip install "catstream[rerun]"
-    catstream track walk.mp4 --box 120,80,64,48 --set endpoint=run
+    catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=run
     python examples/rerun_subscriber.py run
     python examples/rerun_subscriber.py run --save walk.rrd
 

@@ -1,6 +1,6 @@
 """A subscriber in plain Python, with pyzmq and msgpack and nothing of catstream.
 
-    catstream track walk.mp4 --box 120,80,64,48 --set endpoint=run
+    catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=run
     python examples/subscriber.py run
 
 Where the pipeline asks for keys, their folder is a second argument.

@@ -35,9 +35,9 @@ def main(context: click.Context, parent: int | None, watchdog: int | None) -> No
 
     \b
       mkdir -m 700 run
-      python -P -m catstream.services compressor --set endpoint=run &
-      python -P -m catstream.services trainer    --set endpoint=run &
-      python -P -m catstream.services detector   --set endpoint=run walk.mp4 --box 120,80,64,48
+      python -P -m catstream.services compressor --set run.endpoint=run &
+      python -P -m catstream.services trainer    --set run.endpoint=run &
+      python -P -m catstream.services detector   --set run.endpoint=run walk.mp4 --box 120,80,64,48
     """
     logging.basicConfig(format=f"{context.invoked_subcommand}: %(message)s", level=logging.INFO)
     context.obj = None if parent is None else Parent(parent, watchdog)

@@ -69,7 +69,9 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
             if isinstance(message, Features):
                 compressor.check(message)
 
-        features = stack.enter_context(Receiver("features", process.endpoint, settled, settings.window, store, check))
+        features = stack.enter_context(
+            Receiver("features", process.endpoint, settled, settings.run.unstored_frames, store, check)
+        )
         samples = stack.enter_context(Publisher("samples", process.endpoint))
 
         def counters() -> dict[str, float]:
@@ -95,8 +97,8 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
                 if sample is not None:
                     samples.send(sample)
             before, waiting = settled, compressor.seq - settled.seq
-            needed = generations is None or end or 2 * waiting >= settings.window
-            overdue = time.monotonic() - tried >= settings.checkpoint_seconds
+            needed = generations is None or end or 2 * waiting >= settings.run.unstored_frames
+            overdue = time.monotonic() - tried >= settings.run.checkpoint_seconds
             if compressor.seq > stored and (needed or overdue):
                 store(needed)
             if message is not None or settled is not before:

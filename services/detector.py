@@ -95,8 +95,8 @@ def main(
                 part=part,
                 since=since,
                 idle=line.idle,
-                image_rate=process.settings.image_rate,
-                skip_damaged=process.settings.skip_damaged,
+                image_rate=process.settings.run.image_rate,
+                skip_damaged=process.settings.run.skip_damaged,
             )
         )
         line.source = frames
@@ -119,7 +119,7 @@ def main(
                     found = _follow(detector, frame, commands.desired)
                 track, features = found
                 line.send(replace(track, pts=frame.pts), features)
-                if track.frame >= process.settings.motion_frames // 2:
+                if track.frame >= process.settings.search.motion_frames // 2:
                     kalman.prepare()  # so many more, and a model brings the motion
                 line.previews.show(track.frame, frame.image, track.box)
                 if not frames.live:
@@ -165,7 +165,7 @@ class _Line:
     """
 
     def __init__(self, process: Process, stack: ExitStack, commands: CommandHandler, owned: bool) -> None:
-        window, endpoint = process.settings.window, process.endpoint
+        window, endpoint = process.settings.run.unstored_frames, process.endpoint
         self._process, self._commands = process, commands
         self._features = stack.enter_context(Sender("features", endpoint, window))
         self._results = stack.enter_context(Sender("results", endpoint, window)) if owned else None
@@ -174,8 +174,8 @@ class _Line:
         self.models = stack.enter_context(Subscriber("models", endpoint))
         self.previews = stack.enter_context(Previews(endpoint))
         self._senders = [self._features] + ([self._results] if self._results else [])
-        self._lockstep = process.settings.lockstep
-        self._lag = 0 if self._lockstep else process.settings.lag_frames
+        self._lockstep = process.settings.run.lockstep
+        self._lag = 0 if self._lockstep else process.settings.run.lag_frames
         self._version = 0
         self.source: Source | None = None
         self.skipped = 0

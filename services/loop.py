@@ -55,11 +55,11 @@ class Process:
     def __init__(self, name: str, settings: Settings, watchdog: int | None = None) -> None:
         self.name = name
         self.settings = settings
-        self.endpoint = Endpoint.parse(settings.endpoint, settings.keys)
+        self.endpoint = Endpoint.parse(settings.run.endpoint, settings.run.keys)
         self.trouble = self.source = ""
         self.broken = False
         # All but the detector turn in a time that grows with the coreset size.
-        factor = 1.0 if name == "detector" else max(1.0, (settings.coreset_size / _QUICK_SIZE) ** 2)
+        factor = 1.0 if name == "detector" else max(1.0, (settings.coreset.size / _QUICK_SIZE) ** 2)
         self._watchdog = Watchdog(watchdog, PATIENCE * factor)
         self._asked = float("inf")  # when it was asked to end
         self._health = Publisher("health", self.endpoint, sender=name)

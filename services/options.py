@@ -51,7 +51,7 @@ def with_given(command: Callable[..., None]) -> Callable[..., None]:
 
     @click.option("--settings", "file", type=click.Path(path_type=Path), help="TOML file of settings.")
     @click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings.")
-    @click.option("--set", "pairs", multiple=True, metavar="NAME=VALUE", help="One setting; may be repeated.")
+    @click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="One setting; may be repeated.")
     @wraps(command)
     def wrapped(file: Path | None, preset: str | None, pairs: tuple[str, ...], **options: Any) -> None:
         command(given=Settings.given(preset=preset, file=file, overrides=pairs), **options)
@@ -66,8 +66,8 @@ def with_reading(command: Callable[..., None]) -> Callable[..., None]:
     @click.option("--skip-damaged", is_flag=True, help="Go on after a damaged place in a video file.")
     @wraps(command)
     def wrapped(given: dict[str, Any], fps: float | None, skip_damaged: bool, **options: Any) -> None:
-        rate = {} if fps is None else {"image_rate": fps}
-        command(given=given | rate | ({"skip_damaged": True} if skip_damaged else {}), **options)
+        rate = {} if fps is None else {"run.image_rate": fps}
+        command(given=given | rate | ({"run.skip_damaged": True} if skip_damaged else {}), **options)
 
     return wrapped
 

@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
@@ -273,8 +273,8 @@ def main(source: str, settings: Settings, box: Box | None, model: Path | None, p
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     shown = without_password(source if is_live(source) else str(Path(source).absolute()))
-    with private_folder() as folder, meeting_place(settings.endpoint, folder, settings.keys, shown) as endpoint:
-        settings = replace(settings, endpoint=str(endpoint))
+    with private_folder() as folder, meeting_place(settings.run.endpoint, folder, settings.run.keys, shown) as endpoint:
+        settings = settings.but({"run.endpoint": str(endpoint)})
         supervisor = Supervisor(source, box, settings, folder, model=model, owned=False, part=part)
         try:
             while not supervisor.finished and not ended.wait(0.05):

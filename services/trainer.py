@@ -29,7 +29,7 @@ def main(process: Process) -> None:
             if message is not None and not end and message.version != version:
                 process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
-                if message.frame >= process.settings.motion_frames // 2:
+                if message.frame >= process.settings.search.motion_frames // 2:
                     kalman.prepare()  # so many more, and a sample brings the centres
                 version, trained = message.version, trained + 1
             models.welcome()

@@ -94,7 +94,7 @@ def test_each_process_accepts_its_command_line(name):
 
 
 def test_all_meet_on_the_loopback_of_one_network_that_nobody_else_is_in():
-    (endpoint,) = {settings(name).endpoint for name in NAMES}
+    (endpoint,) = {settings(name).run.endpoint for name in NAMES}
     assert Endpoint.parse(endpoint).host == "127.0.0.1"
     assert {SERVICES[name]["network_mode"] for name in (*NAMES, "view")} == {"service:network"}
 
@@ -112,7 +112,7 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
     options = group.make_context("catstream", list(service["command"]))
     verb, command, rest = group.resolve_command(options, service["command"])
     page = command.make_context(verb, rest, parent=options).params
-    assert (page["endpoint"], page["port"]) == (settings("detector").endpoint, 8000)
+    assert (page["endpoint"], page["port"]) == (settings("detector").run.endpoint, 8000)
     server = Server(page["endpoint"], host=page["host"], port=0, token=page["token"])
     script = service["healthcheck"]["test"][-1].replace(":8000", f":{urlsplit(server.url).port}")
     with server.beside():
@@ -148,7 +148,7 @@ def test_the_address_of_a_camera_is_taken_as_it_is():
 def test_the_health_check_hears_its_process_and_notices_silence(name):
     *command, script, address = SERVICES[name]["healthcheck"]["test"]
     assert command == ["CMD", "python", "-P", "-c"]
-    compose = Endpoint.parse(settings(name).endpoint)
+    compose = Endpoint.parse(settings(name).run.endpoint)
     assert address == compose.address(CHANNELS["health"], name)
 
     with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -165,7 +165,7 @@ def test_the_health_check_hears_its_process_and_notices_silence(name):
 
 
 def test_what_a_client_may_subscribe_to_is_published_on_this_host_alone_if_there_are_keys():
-    compose = Endpoint.parse(settings("detector").endpoint)
+    compose = Endpoint.parse(settings("detector").run.endpoint)
     wanted = {
         int(compose.address(channel, sender).rpartition(":")[2])
         for channel in CHANNELS.values()
@@ -194,7 +194,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
             assert next(tracks).box is not None
         first = int(tcp.rpartition(":")[2])
         *_, script, address = SERVICES["trainer"]["healthcheck"]["test"]
-        monkeypatch.setenv("CATSTREAM_KEYS", str(tmp_path / "pipeline"))
+        monkeypatch.setenv("CATSTREAM_RUN_KEYS", str(tmp_path / "pipeline"))
         heard = address.replace("5707", str(first + 7))
         subprocess.run([sys.executable, "-P", "-c", script, heard], check=True)
 

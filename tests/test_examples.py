@@ -75,7 +75,9 @@ def beside(request, demo_video, shown, tmp_path_factory):
         words["rerun_subscriber.py"] = ["--save", shown]
     with ExitStack() as stack:
         # A window of one: the pipeline goes on only as its tracks are taken.
-        pipeline = stack.enter_context(Pipeline(str(source), boxes[0], Settings(window=1, keys=keys)))
+        pipeline = stack.enter_context(
+            Pipeline(str(source), boxes[0], Settings(run={"unstored_frames": 1, "keys": keys}))
+        )
         models = stack.enter_context(catstream.subscribe(pipeline.endpoint, "models", timeout=0, keys=keys))
         readers = {}
         for name, more in words.items():

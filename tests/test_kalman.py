@@ -16,7 +16,10 @@ def test_the_first_models_need_no_filterpy_and_its_import_begins_half_a_block_of
     begun = []
     monkeypatch.setitem(sys.modules, "filterpy.kalman", None)  # an import of it fails
     monkeypatch.setattr(kalman, "prepare", lambda: begun.append(tracker.track.frame))
-    frame, tracker = rng.integers(0, 256, (120, 160, 3), np.uint8), Tracker(Settings(motion_frames=8))
+    frame, tracker = (
+        rng.integers(0, 256, (120, 160, 3), np.uint8),
+        Tracker(Settings(search={"motion_frames": 8})),
+    )
     tracker.init(frame, (60, 40, 40, 40))
     for _ in range(4):
         assert not begun

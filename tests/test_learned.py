@@ -32,7 +32,7 @@ def features(rng, seq, begins=False):
 @pytest.fixture
 def compressor(rng):
     """One that has seen a while."""
-    compressor = Compressor(Settings(coreset_size=SIZE))
+    compressor = Compressor(Settings(coreset={"size": SIZE}))
     for seq in range(1, 101):
         compressor.take(features(rng, seq))
     return compressor
@@ -94,7 +94,7 @@ def test_a_tree_of_a_sample_stands_for_as_many_rows_with_the_same_mean(compresso
 
 def test_a_compressor_goes_on_from_a_sample_with_its_version_and_its_weight(learned, rng, tmp_path):
     learned.save(tmp_path / "one")
-    compressor = Compressor.of(Learned.load(tmp_path / "one").sample, Settings(coreset_size=SIZE))
+    compressor = Compressor.of(Learned.load(tmp_path / "one").sample, Settings(coreset={"size": SIZE}))
     assert compressor.sampled == learned.sample.version
     samples = [sample for seq in range(1, 30) if (sample := compressor.take(features(rng, seq)))]
     assert [sample.version for sample in samples] == [learned.sample.version + 1 + i for i in range(len(samples))]
@@ -102,7 +102,7 @@ def test_a_compressor_goes_on_from_a_sample_with_its_version_and_its_weight(lear
 
 
 def test_where_another_object_begins_nothing_of_the_one_before_is_left_but_the_versions(compressor, rng):
-    version, fresh = compressor.version, Compressor(Settings(coreset_size=SIZE))
+    version, fresh = compressor.version, Compressor(Settings(coreset={"size": SIZE}))
     stream = [features(rng, seq, begins=seq == 101) for seq in range(101, 140)]
     ours = [compressor.take(message) for message in stream]
     theirs = [fresh.take(dataclasses.replace(message, seq=message.seq - 100)) for message in stream]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import copy
 import dataclasses
 import pickle
+import re
 
 import numpy as np
 import pytest
 
 from catstream.errors import SettingsError
-from catstream.settings import PRESETS, Settings
+from catstream.settings import PRESETS, CoresetSettings, RunSettings, Settings
 
 
 @pytest.mark.parametrize("text", [b"\xff", b"coreset_size", b"x = " + b"[" * 100_000], ids=["bytes", "text", "nested"])
@@ -20,14 +21,29 @@ def test_a_file_that_is_not_toml_is_named(text, tmp_path):
         Settings.load(file=tmp_path / "set.toml", environment={})
 
 
+def grouped(name, value):
+    """Settings made of one group."""
+    group, _, short = name.partition(".")
+    return Settings(**{group: {short: value}})
+
+
+def replaced(name, value):
+    """Settings of which one group was replaced."""
+    group, _, short = name.partition(".")
+    settings = Settings()
+    return dataclasses.replace(settings, **{group: dataclasses.replace(getattr(settings, group), **{short: value})})
+
+
 #: Each way in which a program or a user gives a setting.
 WAYS = {
-    "Settings": lambda name, value: Settings(**{name: value}),
+    "Settings": grouped,
+    "replace": replaced,
     "but": lambda name, value: Settings().but({name: value}),
-    "replace": lambda name, value: dataclasses.replace(Settings(), **{name: value}),
     "of": lambda name, value: Settings.of({name: value}),
     "set": lambda name, value: Settings.load(overrides=[f"{name}={value}"], environment={}),
-    "environment": lambda name, value: Settings.load(environment={f"CATSTREAM_{name.upper()}": str(value)}),
+    "environment": lambda name, value: Settings.load(
+        environment={f"CATSTREAM_{name.upper().replace('.', '_')}": str(value)}
+    ),
 }
 
 
@@ -35,70 +51,90 @@ WAYS = {
 @pytest.mark.parametrize(
     ("name", "value", "takes"),
     [
-        ("coreset_size", "x", "int >= 2, <= 4096"),
-        ("coreset_size", 1, "int >= 2, <= 4096"),
-        ("coreset_size", 2.5, "int >= 2, <= 4096"),
-        ("scale_count", -3, "int >= 1, <= 15"),
-        ("ridge", 0, "float > 0"),
-        ("ridge", float("nan"), "float > 0"),
-        ("extent_score", float("inf"), "float"),
-        ("lockstep", 7, "bool"),
-        ("classifier", "wrong", "joint | least-squares | one-class"),
+        ("coreset.size", "x", "int >= 2, <= 4096"),
+        ("coreset.size", 1, "int >= 2, <= 4096"),
+        ("coreset.size", 2.5, "int >= 2, <= 4096"),
+        ("extent.size_count", -3, "int >= 1, <= 15"),
+        ("teaching.near_sigma", 0, "float > 0"),
+        ("teaching.near_sigma", float("nan"), "float > 0"),
+        ("belief.trust_score", float("inf"), "float"),
+        ("run.lockstep", 7, "bool"),
+        ("teaching.classifier", "wrong", "joint | least-squares | one-class"),
     ],
 )
 def test_a_value_that_does_not_fit_is_refused_with_what_the_setting_takes(way, name, value, takes):
     with pytest.raises(SettingsError) as error:
         WAYS[way](name, value)
-    shown = (repr(value), repr(str(value)), repr(float(value)) if name == "ridge" else "")
+    shown = (repr(value), repr(str(value)), repr(float(value)) if name == "teaching.near_sigma" else "")
     assert str(error.value) in [f"setting {name} cannot be {each}: it takes {takes}" for each in shown]
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_name_that_does_not_exist_is_refused_with_the_nearest_ones(way):
     with pytest.raises(SettingsError) as error:
-        WAYS[way]("corset_size", 64)
-    told = "there is no setting 'corset_size', did you mean 'coreset_size'"
-    assert str(error.value).startswith(told)
+        WAYS[way]("coreset.sice", 64)
+    assert str(error.value).startswith("there is no setting 'coreset.sice', did you mean 'coreset.size'")
     assert "`catstream settings` lists all" in str(error.value)
     assert len(str(error.value)) < 200
 
 
-def test_a_name_that_is_near_no_other_says_how_to_list_them():
+@pytest.mark.parametrize(
+    ("name", "nearest"), [("coreset_size", "coreset.size"), ("lockstep", "run.lockstep"), ("keys", "run.keys")]
+)
+def test_a_name_without_its_group_is_refused_with_the_full_name(name, nearest):
+    with pytest.raises(SettingsError, match=f"there is no setting '{name}', did you mean '{re.escape(nearest)}'"):
+        Settings.of({name: 1})
+
+
+def test_a_name_that_is_similar_to_no_other_says_how_to_list_them():
     with pytest.raises(SettingsError, match=r"there is no setting 'qqq': `catstream settings` lists all \d+$"):
         Settings(qqq=1)
 
 
-def test_what_is_given_without_a_name_is_refused():
+@pytest.mark.parametrize("make", [Settings, CoresetSettings], ids=["all", "group"])
+def test_a_value_without_a_name_is_refused(make):
     with pytest.raises(SettingsError, match="given by name, got 64"):
-        Settings(64)
+        make(64)
+
+
+def test_a_group_that_is_no_group_is_refused():
+    with pytest.raises(SettingsError, match=r"the group of settings coreset cannot be 64: give a CoresetSettings"):
+        Settings(coreset=64)
 
 
 @pytest.mark.parametrize("value", ["64", True, None, [64], np.float64(6.5)], ids=repr)
 def test_a_program_gives_values_of_their_type(value):
-    with pytest.raises(SettingsError, match="coreset_size cannot be"):
-        Settings(coreset_size=value)
+    with pytest.raises(SettingsError, match=r"coreset\.size cannot be"):
+        Settings(coreset={"size": value})
 
 
-def test_a_number_of_any_kind_is_kept_as_one_of_python():
-    settings = Settings(coreset_size=np.int64(32), ridge=np.float32(0.5), context=2)
-    assert [type(value) for value in (settings.coreset_size, settings.ridge, settings.context)] == [int, float, float]
-    assert settings == Settings(coreset_size=32, ridge=0.5, context=2.0)
+def test_a_number_of_any_kind_is_stored_as_one_of_python():
+    settings = Settings(coreset={"size": np.int64(32)}, search={"area": np.float32(2.5), "context": 2})
+    numbers = settings.coreset.size, settings.search.area, settings.search.context
+    assert [type(number) for number in numbers] == [int, float, float]
+    assert settings == Settings(coreset={"size": 32}, search={"area": 2.5, "context": 2.0})
+
+
+def test_groups_may_be_written_in_one_way_or_the_other():
+    flat, nested = {"coreset.size": 32, "run.seed": 7}, {"coreset": {"size": 32}, "run": {"seed": 7}}
+    groups = Settings(coreset=CoresetSettings(size=32), run=RunSettings(seed=7))
+    assert Settings.of(flat) == Settings.of(nested) == Settings().but(nested) == Settings(**nested) == groups
 
 
 @pytest.mark.parametrize(
     ("pair", "name", "value"),
     [
-        ("ridge=.5", "ridge", 0.5),
-        ("ridge=1e-3", "ridge", 0.001),
-        ("ridge=5.", "ridge", 5.0),
-        ("seed=007", "seed", 7),
-        ("lockstep=True", "lockstep", True),
-        ("lockstep=0", "lockstep", False),
-        ("detection = full", "detection", "full"),
+        ("search.area=.25e1", "search.area", 2.5),
+        ("teaching.near_sigma=1e-3", "teaching.near_sigma", 0.001),
+        ("search.area=5.", "search.area", 5.0),
+        ("run.seed=007", "run.seed", 7),
+        ("run.lockstep=True", "run.lockstep", True),
+        ("run.lockstep=0", "run.lockstep", False),
+        ("search.mode = full", "search.mode", "full"),
     ],
 )
 def test_a_text_is_read_as_a_person_writes_it(pair, name, value):
-    assert getattr(Settings.load(overrides=[pair], environment={}), name) == value
+    assert Settings.load(overrides=[pair], environment={}).values()[name] == value
 
 
 @pytest.mark.parametrize("preset", [None, *PRESETS])

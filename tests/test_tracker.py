@@ -49,14 +49,14 @@ def test_a_patch_is_followed(video, preset):
 
 def test_a_share_of_an_unknown_length_is_refused(video):
     with pytest.raises(SettingsError, match="for_length"):
-        follow(video, Settings(coreset_share=0.1))
+        follow(video, Settings(coreset={"share": 0.1}))
     with pytest.raises(SettingsError, match="has none"):
-        Settings(coreset_share=0.1).for_length(None)
+        Settings(coreset={"share": 0.1}).for_length(None)
 
 
 def test_scm_follows_the_object_until_n_rows_make_a_model(video):
     frames, boxes = video
-    tracker = Tracker(Settings(bootstrap="scm", coreset_size=36, copies=5))
+    tracker = Tracker(Settings(teaching={"bootstrap": "scm", "copies": 5}, coreset={"size": 36}))
     tracker.init(frames[0], boxes[0])
     states = []
     for frame, truth in zip(frames[1:], boxes[1:], strict=True):
@@ -124,20 +124,26 @@ def test_a_frame_of_another_size_is_refused(video):
 
 
 def test_settings_may_be_given_as_a_mapping():
-    assert Tracker({"coreset_size": 32}).settings == Settings(coreset_size=32)
+    assert Tracker({"coreset.size": 32}).settings == Settings(coreset={"size": 32})
 
 
 def test_trackers_in_two_threads_give_what_each_gives_alone(video):
     with ThreadPoolExecutor(2) as pool:
-        one, two = (pool.submit(follow, video, Settings(seed=seed)) for seed in (0, 1))
-    assert (one.result()[0], two.result()[0]) == (follow(video, Settings())[0], follow(video, Settings(seed=1))[0])
+        one, two = (pool.submit(follow, video, Settings(run={"seed": seed})) for seed in (0, 1))
+    assert (one.result()[0], two.result()[0]) == (
+        follow(video, Settings())[0],
+        follow(video, Settings(run={"seed": 1}))[0],
+    )
 
 
 def results(tracker, frames):
     return [(*tracker.update(frame), tracker.track) for frame in frames]
 
 
-@pytest.mark.parametrize("settings", [{}, {"bootstrap": "scm", "coreset_size": 36, "copies": 5}], ids=["copies", "scm"])
+_SCM = {"teaching.bootstrap": "scm", "coreset.size": 36, "teaching.copies": 5}
+
+
+@pytest.mark.parametrize("settings", [{}, _SCM], ids=["copies", "scm"])
 @pytest.mark.parametrize("after", [1, 4, 11], ids="after {} frames".format)
 def test_a_saved_tracker_goes_on_bit_for_bit(video, tmp_path, settings, after):
     frames, boxes = video
@@ -152,7 +158,7 @@ def test_a_saved_tracker_goes_on_bit_for_bit(video, tmp_path, settings, after):
 
 def test_a_tracker_saved_while_the_object_is_absent_finds_it_as_the_other_does(video, tmp_path):
     frames, boxes = video
-    tracker = Tracker(Settings(motion_frames=8))
+    tracker = Tracker(Settings(search={"motion_frames": 8}))
     tracker.init(frames[0], boxes[0])
     results(tracker, [*frames[1:12], *[np.zeros_like(frames[0])] * 3])
     assert tracker.track.state == "absent"

@@ -24,15 +24,15 @@ from catstream.evaluation.onepass import starts_of
 from catstream.settings import Settings
 
 #: Bootstrap -> its settings. SCM follows all n frames where each gives one row: no copies.
-BOOTSTRAPS: dict[str, dict[str, Any]] = {"copies": {}, "scm": {"bootstrap": "scm", "copies": 0}}
+BOOTSTRAPS: dict[str, dict[str, Any]] = {"copies": {}, "scm": {"teaching.bootstrap": "scm", "teaching.copies": 0}}
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    base = Settings(coreset_size=options.size)
+    base = Settings(coreset={"size": options.size})
     places = 1 if options.quick else options.starts
     pieces = [piece for found in videos(options) for piece in pieces_of(found, places, options.size)]
     options.starts = 1  # of each piece
-    runs = compared(options, pieces, {name: replace(base, **changes) for name, changes in BOOTSTRAPS.items()})
+    runs = compared(options, pieces, {name: base.but(changes) for name, changes in BOOTSTRAPS.items()})
     rows = []
     for name, found in runs.items():
         rate = sum(len(run.seconds) for run in found) / sum(float(run.seconds.sum()) for run in found)

@@ -28,10 +28,10 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     found = videos(options, "TLD_")
     recipes, sizes = {}, list(PAPER)[-1:] if options.quick else list(PAPER)
     for percent in sizes:
-        share = {"coreset_share": percent / 100}
-        copies = {"copies": int(25 // percent) - 1}
-        recipes[f"paper's, {percent} %"] = Recipe(Settings(**PRESETS["one-class-paper"] | share | copies))
-        recipes[f"ours, {percent} %"] = Recipe(Settings(**share))
+        share = {"coreset.share": percent / 100}
+        copies = {"teaching.copies": int(25 // percent) - 1}
+        recipes[f"paper's, {percent} %"] = Recipe(Settings.of(PRESETS["one-class-paper"] | share | copies))
+        recipes[f"ours, {percent} %"] = Recipe(Settings.of(share))
     runs = follow_all(options, found, recipes)
     rows = []
     for percent in sizes:

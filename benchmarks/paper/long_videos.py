@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -49,7 +48,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         sequence = named(options, name)
         path, truth = lengthened(sequence, frames)
         for n in options.sizes[:1] if options.quick else options.sizes:
-            settings = replace(base_of(options), coreset_size=n, coreset_share=0.0)
+            settings = base_of(options).but({"coreset.size": n, "coreset.share": 0.0})
             label = f"{sequence.name}, n = {n}"
             journey = journeys[label] = travel(str(path), truth[0], settings, watch=max(frames // 200, 1))
             ends = (LENGTHS * frames).astype(int)
@@ -65,7 +64,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 def base_of(options: argparse.Namespace) -> Settings:
     """All settings but n."""
-    return Settings(**PRESETS.get(options.preset, {}))
+    return Settings.of(PRESETS.get(options.preset, {}))
 
 
 def lengthened(sequence: Sequence, frames: int) -> tuple[Path, np.ndarray]:

@@ -94,7 +94,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     shares = SHARES[:1] if options.quick else SHARES
     for n in options.sizes[:1] if options.quick else options.sizes:
         recipes = {
-            f"{name}, {share}": Recipe(replace(base, coreset_size=n), tree, share)
+            f"{name}, {share}": Recipe(base.but({"coreset.size": n}), tree, share)
             for name, tree in TREES.items()
             for share in shares
         }
@@ -108,7 +108,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 def base_of(options: argparse.Namespace) -> Settings:
     """All settings but n and the tree."""
-    return Settings() if options.ours else Settings(**PRESETS["one-class-paper"])
+    return Settings() if options.ours else Settings.of(PRESETS["one-class-paper"])
 
 
 if __name__ == "__main__":

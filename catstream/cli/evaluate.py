@@ -68,7 +68,7 @@ def evaluate(
     EXAMPLES
       catstream evaluate sequences/
       catstream evaluate sequences/ --tracker catstream,csrt --jobs 4 --output results
-      catstream evaluate sequences/walk --starts 5 --set coreset_size=128
+      catstream evaluate sequences/walk --starts 5 --set coreset.size=128
     """
     # Here, so that --help and the other verbs need not wait for these.
     with interruptible():

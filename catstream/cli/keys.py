@@ -25,7 +25,7 @@ def keys() -> None:
     \b
     EXAMPLES
       catstream keys new keys
-      catstream track walk.mp4 --box 120,80,64,48 --set endpoint=tcp://0.0.0.0:5700 --set keys=keys
+      catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=tcp://0.0.0.0:5700 --set run.keys=keys
       catstream keys allow keys phone --output phone-keys
       catstream watch tracks --endpoint tcp://10.0.0.1:5700 --keys phone-keys
       catstream keys revoke keys phone
@@ -47,7 +47,7 @@ def new(folder: Path) -> None:
       catstream keys new keys
     """
     create(folder)
-    click.echo(f"made {folder}: start the pipeline with --set keys={folder}")
+    click.echo(f"made {folder}: start the pipeline with --set run.keys={folder}")
 
 
 @keys.command(name="allow")

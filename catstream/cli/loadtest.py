@@ -76,7 +76,7 @@ def loadtest(
     track of a newer one.
 
     Slow subscribers take two tracks a second, every other one is frozen
-    instead. Chaos kills by SIGKILL, the same in each run with --set seed=N.
+    instead. Chaos kills by SIGKILL, the same in each run with --set run.seed=N.
 
     \b
     LIMITS, of the worst stream

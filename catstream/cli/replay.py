@@ -73,7 +73,7 @@ def replay(
       catstream replay walk.rec --wait
       catstream replay walk.rec --endpoint run --fast
       catstream replay walk.rec --learn
-      catstream replay walk.rec --learn --set coreset_size=128 --output larger.rec
+      catstream replay walk.rec --learn --set coreset.size=128 --output larger.rec
     """
     if not learns and (pairs or output or incomplete):
         raise click.UsageError("--set, --output and --incomplete go with --learn")

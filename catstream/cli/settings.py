@@ -15,7 +15,8 @@ __all__ = ["settings"]
 def settings() -> None:
     """List all settings, with their defaults and meaning.
 
-    Set them with --set NAME=VALUE, in a TOML file (--settings FILE), or in the environment (CATSTREAM_NAME).
+    Set them with --set GROUP.NAME=VALUE, in a TOML file with a table for each group (--settings FILE), or in the
+    environment (CATSTREAM_GROUP_NAME).
     """
     table = Table("setting", "default", "takes", "meaning", box=None, pad_edge=False, header_style="bold")
     for name, takes, default, meaning in describe():

@@ -88,4 +88,4 @@ def _reach(place: Endpoint) -> int:
     """How many tracks a restarted detector repeats at most: those that may be on their way, as the run was told."""
     with Subscriber("lessons", place, only=Run) as runs:
         run = runs.receive(_RUN_SECONDS)
-    return int(run.settings["window"]) if run is not None else Settings().window
+    return int(run.settings["run.unstored_frames"]) if run is not None else Settings().run.unstored_frames

@@ -123,7 +123,7 @@ def track(
     \b
     EXAMPLES
       catstream track walk.mp4 --box 120,80,64,48 --output out --video
-      catstream track frames/ --box 120,80,64,48 --output out --set coreset_size=128
+      catstream track frames/ --box 120,80,64,48 --output out --set coreset.size=128
       catstream track walk.mp4 --box 120,80,64,48 --write tracks.parquet
       catstream track walk.mp4 --box 120,80,64,48 --write - | jq .box
       catstream track walk.mp4 --box 120,80,64,48 --save-model walker.safetensors
@@ -148,7 +148,7 @@ def track(
     pipeline = Pipeline(
         source,
         box,
-        given | ({"lockstep": True} if lockstep else {}),
+        given | ({"run.lockstep": True} if lockstep else {}),
         model=model,
         part=part,
         state=state,
@@ -167,7 +167,7 @@ def track(
         output,
         "video" in notes,
         [*_written(notes), *([STDOUT] if STDOUT in write else [])],
-        pipeline.settings.image_rate,
+        pipeline.settings.run.image_rate,
     )
     if files.video and output is None:
         raise click.UsageError("--video needs --output, the folder to write it to")
@@ -201,7 +201,9 @@ def track(
             if view is not None:
                 from catstream.web.server import Server
 
-                server = Server(pipeline.endpoint, pipeline.settings.keys, host=view.host, port=view.port, token=token)
+                server = Server(
+                    pipeline.endpoint, pipeline.settings.run.keys, host=view.host, port=view.port, token=token
+                )
                 stack.enter_context(server.beside())
                 for url in server.urls:
                     console.print(f"page: {url}", highlight=False)

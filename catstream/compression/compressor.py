@@ -44,10 +44,10 @@ class Compressor:
     """
 
     def __init__(self, settings: Settings, tree: type[CoresetTree] = CoresetTree) -> None:
-        if settings.coreset_share:
+        if settings.coreset.share:
             raise SettingsError(
-                f"coreset_share={settings.coreset_share:g} is a share of a video's length: "
-                "call Settings.for_length first, or set coreset_size"
+                f"coreset.share={settings.coreset.share:g} is a share of a video's length: "
+                "call Settings.for_length first, or set coreset.size"
             )
         self.settings = settings
         self._tree = tree
@@ -58,7 +58,7 @@ class Compressor:
 
     def _forget(self) -> None:
         """All but the stream of messages and the versions of samples, which go on."""
-        self.trees = {name: self._tree(self.settings.coreset_size) for name in _TREES}
+        self.trees = {name: self._tree(self.settings.coreset.size) for name in _TREES}
         self.centres = np.empty((0, 2))
         self._path: list[tuple[float, float]] = []
         self.box: Box | None = None
@@ -71,7 +71,7 @@ class Compressor:
         self = cls(settings)
         for name in _TREES:
             if (summary := getattr(sample, name)) is not None:
-                self.trees[name] = CoresetTree.of(summary, settings.coreset_size)
+                self.trees[name] = CoresetTree.of(summary, settings.coreset.size)
         self.last_sample, self.centres, self._sampled_leaves = sample, sample.centres, self.leaves
         return self
 
@@ -191,9 +191,9 @@ class Compressor:
             self = cls.from_state(arrays, facts, settings)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): take an older copy") from None
-        if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset_size}:
+        if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset.size}:
             raise SettingsError(
-                f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset_size}: "
+                f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset.size}: "
                 "go on with the same settings"
             )
         return self
@@ -220,7 +220,7 @@ class Compressor:
     def _follow(self, box: Box | None) -> None:
         """Centres go out in whole blocks, so that the trainer learns the motion once a block."""
         self._path.append(box.centre if box else (np.nan, np.nan))
-        if len(self._path) == self.settings.motion_frames:
+        if len(self._path) == self.settings.search.motion_frames:
             self.centres = np.array(self._path)
             self._path = []
 
@@ -229,7 +229,7 @@ class Compressor:
         if not (self.trees["object"].nodes and self.trees["background"].nodes and self.trees["loss"].nodes):
             return False
         leaves, last = self.leaves, self.last_sample
-        waited = last is not None and self.frame - last.frame >= self.settings.train_frames
+        waited = last is not None and self.frame - last.frame >= self.settings.coreset.sample_interval
         return leaves > self._sampled_leaves and (waited or leaves >= _GROWTH * self._sampled_leaves)
 
     def _sample(self) -> Sample:

@@ -27,7 +27,7 @@ def stand_in(lesson: Lesson, settings: Settings) -> Model:
     """
     background = lesson.rows[lesson.labels == 0]
     mean, background_mean = lesson.rows[lesson.labels == 1].mean(axis=0), background.mean(axis=0)
-    weights = ridge.between(background, mean - background_mean, settings.ridge)
+    weights = ridge.between(background, mean - background_mean, settings.teaching.ridge)
     contrast = float(weights @ (mean - background_mean))
     if not contrast > 0:
         raise BoxError("the object in the box looks like all that is around it: give another box, or another frame")

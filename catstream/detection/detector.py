@@ -67,7 +67,7 @@ class Detector:
 
     def prepare(self) -> None:
         """Import what `init` needs, if that takes long."""
-        if self.settings.bootstrap == "scm":
+        if self.settings.teaching.bootstrap == "scm":
             from catstream.paper import scm
 
             scm.prepare()
@@ -75,7 +75,7 @@ class Detector:
     @property
     def box(self) -> Box | None:
         """Where the object was last, in pixels; None before the first frame."""
-        return self._box.scaled(1 / self.settings.context) if self.seq and self._started else None
+        return self._box.scaled(1 / self.settings.search.context) if self.seq and self._started else None
 
     def init(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
         """Start on a box; what was followed before is forgotten.
@@ -95,8 +95,8 @@ class Detector:
         frame = Pyramid.of(image)
         # The window is wider than the object: the edge of an object tells most about where it is.
         box = Box(*map(float, box)).inside(*frame.size)
-        window, scm = box.scaled(self.settings.context), None
-        if self.settings.bootstrap == "scm":
+        window, scm = box.scaled(self.settings.search.context), None
+        if self.settings.teaching.bootstrap == "scm":
             from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
             scm = SparseCollaborativeModel(image, box, self._random())
@@ -116,8 +116,8 @@ class Detector:
     def seek(self, model: Model, box: Box) -> None:
         """Start with a model: the object is absent until it is found, in whichever frame and size that is.
 
-        It is found at the window that scores `sighting_lead` higher than the rest of the frame, in
-        `sighting_frames` frames in a row: of two objects that look alike, neither.
+        It is found at the window that scores `belief.sighting_lead` higher than the rest of the frame, in
+        `belief.sighting_frames` frames in a row: of two objects that look alike, neither.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class Detector:
                 f"the model has {len(model.weights)} weights, the features of a window are {row_length()}: "
                 "learn it anew with this catstream"
             )
-        self._box = self._sure_box = box.scaled(self.settings.context)
+        self._box = self._sure_box = box.scaled(self.settings.search.context)
         self.state, self._started = "absent", True
         self.adopt(model)
 
@@ -146,7 +146,7 @@ class Detector:
             As `init` does.
         """
         frame = Pyramid.of(image)
-        self._box = self._sure_box = Box(*map(float, box)).inside(*frame.size).scaled(self.settings.context)
+        self._box = self._sure_box = Box(*map(float, box)).inside(*frame.size).scaled(self.settings.search.context)
         self.seq, self.state = self.seq + 1, "present"
         self._elsewhere, self._first_box = False, self._first_box or self._box
         self._balance = Balance()  # this box says anew where in it the colours lie
@@ -214,8 +214,8 @@ class Detector:
 
     def state_at(self, box: Box, first: Box) -> DetectorState:
         """Where nothing is known but where the object was last, and in its first frame."""
-        window = box.scaled(self.settings.context)
-        return DetectorState("present", window, window, first.scaled(self.settings.context), 0.0, False)
+        window = box.scaled(self.settings.search.context)
+        return DetectorState("present", window, window, first.scaled(self.settings.search.context), 0.0, False)
 
     def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
         """Find the object in the next frame."""
@@ -228,15 +228,15 @@ class Detector:
         frame = Pyramid.of(image)
         if self._scm is not None:
             score, box = self._scm.step(image)  # it has no word for absent
-            self._box = box.scaled(settings.context).held_in(*frame.size)
+            self._box = box.scaled(settings.search.context).held_in(*frame.size)
             return self._answer(time, score, self._lesson(frame, Found(score, self._box)))
         found = self._find(frame) if self._first_box else self._seek(frame)
-        self._elsewhere &= found.score < settings.trust_score
+        self._elsewhere &= found.score < settings.belief.trust_score
         there = self._first_box is not None and self._there(found.score)
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
             self._box = self._balanced(extent.followed(self._box, found, settings), found).held_in(*frame.size)
-            if found.score >= settings.sure_score:
+            if found.score >= settings.belief.confident_score:
                 self._sure_box = self._box
         else:
             self.state = "absent"
@@ -248,9 +248,9 @@ class Detector:
         """Whether the best score in a frame is the object's: high enough, also for what this one usually scores."""
         settings = self.settings
         if self.state == "absent":
-            there = score >= max(settings.return_score, settings.return_share * self._usual_score)
+            there = score >= max(settings.belief.return_score, settings.belief.return_share * self._usual_score)
         else:
-            there = score >= max(settings.present_score, settings.present_share * self._usual_score)
+            there = score >= max(settings.belief.present_score, settings.belief.present_share * self._usual_score)
         if there:
             self._usual_score += _USUAL_RATE * (score - self._usual_score)
         return there
@@ -258,24 +258,24 @@ class Detector:
     def _balanced(self, box: Box, found: Found) -> Box:
         """The box, drawn after the object's colours if it crept off them."""
         settings = self.settings
-        if found.around is None or self._elsewhere or found.score < settings.extent_score:
+        if found.around is None or self._elsewhere or found.score < settings.belief.extent_score:
             return box
-        return self._balance.drawn(box, found.around, self.model.weights[COLOURS], settings.balance_slack)
+        return self._balance.drawn(box, found.around, self.model.weights[COLOURS], settings.extent.colour_slack)
 
     def _find(self, frame: Pyramid) -> Found:
         settings = self.settings
         surely = self._sure_box.centred(*self._box.centre)  # as large as it surely was
-        if settings.detection == "full":
+        if settings.search.mode == "full":
             doubtful = self._elsewhere or self.state == "absent"
             found = self._fitted(frame, search.whole(frame, surely if doubtful else self._box, self.model, settings))
             self._elsewhere |= not found.box.overlap(self._box)
             return found
         found = self._fitted(frame, search.local(frame, self._box, self.model, settings))
-        lost = found.score < settings.lost_score
-        unsure = found.score < settings.sure_score or self._elsewhere
-        if lost or (unsure and self.seq % settings.whole_frames == 0):
+        lost = found.score < settings.belief.lost_score
+        unsure = found.score < settings.belief.confident_score or self._elsewhere
+        if lost or (unsure and self.seq % settings.search.whole_interval == 0):
             other = search.whole(frame, surely, self.model, settings)
-            if other.score > settings.return_score and other.score > found.score + settings.jump_margin:
+            if other.score > settings.belief.return_score and other.score > found.score + settings.belief.jump_margin:
                 other = self._fitted(frame, search.local(frame, other.box, self.model, settings))
                 if other.score > found.score:
                     self._elsewhere = True
@@ -291,13 +291,13 @@ class Detector:
         settings = self.settings
         third = _SOUGHT_FACTORS[self.seq % 3 :: 3]
         found, lead = search.sought(frame, self._box, third, self.model, settings)
-        if self._sightings or found.score >= settings.return_score:
+        if self._sightings or found.score >= settings.belief.return_score:
             found, lead = search.sought(frame, self._box, _SOUGHT_FACTORS, self.model, settings)
-        seen = found.score >= settings.return_score and lead >= settings.sighting_lead
+        seen = found.score >= settings.belief.return_score and lead >= settings.belief.sighting_lead
         again = self._sightings and found.box.overlap(self._sure_box) > _AGAIN_OVERLAP
         self._sightings = (self._sightings + 1 if again else 1) if seen else 0
         self._sure_box = found.box
-        if self._sightings < settings.sighting_frames:
+        if self._sightings < settings.belief.sighting_frames:
             return found
         self._box = self._first_box = found.box
         self._elsewhere = True
@@ -309,18 +309,18 @@ class Detector:
 
     def _lesson(self, frame: Pyramid, found: Found) -> Lesson:
         settings = self.settings
-        if found.score < settings.teach_score or self._elsewhere:
+        if found.score < settings.belief.teach_score or self._elsewhere:
             return Lesson.none()
         lesson = lessons.near(frame, self._box, self.model, self._random(), settings, found.around)
-        if self.seq % settings.extent_frames == 0:
+        if self.seq % settings.extent.interval == 0:
             lesson = lessons.with_extents(lesson, frame, self._box, settings)
-        if found.score > settings.mine_score and self.seq % settings.mine_frames == 0:
+        if found.score > settings.belief.mine_score and self.seq % settings.teaching.mining_interval == 0:
             lesson += lessons.far(frame, self._box, self.model, settings)
         return lesson
 
     def _random(self) -> np.random.Generator:
         """A fresh generator for each frame: what a frame teaches does not depend on the ones before."""
-        return np.random.default_rng((self.settings.seed, self.seq))
+        return np.random.default_rng((self.settings.run.seed, self.seq))
 
     def _answer(self, time: float, score: float, lesson: Lesson, *, begins: bool = False) -> tuple[Track, Features]:
         seq, frame = self.seq, self.seq - 1

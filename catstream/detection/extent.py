@@ -40,10 +40,10 @@ def fitted(frame: Pyramid, box: Box, first: Box, model: Model, settings: Setting
         place = search.highest(scored.scores)
         score = float(scored.scores[place])
         found[step] = Found(score, scored.box(*scored.refined(*place)))
-        fit = 0.0 if model.extent is None else settings.extent_weight * float(scored.row(1, 1) @ model.extent)
-        return score + fit - _cost(step * math.log(1 + settings.scale_step), now, settings)
+        fit = 0.0 if model.extent is None else settings.extent.weight * float(scored.row(1, 1) @ model.extent)
+        return score + fit - _cost(step * math.log(1 + settings.extent.size_step), now, settings)
 
-    step, beside = _climbed(value, settings.scale_count // 2)
+    step, beside = _climbed(value, settings.extent.size_count // 2)
     best = Found(found[step].score, found[step].box.scaled(_size(beside, settings)))
     return best if model.extent is None else _widened(frame, best, first, model, settings)
 
@@ -54,10 +54,10 @@ def _widened(frame: Pyramid, found: Found, first: Box, model: Model, settings: S
 
     def value(step: int) -> float:
         scored = search.scored_around(frame, found.box.scaled(*_stretch(step, settings)), WINDOW, model)
-        fit = settings.extent_weight * float(scored.row(0, 0) @ model.extent)
-        return float(scored.scores[0, 0]) + fit - _cost(step * math.log(1 + settings.aspect_step), now, settings)
+        fit = settings.extent.weight * float(scored.row(0, 0) @ model.extent)
+        return float(scored.scores[0, 0]) + fit - _cost(step * math.log(1 + settings.extent.aspect_step), now, settings)
 
-    step, beside = _climbed(value, settings.aspect_count // 2)
+    step, beside = _climbed(value, settings.extent.aspect_count // 2)
     return Found(found.score, found.box.scaled(*_stretch(step + beside, settings)))
 
 
@@ -87,10 +87,10 @@ def followed(before: Box, found: Found, settings: Settings) -> Box:
     growth = math.sqrt(found.box.area / before.area)
     if not 1 / _GROWTH < growth < _GROWTH:
         return found.box
-    if found.score < settings.extent_score:
+    if found.score < settings.belief.extent_score:
         return before.centred(*found.box.centre)
-    size = growth**settings.scale_rate
-    stretch = math.sqrt(found.box.w / found.box.h * before.h / before.w) ** settings.aspect_rate
+    size = growth**settings.extent.size_rate
+    stretch = math.sqrt(found.box.w / found.box.h * before.h / before.w) ** settings.extent.aspect_rate
     return before.scaled(size * stretch, size / stretch).centred(*found.box.centre)
 
 
@@ -105,18 +105,18 @@ def cuts(frame: Pyramid, box: Box, own: np.ndarray, settings: Settings) -> tuple
     -------
     feature rows, and 1 for a cut as it is, exp(-k^2 / 2 sigma^2) for one k steps off
     """
-    if not settings.extent_weight:
+    if not settings.extent.weight:
         return [], []
-    trials = [(k, box.scaled(_size(k, settings))) for k in _steps(settings.scale_count) if k]
-    trials += [(k, box.scaled(*_stretch(k, settings))) for k in _steps(settings.aspect_count) if k]
+    trials = [(k, box.scaled(_size(k, settings))) for k in _steps(settings.extent.size_count) if k]
+    trials += [(k, box.scaled(*_stretch(k, settings))) for k in _steps(settings.extent.aspect_count) if k]
     rows = [windows.around(frame, trial, WINDOW)[0].row(0, 0) for _, trial in trials]
-    fits = [math.exp(-((k / settings.extent_sigma) ** 2) / 2) for k, _ in trials]
+    fits = [math.exp(-((k / settings.extent.sigma) ** 2) / 2) for k, _ in trials]
     return [own, *rows], [1.0, *fits]
 
 
 def _cost(change: float, now: float, settings: Settings) -> float:
     """What a change of a logarithm costs, where it is off by `now` already."""
-    return settings.extent_penalty * abs(change) + settings.extent_prior * (change + now) ** 2
+    return settings.extent.penalty * abs(change) + settings.extent.prior * (change + now) ** 2
 
 
 def _steps(count: int) -> range:
@@ -126,10 +126,10 @@ def _steps(count: int) -> range:
 
 def _size(step: float, settings: Settings) -> float:
     """Factor of both sides."""
-    return (1 + settings.scale_step) ** step
+    return (1 + settings.extent.size_step) ** step
 
 
 def _stretch(step: float, settings: Settings) -> tuple[float, float]:
     """Factors of width and height: of another aspect, and the same area."""
-    root = (1 + settings.aspect_step) ** (step / 2)
+    root = (1 + settings.extent.aspect_step) ** (step / 2)
     return root, 1 / root

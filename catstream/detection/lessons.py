@@ -60,16 +60,16 @@ class Lesson:
 
     def seen(self, settings: Settings) -> Lesson:
         """These, or without the histograms of colours: what no row tells of, no model weighs."""
-        if not settings.colours:
+        if not settings.teaching.colours:
             self.rows[:, COLOURS] = self.extents[:, COLOURS] = 0
         return self
 
 
 def first(frame: Pyramid, box: Box, rng: np.random.Generator, settings: Settings) -> Lesson:
     """What the first frame teaches: n affine copies of the box and n windows around it, a leaf of each tree."""
-    count, context, moved = settings.coreset_size, settings.context, settings.other_backgrounds
+    count, context, moved = settings.coreset.size, settings.search.context, settings.teaching.other_backgrounds
     copies = affine.copies(frame, box, count, rng, context=context, moved=moved)
-    lesson = Lesson.of(list(copies), 1, settings.object_weight)
+    lesson = Lesson.of(list(copies), 1, settings.teaching.object_weight)
     lesson += _around(_unscored(frame, box), box, count, 0, rng, settings)
     return with_extents(lesson.seen(settings), frame, box, settings)
 
@@ -90,9 +90,9 @@ def near(
     around : cells that hold the object, if a search has left some: near misses and background are taken from these,
         where they are enough
     """
-    own = list(affine.copies(frame, box, 1 + settings.copies, rng, mirrored=settings.mirrored))
-    lesson = Lesson.of(own, 1, settings.object_weight / len(own))
-    count, hardest = settings.near_negatives, settings.near_negatives // 2
+    own = list(affine.copies(frame, box, 1 + settings.teaching.copies, rng, mirrored=settings.teaching.mirrored))
+    lesson = Lesson.of(own, 1, settings.teaching.object_weight / len(own))
+    count, hardest = settings.teaching.near_negatives, settings.teaching.near_negatives // 2
     if model is None:
         around, hardest = _unscored(frame, box), 0
     elif around is None or min(around.cells.shape) < _CELLS:
@@ -103,9 +103,9 @@ def near(
 def far(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Lesson:
     """Hard negatives: the windows of the whole frame that look most like the object and are not it."""
     scored = search.scored_whole(frame, box, model)
-    places = windows.peaks(scored.scores, settings.far_negatives + 1, WINDOW // 2)
+    places = windows.peaks(scored.scores, settings.teaching.hard_negatives + 1, WINDOW // 2)
     rows = [scored.row(*place) for place in places if scored.box(*place).overlap(box) < 0.2]
-    return Lesson.of(rows[: settings.far_negatives], 0).seen(settings)
+    return Lesson.of(rows[: settings.teaching.hard_negatives], 0).seen(settings)
 
 
 def with_extents(lesson: Lesson, frame: Pyramid, box: Box, settings: Settings) -> Lesson:
@@ -131,11 +131,11 @@ def _around(scored: Scored, box: Box, count: int, hardest: int, rng: np.random.G
     outside = np.maximum(abs(down), abs(across)) > _NEAR + 0.5
     misses, labels = [], []
     near = np.argwhere(~outside)
-    for place in near[rng.integers(len(near), size=settings.near_misses)] if len(near) else ():
+    for place in near[rng.integers(len(near), size=settings.teaching.near_misses)] if len(near) else ():
         distance = math.hypot(down[place[0], 0], across[place[1]])
         if distance > _NEAREST:
             misses.append(scored.row(*place))
-            labels.append(math.exp(-((distance / settings.near_sigma) ** 2) / 2))
+            labels.append(math.exp(-((distance / settings.teaching.near_sigma) ** 2) / 2))
     places = windows.peaks(np.where(outside, scored.scores, -np.inf), hardest, _NEAR)
     anywhere = np.argwhere(outside)
     places += list(map(tuple, rng.choice(anywhere, count - len(places), replace=count > len(anywhere))))

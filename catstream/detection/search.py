@@ -41,10 +41,10 @@ def local(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
 
     Distance costs a little of the score, so that of two equal windows the nearer wins.
     """
-    cells = WINDOW + 2 * round((settings.search_area - 1) * WINDOW / 2)
+    cells = WINDOW + 2 * round((settings.search.area - 1) * WINDOW / 2)
     scored = scored_around(frame, box, cells, model)
     away = (np.arange(cells - WINDOW + 1) - (cells - WINDOW) // 2) / WINDOW
-    place = highest(scored.scores - settings.distance_penalty * (away[:, None] ** 2 + away**2))
+    place = highest(scored.scores - settings.search.distance_penalty * (away[:, None] ** 2 + away**2))
     return Found(float(scored.scores[place]), scored.box(*scored.refined(*place)), scored)
 
 
@@ -55,7 +55,7 @@ def whole(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
         scored = scored_whole(frame, box.scaled(factor), model)
         place = highest(scored.scores)
         score = float(scored.scores[place])
-        worth = score - settings.extent_penalty * abs(np.log(factor))
+        worth = score - settings.extent.penalty * abs(np.log(factor))
         if worth > least:
             least = worth
             best = Found(score, scored.box(*scored.refined(*place)))
@@ -75,7 +75,7 @@ def sought(
     factors : the sizes, as factors of that of the box
     """
     sizes = [scored_whole(frame, box.scaled(factor), model) for factor in factors]
-    costs = [settings.extent_penalty * abs(np.log(factor)) for factor in factors]
+    costs = [settings.extent.penalty * abs(np.log(factor)) for factor in factors]
     worths = [float(scored.scores.max()) - cost for scored, cost in zip(sizes, costs, strict=True)]
     best = sizes[int(np.argmax(worths))]
     place = highest(best.scores)

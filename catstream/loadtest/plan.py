@@ -48,9 +48,9 @@ class Plan:
             raise SettingsError(
                 f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: give a higher rate or more seconds"
             )
-        if self.settings.lockstep:
+        if self.settings.run.lockstep:
             raise SettingsError("the frames of a load test do not wait: leave lockstep away")
-        if self.settings.endpoint:
+        if self.settings.run.endpoint:
             raise SettingsError("each stream of a load test meets in a folder of its own: leave endpoint away")
 
     def __str__(self) -> str:

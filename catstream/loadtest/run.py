@@ -126,12 +126,16 @@ def run(plan: Plan, camera: Camera, tell: Callable[[News], None] = lambda _: Non
             stream.start()
         stack.callback(_ask_to_stop, streams)
         _until(lambda: all(stream.ready.is_set() for stream in streams), streams, "starting processes", tell)
-        observer = Observer([stream.endpoint for stream in streams], plan.settings.keys)
+        observer = Observer([stream.endpoint for stream in streams], plan.settings.run.keys)
         observer.start()
         stack.callback(observer.end)
         _until(lambda: all(seen.warm for seen in observer.seen), streams, "learning the first models", tell)
         gather = partial(
-            Crowd, readers=plan.subscribers, slow=plan.slow - plan.frozen, frozen=plan.frozen, keys=plan.settings.keys
+            Crowd,
+            readers=plan.subscribers,
+            slow=plan.slow - plan.frozen,
+            frozen=plan.frozen,
+            keys=plan.settings.run.keys,
         )
         crowds = [stack.enter_context(gather(stream.endpoint)) for stream in streams]
         _until(lambda: all(crowd.attached for crowd in crowds), streams, "attaching subscribers", tell)
@@ -185,7 +189,7 @@ class _Watch:
     ) -> None:
         self._plan, self._camera, self._streams, self._crowds = plan, camera, streams, crowds
         self._seen = observer.seen
-        self._chaos = Chaos(plan.settings.seed) if plan.chaos else None
+        self._chaos = Chaos(plan.settings.run.seed) if plan.chaos else None
         self._looked = 0.0
         self.usage = Usage()
 

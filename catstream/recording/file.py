@@ -48,7 +48,7 @@ _ANY_OPENING = re.compile(b"|".join(map(re.escape, _OPENINGS)))
 
 def run_of(settings: Settings) -> Run:
     """What a pipeline of this catstream runs with."""
-    own = ("endpoint", "keys")  # of one machine, and of no meaning to others
+    own = ("run.endpoint", "run.keys")  # of one machine, and of no meaning to others
     return Run(version("catstream"), {name: text for name, text in settings.texts().items() if name not in own})
 
 

@@ -49,21 +49,21 @@ class Trainer:
             # What the score says of a cut already is taken off: the two are added up where size and aspect are chosen.
             rows = sample.extent.rows.copy()
             rows[:, -1] -= rows[:, :-2] @ weights
-            extent = ridge.fit(rows, self.settings.extent_ridge)
+            extent = ridge.fit(rows, self.settings.teaching.extent_ridge)
         return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), motion, extent)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
-        if settings.classifier == "one-class":
+        if settings.teaching.classifier == "one-class":
             return [one_class(sample.object.rows, sample.background.mean)]
-        if settings.classifier == "least-squares":
+        if settings.teaching.classifier == "least-squares":
             return [_between(sample, settings)]
-        return [_between(sample, settings), ridge.fit(sample.loss.rows, settings.loss_ridge)]
+        return [_between(sample, settings), ridge.fit(sample.loss.rows, settings.teaching.loss_ridge)]
 
 
 def _between(sample: Sample, settings: Settings) -> np.ndarray:
     """Least squares of the two trees: its contrast is positive wherever the means differ."""
-    return ridge.between(sample.background.rows, sample.object.mean - sample.background.mean, settings.ridge)
+    return ridge.between(sample.background.rows, sample.object.mean - sample.background.mean, settings.teaching.ridge)
 
 
 def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | None:

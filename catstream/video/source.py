@@ -16,7 +16,7 @@ What the text may be:
 
 Files and images are read to their last frame and none is skipped. If a file is
 damaged, its good frames come first and then a `VideoError`; with
-`skip_damaged` it is read on after the damaged place. Cameras and streams are
+`run.skip_damaged` it is read on after the damaged place. Cameras and streams are
 live: see `catstream.video.live`.
 """
 

@@ -73,7 +73,7 @@ class Endpoint:
             Where one is not what it should be, or others can reach the host and there are no keys.
         """
         if not text:
-            raise ServiceError("this process was not told where to meet the others: --set endpoint=FOLDER")
+            raise ServiceError("this process was not told where to meet the others: --set run.endpoint=FOLDER")
         known = Keys.load(keys) if keys else None
         if text.startswith("tcp://"):
             return cls._tcp(text, known)
@@ -97,7 +97,7 @@ class Endpoint:
         elif keys is None and not all(map(_is_loopback, map(_plain, [first, *named.values()]))):
             raise ServiceError(
                 f"{text} can be reached from other machines, and nothing on it asks who is there: make keys "
-                "(catstream keys new DIR) and give them to all (--set keys=DIR), or give a folder or "
+                "(catstream keys new DIR) and give them to all (--set run.keys=DIR), or give a folder or "
                 "tcp://127.0.0.1:PORT"
             )
         if not (port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
@@ -225,7 +225,7 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "") ->
         if not lock(handle):
             raise ServiceError(
                 f"a pipeline is already running on {text!r}: "
-                "wait for it, or give another folder (--set endpoint=FOLDER)"
+                "wait for it, or give another folder (--set run.endpoint=FOLDER)"
             )
         try:
             endpoint = Endpoint.parse(str(folder), keys)

@@ -44,7 +44,7 @@ _HELLO = b""
 _PATIENCE = 0.2  # seconds of silence after which a sender asks where the receiver is, a publisher says it once more
 _LINGER = 2000  # milliseconds that a closed socket still has for its last messages
 _NEWEST = 8  # messages of a burst that are on their way at once where only the newest counts
-_SAMPLES = 65536  # that a sender remembers, at most one a message: as many as `lag_frames` may be
+_SAMPLES = 65536  # that a sender remembers, at most one a message: as many as `run.lag_frames` may be
 _COMMANDS = 64  # that wait, or were answered last, and that are taken in at once
 _CHANGES = 1000  # readers that come or go, taken in at once
 _LONGEST_WISH = 4096  # bytes of what a reader says: who it is, and what it subscribes to
@@ -107,7 +107,7 @@ class _Socket:
             self.close()
             raise ServiceError(
                 f"cannot listen on {address} ({error.strerror}): another pipeline may be running there, "
-                "wait for it or give another endpoint (--set endpoint=...)"
+                "wait for it or give another endpoint (--set run.endpoint=...)"
             ) from None
         except ServiceError:
             self.close()

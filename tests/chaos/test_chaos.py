@@ -37,7 +37,7 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(video, calm, tmp_path):
 def assert_same(video, calm, faults):
     """One run through the faults stores what it sent, and learns what the tracker learned."""
     path, boxes = video
-    run = chaos.endure(path, boxes[0], Settings(lockstep=True), faults)
+    run = chaos.endure(path, boxes[0], Settings(run={"lockstep": True}), faults)
     assert run.totals == {"sent": len(boxes), "stored": len(boxes)}
     assert chaos.identical(run, calm)
 

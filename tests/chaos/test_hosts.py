@@ -38,7 +38,14 @@ def start(video, hosts, tmp_path):
     allow(tmp_path / "keys", "viewer", "watch", output=tmp_path / "viewer")
     first, *others = (f"{name}={hosts.addresses[name]}" for name in NAMES)
     endpoint = f"tcp://{','.join([first.partition('=')[2], *others])}:5700"
-    common = ["--set", f"endpoint={endpoint}", "--set", "lockstep=true", "--set", f"keys={tmp_path / 'keys'}"]
+    common = [
+        "--set",
+        f"run.endpoint={endpoint}",
+        "--set",
+        "run.lockstep=true",
+        "--set",
+        f"run.keys={tmp_path / 'keys'}",
+    ]
     own = {
         "compressor": ["--state", tmp_path / "state"],
         "trainer": [],
@@ -85,7 +92,7 @@ def test_a_host_that_loses_its_power_and_comes_back_costs_nothing(video, calm, h
 def reached(state, seq):
     """The last checkpoint, where there is one of a message after `seq`."""
     try:
-        compressor = chaos.learned(state, Settings(lockstep=True))
+        compressor = chaos.learned(state, Settings(run={"lockstep": True}))
     except (CatstreamError, OSError, ValueError):
         return None
     return compressor if compressor.seq > seq else None

@@ -49,7 +49,7 @@ def test_a_run_counts_every_frame_and_says_which_limit_was_broken(said, tmp_path
         (["--rate", 0], "0.5<=x<=1000"),
         (["--json", "missing/x.json"], "its folder does not exist"),
         (["--output", "/dev/null/load"], "give another folder"),
-        (["--set", "lockstep=true"], "leave lockstep away"),
+        (["--set", "run.lockstep=true"], "leave lockstep away"),
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_starts(said, tmp_path, arguments, message):

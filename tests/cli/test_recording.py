@@ -35,16 +35,16 @@ def test_a_run_that_is_recorded_says_what_is_in_the_file(whole_run):
 
 def test_the_learning_is_replayed_and_compared_with_other_settings(recorded, said, tmp_path):
     code, output, errors = said(
-        "replay", recorded, "--learn", "--set", "coreset_size=32", "--output", tmp_path / "smaller.rec"
+        "replay", recorded, "--learn", "--set", "coreset.size=32", "--output", tmp_path / "smaller.rec"
     )
     assert code == 0, errors
     models = Recording(recorded).counts[Model]
     rows = {line.split("  ")[0]: line.split() for line in output.splitlines()}
     assert rows["the same"][3:6] == [str(models), "of", str(models)]
-    assert rows["coreset_size=32"][2:5] == ["0", "of", str(models)]
+    assert rows["coreset.size=32"][2:5] == ["0", "of", str(models)]
     smaller = Recording(tmp_path / "smaller.rec")
-    assert smaller.settings.coreset_size == 32
-    assert str(smaller.counts[Model]) == rows["coreset_size=32"][1]
+    assert smaller.settings.coreset.size == 32
+    assert str(smaller.counts[Model]) == rows["coreset.size=32"][1]
 
 
 def test_a_model_that_does_not_come_out_again_is_an_error(recorded, said, tmp_path):
@@ -88,7 +88,10 @@ def test_a_recording_is_watched_like_a_pipeline(recorded, catstream, tmp_path):
 
 def test_what_a_pipeline_says_is_recorded_from_outside(video, catstream, tmp_path):
     source, box = video
-    settings, paths = Settings(window=1, endpoint=str(tmp_path)), [tmp_path / "whole.rec", tmp_path / "stopped.rec"]
+    settings, paths = (
+        Settings(run={"unstored_frames": 1, "endpoint": str(tmp_path)}),
+        [tmp_path / "whole.rec", tmp_path / "stopped.rec"],
+    )
     with Pipeline(source, [float(side) for side in box.split(",")], settings) as pipeline:
         tracks = iter(pipeline)
         next(tracks)
@@ -101,7 +104,7 @@ def test_what_a_pipeline_says_is_recorded_from_outside(video, catstream, tmp_pat
     for path, recorder, errors, stopped in zip(paths, recorders, told, (False, True), strict=True):
         assert recorder.returncode == 0, errors
         recording = Recording(path)
-        assert recording.settings.window == 1
+        assert recording.settings.run.unstored_frames == 1
         assert recording.counts[Features]
         assert recording.counts[Track]
         assert (recording.end is None) == stopped

@@ -23,7 +23,7 @@ FILES = ["tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet"]
 def test_tracks_go_to_files_and_stay_there(video, catstream, tmp_path):
     source, box = video
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    with Pipeline(source, [float(side) for side in box.split(",")], Settings(window=1)) as pipeline:
+    with Pipeline(source, [float(side) for side in box.split(",")], Settings(run={"unstored_frames": 1})) as pipeline:
         sinks = {}
         for folder in (whole, stopped):
             folder.mkdir()
@@ -70,7 +70,7 @@ def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the
     with (
         Publisher("health", endpoint, "detector") as health,
         Publisher("tracks", endpoint) as tracks,
-        Publisher("lessons", endpoint, greeting=run_of(Settings(window=100))) as lessons,
+        Publisher("lessons", endpoint, greeting=run_of(Settings(run={"unstored_frames": 100}))) as lessons,
     ):
         sink = catstream("sink", file, "--endpoint", folder)
         until(file.exists, lambda: health.send(Health("detector", time.time())))

@@ -45,7 +45,7 @@ def rows(folder):
 
 def test_a_run_without_a_box_is_shown_the_object_and_goes_on_when_it_may(video, catstream, steer, state, tmp_path):
     source, box = video
-    run = catstream("track", source, "--output", tmp_path / "out", "--set", f"endpoint={tmp_path / 'run'}")
+    run = catstream("track", source, "--output", tmp_path / "out", "--set", f"run.endpoint={tmp_path / 'run'}")
     assert steer("pause") == (0, "paused before the first frame")
     assert state() == "waiting for a box"
     assert steer("set-box", "400,10,20,20")[0] == 1
@@ -69,7 +69,7 @@ def test_what_a_run_has_saved_finds_the_object_in_another(video, catstream, said
     with open_source(source) as film:
         image = next(film).image
     url = camera(lambda _: image).url
-    run = catstream("track", url, "--box", box, "--set", f"endpoint={tmp_path / 'run'}")
+    run = catstream("track", url, "--box", box, "--set", f"run.endpoint={tmp_path / 'run'}")
 
     def saved():
         code, answer = steer("save", tmp_path / "one")

@@ -83,7 +83,9 @@ def test_a_stopped_run_keeps_its_results(video, catstream, until, tmp_path, numb
     source, box = video
     # A window of one: the video cannot be over before the signal comes.
     more = ["--write", tmp_path / "t.parquet", "--write", tmp_path / "t.json", "--save-model", tmp_path / "model"]
-    process = catstream("track", source, "--box", box, "--output", tmp_path, *more, "--set", "window=1", "--lockstep")
+    process = catstream(
+        "track", source, "--box", box, "--output", tmp_path, *more, "--set", "run.unstored_frames=1", "--lockstep"
+    )
     children = started(process, tmp_path / "demo.txt")
     until(lambda: len((tmp_path / "demo.txt").read_text().splitlines()) > 8)
     process.send_signal(number)
@@ -159,11 +161,11 @@ REFUSED = {
     "a box without size": (["--box", "10,10,0,20"], "10,10,0,20|width|area"),
     "a box of NaN": (["--box", "10,nan,20,20"], "nan|number"),
     "a box of three numbers": (["--box", "10,10,20"], "x,y,w,h"),
-    "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset_size'"),
-    "a value that does not fit": (["--set", "coreset_size=x"], "coreset_size cannot be 'x'"),
+    "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset.size'"),
+    "a value that does not fit": (["--set", "coreset.size=x"], "coreset.size cannot be 'x'"),
     "a preset that does not exist": (["--preset", "cat11"], "cat11"),
     "a settings file that is not there": (["--settings", "none.toml"], "cannot read the settings file"),
-    "an endpoint on the network": (["--set", "endpoint=tcp://0.0.0.0:5700"], "other machines"),
+    "an endpoint on the network": (["--set", "run.endpoint=tcp://0.0.0.0:5700"], "other machines"),
 }
 
 
@@ -203,7 +205,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_one_line(video, said, tmp_path, fi
 
 def test_a_second_start_at_the_same_place_and_under_nohup_a_lost_terminal_end_nothing(video, catstream, said, tmp_path):
     source, box = video
-    place, slowly = ["--set", f"endpoint={tmp_path / 'run'}"], ["--set", "window=1", "--lockstep"]
+    place, slowly = ["--set", f"run.endpoint={tmp_path / 'run'}"], ["--set", "run.unstored_frames=1", "--lockstep"]
     nohup = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN)
     results = ["--output", tmp_path / "one", "--video"]
     first = catstream("track", source, "--box", box, *results, *slowly, *place, preexec_fn=nohup)

@@ -88,7 +88,7 @@ def following(catstream, story, tmp_path):
         output, place = tmp_path / "out", tmp_path / "run"
         with subscribe(str(place), "health", timeout=60) as health:
             box = ",".join(map(str, story[0][1]))
-            command = ("track", url, "--box", box, "--output", output, "--set", f"endpoint={place}")
+            command = ("track", url, "--box", box, "--output", output, "--set", f"run.endpoint={place}")
             yield Run(catstream(*command), output, health)
 
     return start

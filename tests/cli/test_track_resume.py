@@ -20,7 +20,7 @@ from catstream.settings import Settings
 from catstream.state import TREES, Origin
 from catstream.video.source import open_source
 
-OFTEN = ["--set", "checkpoint_seconds=0.05", "--lockstep"]
+OFTEN = ["--set", "run.checkpoint_seconds=0.05", "--lockstep"]
 RESULTS = ["demo.txt", "demo_confidence.value", "demo.csv"]
 
 
@@ -120,7 +120,7 @@ def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, 
     kept, out, (source, box) = killed / "kept", killed / "out", video
     refusals = {
         "go on with it": ["track", source, "--box", box, "--state", kept],
-        "learned with coreset_size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset_size=32"],
+        "learned with coreset.size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset.size=32"],
         "frames 3::": ["track", "--resume", kept, "--start", "3"],
         "no pipeline was kept": ["track", "--resume", tmp_path / "none"],
         "give one of them": ["track", "--resume", kept, "--state", kept],
@@ -130,7 +130,7 @@ def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, 
         code, _, errors = said(*command)
         assert code in (1, 2), errors
         assert word in errors.replace("\n", " ")
-    running = catstream("track", "--resume", kept, "--set", "window=1", *OFTEN)
+    running = catstream("track", "--resume", kept, "--set", "run.unstored_frames=1", *OFTEN)
     rows = len(frames(out))
     while len(frames(out)) == rows and running.poll() is None:
         time.sleep(0.01)
@@ -145,15 +145,28 @@ def test_settings_that_are_given_again_change_and_all_others_are_kept(video, sai
     monkeypatch.setattr(Pipeline, "__iter__", lambda _: iter(()))  # kept when it starts: no frame has to be followed
     (source, box), kept = video, tmp_path / "kept"
     assert said("track", source, "--box", box, "--state", kept, *OFTEN)[0] == 0
-    (tmp_path / "mine.toml").write_text("window = 99\nlag_frames = 7\n")
+    (tmp_path / "mine.toml").write_text("[run]\nunstored_frames = 99\nlag_frames = 7\n")
     given = {
-        ("--set", "window=512"): ["lockstep=true", "window=512", "checkpoint_seconds=0.05"],
-        ("--set", "window=256", "--set", "lockstep=false"): ["checkpoint_seconds=0.05"],
-        ("--settings", tmp_path / "mine.toml"): ["lag_frames=3", "window=99", "checkpoint_seconds=0.05"],
-        ("--lockstep",): ["lockstep=true", "lag_frames=3", "window=99", "checkpoint_seconds=0.05"],
+        ("--set", "run.unstored_frames=512"): [
+            "run.lockstep=true",
+            "run.unstored_frames=512",
+            "run.checkpoint_seconds=0.05",
+        ],
+        ("--set", "run.unstored_frames=256", "--set", "run.lockstep=false"): ["run.checkpoint_seconds=0.05"],
+        ("--settings", tmp_path / "mine.toml"): [
+            "run.lag_frames=3",
+            "run.unstored_frames=99",
+            "run.checkpoint_seconds=0.05",
+        ],
+        ("--lockstep",): [
+            "run.lockstep=true",
+            "run.lag_frames=3",
+            "run.unstored_frames=99",
+            "run.checkpoint_seconds=0.05",
+        ],
     }
     for options, changed in given.items():
-        variables = {"CATSTREAM_LAG_FRAMES": "3"} if "--settings" in options else {}
+        variables = {"CATSTREAM_RUN_LAG_FRAMES": "3"} if "--settings" in options else {}
         code, _, errors = said("track", "--resume", kept, *options, env=variables)
         assert code == 0, errors
         assert Origin.load(kept).settings.changed() == changed
@@ -161,18 +174,32 @@ def test_settings_that_are_given_again_change_and_all_others_are_kept(video, sai
 
 def test_a_program_that_goes_on_gives_the_settings_that_are_others(video, tmp_path):
     source, box = video
-    begun = {"settings": Settings(window=8, lockstep=True), "state": tmp_path / "kept"}
+    begun = {"settings": Settings(run={"unstored_frames": 8, "lockstep": True}), "state": tmp_path / "kept"}
     with Pipeline(source, [float(side) for side in box.split(",")], **begun):
         pass
-    for given in (Settings(window=4), {"window": 4}):
-        assert Pipeline(resume=tmp_path / "kept", settings=given).settings == Settings(window=4, lockstep=True)
-    assert Pipeline(resume=tmp_path / "kept", settings={"window": 256}).settings == Settings(lockstep=True)
+    for given in (Settings(run={"unstored_frames": 4}), {"run.unstored_frames": 4}):
+        assert Pipeline(resume=tmp_path / "kept", settings=given).settings == Settings(
+            run={"unstored_frames": 4, "lockstep": True}
+        )
+    resumed = Pipeline(resume=tmp_path / "kept", settings={"run.unstored_frames": 256})
+    assert resumed.settings == Settings(run={"lockstep": True})
 
 
 def test_a_terminal_that_is_lost_ends_a_run_like_ctrl_c(video, catstream, until, tmp_path):
     source, box = video
     heeded = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
-    command = ["track", source, "--box", box, "--output", tmp_path, "--video", "--set", "window=1", "--lockstep"]
+    command = [
+        "track",
+        source,
+        "--box",
+        box,
+        "--output",
+        tmp_path,
+        "--video",
+        "--set",
+        "run.unstored_frames=1",
+        "--lockstep",
+    ]
     process = catstream(*command, preexec_fn=heeded)
     until(lambda: len(frames(tmp_path)) > 5 or process.poll() is not None)
     process.send_signal(signal.SIGHUP)

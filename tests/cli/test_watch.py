@@ -24,7 +24,7 @@ SECONDS = 60  # that anything may take on a busy machine
 def pipeline(video):
     """One that goes on only as its tracks are taken."""
     source, box = video
-    return Pipeline(source, [float(side) for side in box.split(",")], Settings(window=1))
+    return Pipeline(source, [float(side) for side in box.split(",")], Settings(run={"unstored_frames": 1}))
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ WIDTH = 20
 
 @pytest.fixture
 def settings() -> Settings:
-    return Settings(coreset_size=8, train_frames=4, motion_frames=10)
+    return Settings(coreset={"size": 8, "sample_interval": 4}, search={"motion_frames": 10})
 
 
 @pytest.fixture
@@ -128,8 +128,8 @@ def test_versions_count_up_and_samples_keep_their_distance(settings, messages):
     samples = take(Compressor(settings), messages, 400)
     assert [sample.version for sample in samples] == list(range(1, len(samples) + 1))
     apart = np.diff([sample.frame for sample in samples])
-    assert apart[0] < settings.train_frames, "sooner while the trees are small"
-    assert (apart[len(apart) // 2 :] >= settings.train_frames).all()
+    assert apart[0] < settings.coreset.sample_interval, "sooner while the trees are small"
+    assert (apart[len(apart) // 2 :] >= settings.coreset.sample_interval).all()
 
 
 def test_a_sample_is_made_only_where_a_leaf_is_new(settings, messages):
@@ -143,10 +143,10 @@ def test_a_sample_is_made_only_where_a_leaf_is_new(settings, messages):
 def test_centres_come_in_whole_blocks_with_nan_where_absent(settings, messages):
     samples = take(Compressor(settings), messages, 60)
     for sample in samples:
-        blocks = (sample.frame + 1) // settings.motion_frames
-        assert sample.centres.shape == ((settings.motion_frames if blocks else 0), 2)
+        blocks = (sample.frame + 1) // settings.search.motion_frames
+        assert sample.centres.shape == ((settings.search.motion_frames if blocks else 0), 2)
         for offset, centre in enumerate(sample.centres):
-            frame = (blocks - 1) * settings.motion_frames + offset
+            frame = (blocks - 1) * settings.search.motion_frames + offset
             assert_allclose(centre, (frame + 10, 25) if frame % 5 else (np.nan, np.nan))
 
 
@@ -232,4 +232,4 @@ def test_a_state_of_another_coreset_size_is_refused(settings, messages, tmp_path
     take(compressor, messages, 37)
     compressor.save(tmp_path / "state")
     with pytest.raises(SettingsError, match="same settings"):
-        Compressor.load(tmp_path / "state", dataclasses.replace(settings, coreset_size=16))
+        Compressor.load(tmp_path / "state", settings.but({"coreset.size": 16}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import os
 
@@ -15,7 +14,7 @@ from catstream.errors import SettingsError
 from catstream.messages import Features
 from catstream.settings import Settings
 
-SETTINGS = Settings(coreset_size=8)
+SETTINGS = Settings(coreset={"size": 8})
 
 
 @pytest.fixture
@@ -123,4 +122,4 @@ def test_a_full_disk_is_said_and_costs_nothing_that_was_kept(kept, grow, monkeyp
 
 def test_another_coreset_size_is_refused_and_not_taken_for_damage(kept):
     with pytest.raises(SettingsError, match="same settings"):
-        Generations(kept).load(dataclasses.replace(SETTINGS, coreset_size=16))
+        Generations(kept).load(SETTINGS.but({"coreset.size": 16}))

@@ -30,8 +30,8 @@ def scene(texture):
     return draw
 
 
-def started(scene, **settings):
-    detector = Detector(Settings(**settings))
+def started(scene, settings=()):
+    detector = Detector(Settings().but(settings))
     detector.init(scene((60, 50)), START)
     return detector
 
@@ -42,13 +42,13 @@ def test_the_first_frame_teaches_a_leaf_of_each_tree(scene):
     assert (track.seq, track.frame, track.state, track.time) == (1, 0, "bootstrapping", 2.5)
     assert track.box == pytest.approx(START)
     assert features.rows.shape[1] == row_length()
-    assert (features.labels == 1).sum() == settings.coreset_size
-    assert (features.labels == 0).sum() >= settings.coreset_size
+    assert (features.labels == 1).sum() == settings.coreset.size
+    assert (features.labels == 0).sum() >= settings.coreset.size
 
 
 def test_without_colours_no_row_tells_of_them_and_the_model_weighs_none(scene):
     for colours in (True, False):
-        detector = Detector(Settings(colours=colours, extent_frames=1))
+        detector = Detector(Settings(teaching={"colours": colours}, extent={"interval": 1}))
         _, first = detector.init(scene((60, 50)), START)
         detector.seq = 4  # the next frame is searched for hard negatives
         _, later = detector.step(scene((62, 50)))
@@ -59,7 +59,8 @@ def test_without_colours_no_row_tells_of_them_and_the_model_weighs_none(scene):
 
 def test_half_of_the_first_copies_are_put_on_another_background(scene):
     one, other = (
-        Detector(Settings(other_backgrounds=share)).init(scene((60, 50)), START)[1].rows[:64] for share in (0, 0.5)
+        Detector(Settings(teaching={"other_backgrounds": share})).init(scene((60, 50)), START)[1].rows[:64]
+        for share in (0, 0.5)
     )
     differ = (one != other).any(axis=1)
     assert differ.sum() == 31
@@ -68,7 +69,7 @@ def test_half_of_the_first_copies_are_put_on_another_background(scene):
 
 @pytest.mark.parametrize("detection", ["local", "full"])
 def test_a_moving_object_is_followed(scene, detection):
-    detector = started(scene, detection=detection)
+    detector = started(scene, {"search.mode": detection})
     for i in range(1, 15):
         at = (60 + 6 * i, 50 + 4 * i)
         track, _ = detector.step(scene(at))
@@ -93,7 +94,7 @@ def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
 
 @pytest.mark.parametrize(("share", "state"), [(0.0, "bootstrapping"), (0.9, "absent")])
 def test_a_score_is_judged_by_the_one_that_the_object_usually_has(scene, share, state):
-    detector, there = started(scene, present_share=share), scene((60, 50))
+    detector, there = started(scene, {"belief.present_share": share}), scene((60, 50))
     for _ in range(200):
         detector.step(there)
     track, _ = detector.step(cv2.addWeighted(there, 0.4, scene(), 0.6, 0))
@@ -111,7 +112,7 @@ def test_an_object_that_comes_back_elsewhere_is_found_in_the_whole_frame(scene):
 @pytest.mark.parametrize("detection", ["local", "full"])
 @pytest.mark.parametrize(("trust", "teaches"), [(0.0, True), (10.0, False)])
 def test_what_is_found_elsewhere_teaches_only_once_it_is_trusted(scene, trust, teaches, detection):
-    detector = started(scene, trust_score=trust, detection=detection)
+    detector = started(scene, {"belief.trust_score": trust, "search.mode": detection})
     detector.step(scene())
     _, features = detector.step(scene((250, 180)))
     assert features.box.overlap(Box(250, 180, 48, 40)) > 0.6
@@ -277,7 +278,7 @@ def test_a_window_that_does_not_lead_its_frame_is_not_the_object(scene, learned)
     frame[150:190, 200:248] = frame[60:100, 90:138]
     tracks = sought(learned, [frame] * 10)
     assert {track.state for track in tracks} == {"absent"}
-    assert tracks[-1].score > Settings().return_score
+    assert tracks[-1].score > Settings().belief.return_score
 
 
 def test_what_is_in_another_place_in_each_frame_is_not_the_object(scene, learned):

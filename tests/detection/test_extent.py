@@ -31,7 +31,7 @@ def draw(texture):
 
 @pytest.mark.parametrize(("w", "h"), [(84, 60), (60, 84), (84, 84)], ids=["wider", "higher", "larger"])
 def test_the_box_follows_an_object_that_gets(draw, w, h):
-    tracker, frames = Tracker(Settings(extent_prior=0)), 80
+    tracker, frames = Tracker(Settings(extent={"prior": 0})), 80
     tracker.init(*draw(60, 60))
     for share in np.linspace(0, 1, frames):
         image, truth = draw(round(60 + share * (w - 60)), round(60 + share * (h - 60)))
@@ -41,7 +41,7 @@ def test_the_box_follows_an_object_that_gets(draw, w, h):
 
 
 def test_a_cut_fits_the_less_the_further_it_is_off(draw):
-    settings = Settings(scale_count=5, aspect_count=3)
+    settings = Settings(extent={"size_count": 5, "aspect_count": 3})
     image, box = draw(48, 40)
     frame = Pyramid(image)
     own = windows.around(frame, box, WINDOW)[0].row(0, 0)
@@ -53,11 +53,11 @@ def test_a_cut_fits_the_less_the_further_it_is_off(draw):
 
 def test_where_extent_is_not_learned_nothing_is_cut(draw):
     image, box = draw(48, 40)
-    assert extent.cuts(Pyramid(image), box, np.empty(0), Settings(extent_weight=0)) == ([], [])
+    assert extent.cuts(Pyramid(image), box, np.empty(0), Settings(extent={"weight": 0})) == ([], [])
 
 
 def test_a_box_follows_by_its_rates():
-    settings = Settings(scale_rate=0.5, aspect_rate=0.25)
+    settings = Settings(extent={"size_rate": 0.5, "aspect_rate": 0.25})
     box = extent.followed(BOX, Found(0.9, BOX.scaled(1.1).scaled(1.05, 1 / 1.05).centred(90, 80)), settings)
     assert box.centre == pytest.approx((90, 80))
     assert box.area == pytest.approx(BOX.area * 1.1)
@@ -66,7 +66,7 @@ def test_a_box_follows_by_its_rates():
 
 def test_where_the_score_is_low_only_the_place_is_followed():
     found = Found(0.4, BOX.scaled(1.1).centred(90, 80))
-    assert extent.followed(BOX, found, Settings(extent_score=0.5)) == pytest.approx(BOX.centred(90, 80))
+    assert extent.followed(BOX, found, Settings(belief={"extent_score": 0.5})) == pytest.approx(BOX.centred(90, 80))
 
 
 def test_a_far_larger_change_is_another_place_and_taken_over_whole():

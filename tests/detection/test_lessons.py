@@ -12,7 +12,7 @@ from catstream.messages import Model
 from catstream.settings import Settings
 
 BOX = Box(120, 80, 64, 64)
-SETTINGS = Settings(near_misses=200)
+SETTINGS = Settings(teaching={"near_misses": 200})
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_a_near_miss_is_worth_what_its_distance_says(frame, model):
     worth = {around.row(*place).tobytes(): np.hypot(place[0] - row, place[1] - column) for place in np.ndindex(13, 13)}
     assert misses.sum() > 100
     for features, label in zip(lesson.rows[misses], lesson.labels[misses], strict=True):
-        assert label == pytest.approx(np.exp(-((worth[features.tobytes()] / SETTINGS.near_sigma) ** 2) / 2))
+        assert label == pytest.approx(np.exp(-((worth[features.tobytes()] / SETTINGS.teaching.near_sigma) ** 2) / 2))
 
 
 def test_between_the_cells_what_is_nearer_than_most_of_a_cell_is_no_miss(frame, model):
@@ -60,7 +60,7 @@ def test_between_the_cells_what_is_nearer_than_most_of_a_cell_is_no_miss(frame, 
 def test_background_is_beyond_the_near_misses_and_half_of_it_scores_highest(frame, model):
     around = search.scored_around(frame, BOX, 20, model)
     lesson, _, _, background = near(frame, model, around)
-    assert background.sum() == SETTINGS.near_negatives
+    assert background.sum() == SETTINGS.teaching.near_negatives
     taken = places(around, lesson.rows[background])
     assert all(max(abs(row - 6), abs(column - 6)) > 2 for row, column in taken)
     outside = [place for place in np.ndindex(13, 13) if max(abs(place[0] - 6), abs(place[1] - 6)) > 2]
@@ -72,8 +72,8 @@ def test_the_object_at_the_edge_of_what_was_searched_teaches_as_well(frame, mode
     around = search.scored_around(frame, BOX, 20, model)
     edge = around.box(0, 12)
     lesson, own, misses, background = near(frame, model, around, edge)
-    assert own.sum() == 1 + SETTINGS.copies
-    assert background.sum() == SETTINGS.near_negatives
+    assert own.sum() == 1 + SETTINGS.teaching.copies
+    assert background.sum() == SETTINGS.teaching.near_negatives
     assert misses.any()
     assert np.isfinite(lesson.rows).all()
 
@@ -81,9 +81,9 @@ def test_the_object_at_the_edge_of_what_was_searched_teaches_as_well(frame, mode
 @pytest.mark.parametrize("known", [True, False], ids=["model", "none"])
 def test_where_no_search_left_cells_they_are_cut_around_the_box(frame, model, known):
     lesson, own, misses, background = near(frame, model if known else None)
-    assert own.sum() == 1 + SETTINGS.copies
+    assert own.sum() == 1 + SETTINGS.teaching.copies
     assert misses.any()
-    assert background.sum() == SETTINGS.near_negatives
+    assert background.sum() == SETTINGS.teaching.near_negatives
     scored = search.scored_around(frame, BOX, 20, model)
     assert scored.scores.shape == (20 - WINDOW + 1,) * 2
     assert len(places(scored, lesson.rows[~own])) > 20

@@ -149,8 +149,8 @@ def test_runs_of_another_version_are_not_mixed_in(tmp_path, monkeypatch, sequenc
 
 def test_runs_made_with_other_settings_are_not_mixed_in(tmp_path, sequence, counted):
     evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
-    with pytest.raises(SettingsError, match="coreset_size"):
-        evaluate([sequence], ["catstream"], Settings(coreset_size=32), output=tmp_path)
+    with pytest.raises(SettingsError, match=r"coreset\.size"):
+        evaluate([sequence], ["catstream"], Settings(coreset={"size": 32}), output=tmp_path)
     assert len(counted) == 1
 
 

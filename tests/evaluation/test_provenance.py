@@ -15,8 +15,8 @@ from catstream.settings import Settings
 
 
 def test_figures_say_the_settings_that_are_not_the_default_and_the_command():
-    made = provenance(Settings(coreset_size=32), ["catstream", "evaluate", "walk", "--starts", "5"])
-    assert made["settings"] == ["coreset_size=32"]
+    made = provenance(Settings(coreset={"size": 32}), ["catstream", "evaluate", "walk", "--starts", "5"])
+    assert made["settings"] == ["coreset.size=32"]
     assert made["command"] == "catstream evaluate walk --starts 5"
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", made["date"])
 

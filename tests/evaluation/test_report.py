@@ -48,12 +48,14 @@ def test_only_failures_are_shown_and_the_worst_first(sequence, found, lost):
 
 
 def test_the_report_needs_nothing_else(tmp_path, sequence, found, lost):
-    path = write_report(tmp_path / "report.html", [run_of(sequence, found, "mil"), lost], Settings(coreset_size=32))
+    path = write_report(
+        tmp_path / "report.html", [run_of(sequence, found, "mil"), lost], Settings(coreset={"size": 32})
+    )
     page = path.read_text()
     assert page.count("<svg") == 2
     assert "data:image/jpeg;base64," in page
     assert not re.search(r"(src|href)=\"(?!data:)|<script|@import|url\(", page)
-    assert "coreset_size = 32" in page
+    assert "coreset.size = 32" in page
     assert page.count("<tr") == 1 + 2 + 2
 
 
@@ -74,7 +76,7 @@ def test_a_report_that_cannot_be_written_says_so(tmp_path, lost):
 
 def test_the_command_prints_a_table_and_writes_all(tmp_path, walk):
     out, file = tmp_path / "out", tmp_path / "numbers.json"
-    arguments = [str(walk), "--output", str(out), "--json", str(file), "--set", "coreset_size=32"]
+    arguments = [str(walk), "--output", str(out), "--json", str(file), "--set", "coreset.size=32"]
     result = CliRunner().invoke(evaluate, arguments, catch_exceptions=False)
     assert result.exit_code == 0
     assert re.search(r"walk +catstream +12 +0\.\d{3}", result.output)

@@ -60,8 +60,8 @@ def test_what_is_no_limit_is_refused(text):
     [
         ({"subscribers": 3, "slow": 4}, "4 of 3 subscribers cannot be slow"),
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
-        ({"settings": Settings(lockstep=True)}, "leave lockstep away"),
-        ({"settings": Settings(endpoint="run")}, "leave endpoint away"),
+        ({"settings": Settings(run={"lockstep": True})}, "leave lockstep away"),
+        ({"settings": Settings(run={"endpoint": "run"})}, "leave endpoint away"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_refused(facts, said):

@@ -17,7 +17,7 @@ from catstream.subscription import subscribe
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small disk")
 
 #: A small window is soon full, a short pause soon over: the disk is noticed within this video.
-SETTINGS = Settings(window=16, checkpoint_seconds=0.2)
+SETTINGS = Settings(run={"unstored_frames": 16, "checkpoint_seconds": 0.2})
 
 
 @pytest.fixture

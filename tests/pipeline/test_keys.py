@@ -22,7 +22,7 @@ def keys(folder):
 
 def test_a_pipeline_with_keys_loses_no_frame_and_is_heard_by_who_may(video, folder, keys, tcp):
     path, boxes = video
-    settings = Settings(endpoint=tcp.replace("127.0.0.1", "0.0.0.0"), keys=str(keys), window=16)
+    settings = Settings(run={"endpoint": tcp.replace("127.0.0.1", "0.0.0.0"), "keys": str(keys), "unstored_frames": 16})
     with (
         Pipeline(path, boxes[0], settings) as pipeline,
         subscribe(tcp, "tracks", keys=str(folder / "phone"), timeout=60) as heard,
@@ -45,7 +45,7 @@ def test_a_pipeline_with_keys_loses_no_frame_and_is_heard_by_who_may(video, fold
 def test_a_stranger_at_the_door_of_a_pipeline_is_counted_in_its_health(video, keys, tcp):
     path, boxes = video
     with (
-        Pipeline(path, boxes[0], Settings(endpoint=tcp, keys=str(keys), window=16)) as pipeline,
+        Pipeline(path, boxes[0], Settings(run={"endpoint": tcp, "keys": str(keys), "unstored_frames": 16})) as pipeline,
         subscribe(tcp, "health", keys=str(keys), timeout=60) as health,
     ):
         tracks = iter(pipeline)
@@ -62,6 +62,6 @@ def test_a_stranger_at_the_door_of_a_pipeline_is_counted_in_its_health(video, ke
 )
 def test_a_pipeline_that_others_can_reach_does_not_start_without_keys(video, place):
     path, boxes = video
-    settings = Settings(endpoint=f"tcp://{place}")
+    settings = Settings(run={"endpoint": f"tcp://{place}"})
     with pytest.raises(ServiceError, match="catstream keys new"), Pipeline(path, boxes[0], settings):
         pass

@@ -13,7 +13,7 @@ from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 
-SETTINGS = Settings(window=4)
+SETTINGS = Settings(run={"unstored_frames": 4})
 PART = slice(0, 20)
 
 

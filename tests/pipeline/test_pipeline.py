@@ -21,7 +21,7 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Subscriber
 
 #: A small window keeps the detector near the frame that a test has reached.
-SETTINGS = Settings(window=16)
+SETTINGS = Settings(run={"unstored_frames": 16})
 
 
 @pytest.fixture(scope="module")
@@ -136,13 +136,13 @@ def test_a_restarted_trainer_goes_on_learning(video, until):
 def in_lockstep(video):
     """Tracks of a run in which each frame waits for all learning from those before."""
     path, boxes = video
-    with Pipeline(path, boxes[0], Settings(lockstep=True)) as pipeline:
+    with Pipeline(path, boxes[0], Settings(run={"lockstep": True})) as pipeline:
         return list(pipeline)
 
 
 def test_in_lockstep_the_tracks_are_those_of_one_process(in_lockstep, video):
     path, boxes = video
-    tracker, expected = Tracker(Settings(lockstep=True)), []
+    tracker, expected = Tracker(Settings(run={"lockstep": True})), []
     with open_source(path) as source:
         for frame in source:
             if expected:
@@ -156,7 +156,7 @@ def test_in_lockstep_the_tracks_are_those_of_one_process(in_lockstep, video):
 def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(in_lockstep, video):
     path, boxes = video
     lag = 5
-    with Pipeline(path, boxes[0], Settings(lag_frames=lag)) as pipeline:
+    with Pipeline(path, boxes[0], Settings(run={"lag_frames": lag})) as pipeline:
         tracks = list(pipeline)
     due = [track.model_version for track in in_lockstep]
     assert due[-1] > 2
@@ -167,7 +167,7 @@ def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(in_locks
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
 def test_a_second_pipeline_at_the_same_place_is_refused(video, transport, folder, tcp):
     path, boxes = video
-    settings = Settings(endpoint=str(folder) if transport == "ipc" else tcp, window=16)
+    settings = Settings(run={"endpoint": str(folder) if transport == "ipc" else tcp, "unstored_frames": 16})
     with Pipeline(path, boxes[0], settings) as first:
         with pytest.raises(ServiceError, match=r"give another (endpoint|folder)"), Pipeline(path, boxes[0], settings):
             pass
@@ -178,7 +178,7 @@ def test_a_second_pipeline_at_the_same_place_is_refused(video, transport, folder
 
 def test_who_attaches_late_gets_the_last_model(video, until):
     path, boxes = video
-    with Pipeline(path, boxes[0], Settings(window=4)) as pipeline:
+    with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 4})) as pipeline:
         for track in pipeline:
             if track.frame == 30:
                 break

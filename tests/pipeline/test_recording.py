@@ -17,7 +17,7 @@ from catstream.settings import Settings
 
 def test_no_features_are_missing_and_every_model_comes_out_again_whatever_dies(video, tmp_path):
     path, boxes = video
-    with Pipeline(path, boxes[0], Settings(window=16), record=tmp_path / "run.rec") as pipeline:
+    with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16}), record=tmp_path / "run.rec") as pipeline:
         for track in pipeline:
             if track.frame == 25:
                 for victim in ("compressor", "detector"):
@@ -42,7 +42,7 @@ def test_a_run_goes_on_where_its_recording_cannot(video, tmp_path, monkeypatch):
     preload = tmp_path / "sitecustomize.py"
     preload.write_text("import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (5 << 20, resource.RLIM_INFINITY))")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with Pipeline(path, boxes[0], Settings(coreset_size=8), record=tmp_path / "run.rec") as pipeline:
+    with Pipeline(path, boxes[0], Settings(coreset={"size": 8}), record=tmp_path / "run.rec") as pipeline:
         assert len(list(pipeline)) == pipeline.frames
         assert pipeline.health["compressor"]["unrecorded"] == 1
     recording = Recording(tmp_path / "run.rec")

@@ -35,7 +35,7 @@ def test_started_by_hand_in_any_order_they_complete_a_run(video, folder, tcp, se
         "detector": ["--resume", path, "--box", ",".join(map(str, boxes[0]))],
     }
     with Subscriber("tracks", Endpoint.parse(tcp)) as tracks:
-        processes = [service(name, "--set", f"endpoint={tcp}", *arguments[name]) for name in order]
+        processes = [service(name, "--set", f"run.endpoint={tcp}", *arguments[name]) for name in order]
         end = until(lambda: next((m for m in iter(lambda: tracks.receive(0.1), None) if isinstance(m, End)), None))
     assert end.totals == {"sent": len(boxes), "stored": len(boxes)}
     assert not end.failed
@@ -66,7 +66,7 @@ def test_a_source_that_breaks_ends_its_supervisor_with_the_reason(broken, servic
 def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, folder, service):
     source, box = broken
     arguments = {"compressor": ["--state", folder], "trainer": [], "detector": [source, "--box", box]}
-    processes = [service(name, "--set", f"endpoint={folder}", *given) for name, given in arguments.items()]
+    processes = [service(name, "--set", f"run.endpoint={folder}", *given) for name, given in arguments.items()]
     errors = [process.communicate(timeout=60)[1] for process in processes]
     assert [process.returncode for process in processes] == [3, 3, 3], errors
     assert "5.png' (frame 5): replace or remove it" in errors[-1]
@@ -91,7 +91,7 @@ def test_all_that_are_asked_to_end_at_once_do_so_in_order_and_all_is_stored(vide
         "detector": ["--recorded", path, "--box", ",".join(map(str, boxes[0]))],
     }
     with Subscriber("tracks", Endpoint.parse(str(folder))) as tracks:
-        place = ["--set", f"endpoint={folder}", "--set", "lockstep=true"]  # in which the video is long
+        place = ["--set", f"run.endpoint={folder}", "--set", "run.lockstep=true"]  # in which the video is long
         processes = [service(name, *place, *given) for name, given in arguments.items()]
         until(lambda: isinstance(track := tracks.receive(0.1), Track) and track.frame >= 20)
         for process in processes:
@@ -106,7 +106,14 @@ def test_all_that_are_asked_to_end_at_once_do_so_in_order_and_all_is_stored(vide
 def test_a_compressor_that_is_asked_to_end_alone_stores_what_it_has_and_leaves(video, folder, service, until):
     path, boxes = video
     arguments = {"compressor": ["--state", folder], "detector": [path, "--box", ",".join(map(str, boxes[0]))]}
-    place = ["--set", f"endpoint={folder}", "--set", "checkpoint_seconds=3600", "--set", "window=2000"]
+    place = [
+        "--set",
+        f"run.endpoint={folder}",
+        "--set",
+        "run.checkpoint_seconds=3600",
+        "--set",
+        "run.unstored_frames=2000",
+    ]
     with Subscriber("health", Endpoint.parse(str(folder))) as health:
         compressor, detector = (service(name, *place, *given) for name, given in arguments.items())
         # Without a trainer the detector stands still, with features that were taken and not stored.
@@ -120,12 +127,12 @@ def test_a_compressor_that_is_asked_to_end_alone_stores_what_it_has_and_leaves(v
 
 
 def test_a_process_whose_parent_is_gone_already_ends_at_once(folder, service):
-    assert service("--parent", 2**22 + 1, "trainer", "--set", f"endpoint={folder}").wait(60) == 0
+    assert service("--parent", 2**22 + 1, "trainer", "--set", f"run.endpoint={folder}").wait(60) == 0
 
 
 def test_a_process_that_would_fail_again_says_why_and_is_not_restarted(folder):
     supervisor = Supervisor(
-        str(folder / "gone.mp4"), Box(1, 1, 9, 9), Settings(endpoint=str(folder)), folder, owned=False
+        str(folder / "gone.mp4"), Box(1, 1, 9, 9), Settings(run={"endpoint": str(folder)}), folder, owned=False
     )
     try:
         with pytest.raises(ServiceError, match=r"no video or folder .*gone\.mp4"):
@@ -137,7 +144,7 @@ def test_a_process_that_would_fail_again_says_why_and_is_not_restarted(folder):
 
 def test_a_process_that_keeps_dying_is_given_up(video, folder):
     path, boxes = video
-    supervisor = Supervisor(path, boxes[0], Settings(endpoint=str(folder)), folder, owned=True)
+    supervisor = Supervisor(path, boxes[0], Settings(run={"endpoint": str(folder)}), folder, owned=True)
 
     def kill_trainer():
         if "trainer" in supervisor.pids:
@@ -162,7 +169,7 @@ def check_for_a_minute(supervisor, turn=lambda: None):
 def test_processes_that_hang_are_noticed_and_replaced(video):
     path, boxes = video
     stopped, tracks = [], []
-    with Pipeline(path, boxes[0], Settings(window=16)) as pipeline:
+    with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16})) as pipeline:
         for track in pipeline:
             tracks.append(track.frame)
             if track.frame == 20:

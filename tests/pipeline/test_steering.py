@@ -24,7 +24,7 @@ from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 
 #: A small window keeps the detector near the frame that a test has reached.
-SETTINGS = Settings(window=16)
+SETTINGS = Settings(run={"unstored_frames": 16})
 SECONDS = 60  # that an answer may take on a busy machine
 PATCH = (20, 150, 70, 60)  # of the lake, which the object does not come to
 
@@ -113,7 +113,7 @@ def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_w
             tracks.append(track)
             if track.model_version >= 4:
                 break
-        wanted = boxes[len(tracks) + SETTINGS.window // 2]
+        wanted = boxes[len(tracks) + SETTINGS.run.unstored_frames // 2]
         answer = taken(pipeline, tracks, pool.submit(steering.set_box, wanted))
         for victim in victims:
             os.kill(pipeline.pids[victim], signal.SIGKILL)
@@ -184,7 +184,7 @@ def test_commands_that_a_power_cut_tore_are_said_and_the_run_goes_on(video, tmp_
         tracks = list(pipeline)
     assert "what was commanded cannot be read" in pipeline.trouble["detector"]
     assert pipeline.restarts == 0
-    assert 0 < tracks[0].frame <= before.frame + SETTINGS.window
+    assert 0 < tracks[0].frame <= before.frame + SETTINGS.run.unstored_frames
     assert tracks[0].model_version > 0, "what was learned is whole"
     assert tracks[-1].frame == len(boxes) - 1
 
@@ -214,7 +214,7 @@ def test_a_saved_model_finds_the_object_and_learning_goes_on_from_it(video, save
 
 
 def test_in_lockstep_a_run_from_a_saved_model_repeats_itself_also_where_the_detector_dies(video, saved):
-    settings = Settings(lockstep=True)
+    settings = Settings(run={"lockstep": True})
     runs = []
     for dies in (False, True):
         tracks = []

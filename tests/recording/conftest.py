@@ -13,7 +13,7 @@ from catstream.training.trainer import Trainer
 from catstream.video.source import open_source
 from catstream.wire.endpoint import Endpoint, private_folder
 
-SETTINGS = Settings(coreset_size=16)
+SETTINGS = Settings(coreset={"size": 16})
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -36,11 +35,11 @@ def read(path):
 
 
 def test_what_was_written_is_read_with_the_settings(written):
-    settings = Settings(coreset_size=32, classifier="one-class", endpoint="somewhere")
+    settings = Settings(coreset={"size": 32}, teaching={"classifier": "one-class"}, run={"endpoint": "somewhere"})
     messages = [track(1), features(1), model(1, 0), Health("trainer", 2.0, {"trained": 1.0}), End(2, "its end")]
     recording = Recording(written(messages, settings))
     run, *others = (message for _, message in recording.messages())
-    assert recording.settings == replace(settings, endpoint="")
+    assert recording.settings == settings.but({"run.endpoint": ""})
     assert run == recording.run
     assert list(map(encode, others)) == list(map(encode, messages))
     assert recording.end == messages[-1]
@@ -149,7 +148,7 @@ def test_a_file_that_is_there_is_kept(written):
     with pytest.raises(RecordingError, match="is there already"):
         written([])
     with pytest.raises(RecordingError, match="other settings"):
-        written([], Settings(coreset_size=99), resume=True)
+        written([], Settings(coreset={"size": 99}), resume=True)
     with (
         RecordingWriter(path, Recording(path).run, resume=True),
         pytest.raises(RecordingError, match="somebody else records"),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -36,10 +34,10 @@ def test_versions_that_a_trainer_skipped_are_made_and_the_others_are_the_same(sa
     assert lesson.identical == recording.counts[Model] == lesson.models - len(skipped)
 
 
-@pytest.mark.parametrize("change", [{"coreset_size": 8}, {"classifier": "one-class"}], ids=str)
+@pytest.mark.parametrize("change", [{"coreset.size": 8}, {"teaching.classifier": "one-class"}], ids=str)
 def test_other_settings_give_other_models_of_the_same_rows(said, written, change):
     recording = Recording(written(said))
-    then, now = (learn(recording, settings) for settings in (recording.settings, replace(recording.settings, **change)))
+    then, now = (learn(recording, settings) for settings in (recording.settings, recording.settings.but(change)))
     assert now.models
     assert now.identical == 0
     assert now.counters["rows"] == then.counters["rows"]

@@ -64,7 +64,7 @@ def test_a_box_drawn_with_the_mouse_is_followed_until_it_leaves_and_after_a_rest
         for image, box in render(145, SIZE, begin=LEAVES - 120):
             video.write(image)
             boxes.append(box)
-    settings = Settings(endpoint=str(folder), window=4)  # it goes on only as its tracks are taken
+    settings = Settings(run={"endpoint": str(folder), "unstored_frames": 4})  # it goes on only as its tracks are taken
     server = Server(str(folder), port=0)
     with server.beside():
         with Pipeline(str(path), None, settings) as pipeline:

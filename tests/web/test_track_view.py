@@ -15,7 +15,7 @@ def test_the_first_box_comes_from_the_page_which_tells_of_the_end_of_the_run_and
     demo_video, folder, tmp_path, until
 ):
     source, boxes = demo_video(40)
-    words = ["track", source, "--output", tmp_path / "out", "--set", f"endpoint={folder}"]
+    words = ["track", source, "--output", tmp_path / "out", "--set", f"run.endpoint={folder}"]
     page = ["--view", "127.0.0.1:0", "--view-token", TOKEN]
     with (
         subprocess.Popen(

@@ -55,7 +55,7 @@ EXAMPLES = {
     "model": Model(4, 20, array(5), -0.25, MOTION, array(5)),
     "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2, DETECTOR),
     "preview": Preview(2, 1280, 720, Box(4.5, 3.0, 20.0, 10.0), b"\xff\xd8\xff\xe0 and so on"),
-    "run": Run("0.1.0", {"coreset_size": "64", "classifier": "joint"}),
+    "run": Run("0.1.0", {"coreset.size": "64", "teaching.classifier": "joint"}),
     "sample": Sample(4, 20, summary(5), summary(5), summary(7), summary(7), np.array([[1.0, 2.0], [np.nan, np.nan]])),
     "stored": Stored(5, 7, 2),
     "track": Track(3, 2, 0.08, "present", Box(4.5, 3.0, 20.0, 10.0), 0.75, 4, 1234.5),

@@ -81,7 +81,7 @@ def stranger(endpoint):
 def test_a_wrong_message_is_counted_by_what_is_wrong_and_costs_the_true_sender_nothing(
     reason, endpoint, stranger, until
 ):
-    compressor, before, taken = Compressor(Settings(coreset_size=2)), refused(reason), []
+    compressor, before, taken = Compressor(Settings(coreset={"size": 2})), refused(reason), []
     with (
         Receiver("features", endpoint, Position(), WINDOW, check=compressor.check) as receiver,
         Sender("features", endpoint, WINDOW) as sender,

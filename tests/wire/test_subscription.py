@@ -142,7 +142,7 @@ def test_each_process_is_heard_and_nothing_twice(endpoint):
 
 def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, until):
     with (
-        Publisher("lessons", endpoint, greeting=Run("0", {"coreset_size": "64"})) as lessons,
+        Publisher("lessons", endpoint, greeting=Run("0", {"coreset.size": "64"})) as lessons,
         catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
     ):
         until(lambda: lessons.heard, lessons.welcome)
