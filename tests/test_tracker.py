@@ -50,7 +50,7 @@ def test_a_patch_is_followed(video, preset):
 def test_a_share_of_an_unknown_length_is_refused(video):
     with pytest.raises(SettingsError, match="for_length"):
         follow(video, Settings(coreset={"share": 0.1}))
-    with pytest.raises(SettingsError, match="has none"):
+    with pytest.raises(SettingsError, match="is not known"):
         Settings(coreset={"share": 0.1}).for_length(None)
 
 
