@@ -58,7 +58,7 @@ class Endpoint:
     source: str = field(default="", compare=False)
 
     def __str__(self) -> str:
-        """As the setting `endpoint` says it."""
+        """As the setting `run.endpoint` says it."""
         if self.folder is not None:
             return str(self.folder)
         return f"tcp://{','.join([self.host, *map('='.join, self.hosts.items())])}:{self.port}"
