@@ -14,7 +14,7 @@ import psutil
 
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
-from catstream.video.source import WHOLE
+from catstream.video.source import ALL_FRAMES
 
 __all__ = ["Journey", "draw", "travel"]
 
@@ -59,7 +59,9 @@ class Journey:
         return frames[1:], np.diff(seconds) / np.diff(frames) * 1000
 
 
-def travel(source: str, box: Sequence[float], settings: Settings, watch: int = 250, part: slice = WHOLE) -> Journey:
+def travel(
+    source: str, box: Sequence[float], settings: Settings, watch: int = 250, part: slice = ALL_FRAMES
+) -> Journey:
     """Run a pipeline to the end of its source, or a part of it; look at the processes each `watch` frames."""
     journey, begin = Journey(), perf_counter()
     with Pipeline(source, box, settings, part=part) as pipeline:

@@ -24,7 +24,7 @@ from catstream.errors import ServiceError
 from catstream.settings import Settings
 from catstream.state import TREES
 from catstream.video.demo import write
-from catstream.video.results import tracks
+from catstream.video.results import read_tracks
 
 _REST = 200  # frames beyond the last kill: a fast pipeline goes on while a kill is on its way
 TRACK = [sys.executable, "-P", "-c", "from catstream.cli import main; main()", "track"]
@@ -42,7 +42,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     seconds = [watched(go_on, out, chance.randrange(most)) for _ in range(moments - 1)]
     seconds.append(watched(go_on, out, None))
 
-    rows = [track.frame for track in tracks(out, video.stem)]
+    rows = [track.frame for track in read_tracks(out, video.stem)]
     stored = Generations(kept / TREES).load(Settings()).seq
     columns = ("killed", "frames", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")
     row = (moments, frames, frames - len(set(rows)), len(rows) - len(set(rows)), stored)

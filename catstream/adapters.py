@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from catstream.extras import need
+from catstream.extras import require_extra
 from catstream.messages import Track
 
 __all__ = ["to_supervision"]
@@ -23,7 +23,7 @@ def to_supervision(track: Track) -> Any:
     MissingExtraError
         If supervision is not installed; says how to get it.
     """
-    need("supervision")
+    require_extra("supervision")
     from supervision import Detections
 
     if track.box is None:

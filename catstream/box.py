@@ -47,12 +47,12 @@ class Box(NamedTuple):
         """The box with the same size around another centre."""
         return Box(x - self.w / 2, y - self.h / 2, self.w, self.h)
 
-    def held_in(self, width: int, height: int) -> Box:
+    def with_centre_in(self, width: int, height: int) -> Box:
         """The box moved, where it must be, until its centre is in a frame of this size.
 
         Examples
         --------
-        >>> Box(90, 10, 20, 20).held_in(80, 60)
+        >>> Box(90, 10, 20, 20).with_centre_in(80, 60)
         Box(x=69.0, y=10.0, w=20, h=20)
         """
         x, y = self.centre
@@ -68,7 +68,7 @@ class Box(NamedTuple):
         return shared / (self.area + other.area - shared)
 
     @classmethod
-    def of(cls, value: str | Iterable[float]) -> Box:
+    def parse(cls, value: str | Iterable[float]) -> Box:
         """Read a box as people write it: four numbers, or a text `x,y,w,h` (commas, blanks or tabs between them).
 
         Raises
@@ -78,10 +78,10 @@ class Box(NamedTuple):
 
         Examples
         --------
-        >>> Box.of("10,20,30,40")
+        >>> Box.parse("10,20,30,40")
         Box(x=10.0, y=20.0, w=30.0, h=40.0)
         >>> import numpy as np
-        >>> Box.of(np.array([10, 20, 30, 40])) == Box.of([10, 20, 30, 40])
+        >>> Box.parse(np.array([10, 20, 30, 40])) == Box.parse([10, 20, 30, 40])
         True
         """
         try:
@@ -93,7 +93,7 @@ class Box(NamedTuple):
             ) from None
         return cls(x, y, w, h)
 
-    def inside(self, width: int, height: int) -> Box:
+    def validated(self, width: int, height: int) -> Box:
         """The same box, once it is known to be a start for a frame of this size.
 
         Raises

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from catstream.errors import MissingExtraError
 
-__all__ = ["EXTRAS", "install_command", "need"]
+__all__ = ["EXTRAS", "install_command", "require_extra"]
 
 #: Extra -> the feature that needs it, and the modules that the feature imports.
 EXTRAS = {
@@ -21,7 +21,7 @@ EXTRAS = {
 }
 
 
-def need(extra: str) -> None:
+def require_extra(extra: str) -> None:
     """Check that the modules of an extra can be imported, without importing them.
 
     Raises

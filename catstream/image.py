@@ -12,7 +12,7 @@ __all__ = ["as_bgr"]
 
 _CHANNELS = (1, 3, 4)
 _HALF_STEP = 0.5 / 255  # of brightness: by so much an image that was resized may leave the range from 0 to 1
-_WANTED = "a frame is a numpy array (h, w, 3), blue green red, or (h, w) grey, of uint8, uint16 or float from 0 to 1"
+_EXPECTED = "a frame is a numpy array (h, w, 3), blue green red, or (h, w) grey, of uint8, uint16 or float from 0 to 1"
 
 
 def as_bgr(image: Any) -> np.ndarray:
@@ -32,7 +32,7 @@ def as_bgr(image: Any) -> np.ndarray:
     >>> as_bgr(np.full((2, 2, 1), 0.5))[0, 0]
     array([128, 128, 128], dtype=uint8)
     """
-    pixels = _eight_bit(_checked(image))
+    pixels = _eight_bit(_validated(image))
     if pixels.ndim == 2 or pixels.shape[2] == 1:
         pixels = np.repeat(pixels.reshape(*pixels.shape[:2], 1), 3, axis=2)
     elif pixels.shape[2] == 4:
@@ -40,13 +40,15 @@ def as_bgr(image: Any) -> np.ndarray:
     return np.require(pixels, requirements=["C", "W"])
 
 
-def _checked(image: Any) -> np.ndarray:
+def _validated(image: Any) -> np.ndarray:
     if image is None:
         raise FrameError(
-            f"{_WANTED}, got None: a read has failed, as at the end of a video; check what it returns first"
+            f"{_EXPECTED}, got None: a read has failed, as at the end of a video; check what it returns first"
         )
     if not isinstance(image, np.ndarray):
-        raise FrameError(f"{_WANTED}, got {type(image).__name__}: turn it into such an array first, as np.asarray does")
+        raise FrameError(
+            f"{_EXPECTED}, got {type(image).__name__}: turn it into such an array first, as np.asarray does"
+        )
     shape = image.shape
     if not (image.ndim == 2 or (image.ndim == 3 and shape[2] in _CHANNELS)):
         hint = "give one of this shape"
@@ -54,9 +56,9 @@ def _checked(image: Any) -> np.ndarray:
             hint = "the channels come last, np.moveaxis(frame, 0, -1) puts them there"
         elif image.ndim == 4:
             hint = "give one image of a batch at a time"
-        raise FrameError(f"{_WANTED}, got the shape {shape}: {hint}")
+        raise FrameError(f"{_EXPECTED}, got the shape {shape}: {hint}")
     if not image.size:
-        raise FrameError(f"{_WANTED}, got the shape {shape}, which has no pixels: check where it was cut from")
+        raise FrameError(f"{_EXPECTED}, got the shape {shape}, which has no pixels: check where it was cut from")
     return np.asarray(image)
 
 
@@ -66,15 +68,15 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
     if image.dtype.kind == "u" and image.itemsize == 2:
         return (image >> 8).astype(np.uint8)
     if image.dtype == bool:
-        raise FrameError(f"{_WANTED}, got bool: a mask is no picture, 255 * frame.astype(np.uint8) would be one")
+        raise FrameError(f"{_EXPECTED}, got bool: a mask is no picture, 255 * frame.astype(np.uint8) would be one")
     if image.dtype.kind != "f":
         raise FrameError(
-            f"{_WANTED}, got {image.dtype}: frame.astype(np.uint8) if its values are brightness from 0 to 255"
+            f"{_EXPECTED}, got {image.dtype}: frame.astype(np.uint8) if its values are brightness from 0 to 255"
         )
     low, high = float(image.min()), float(image.max())
     if not (low >= -_HALF_STEP and high <= 1 + _HALF_STEP):  # also of NaN
         raise FrameError(
-            f"{_WANTED}, got {image.dtype} from {low:g} to {high:g}: "
+            f"{_EXPECTED}, got {image.dtype} from {low:g} to {high:g}: "
             "frame.astype(np.uint8) if its values are brightness from 0 to 255"
         )
     return (image.clip(0, 1) * 255).round().astype(np.uint8)

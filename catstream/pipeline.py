@@ -25,7 +25,7 @@ from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.state import Origin, began, learned, locked, position
 from catstream.video.frames import without_password
-from catstream.video.source import WHOLE, is_live, open_source, without_scheme
+from catstream.video.source import ALL_FRAMES, is_live, open_source, without_scheme
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.readable import readable
 from catstream.wire.sockets import Receiver, Subscriber
@@ -124,7 +124,7 @@ class Pipeline:
         settings: Settings | Mapping[str, Any] | None = None,
         *,
         model: str | os.PathLike[str] | None = None,
-        part: slice = WHOLE,
+        part: slice = ALL_FRAMES,
         record: str | os.PathLike[str] | None = None,
         state: str | os.PathLike[str] | None = None,
         resume: str | os.PathLike[str] | None = None,
@@ -146,14 +146,14 @@ class Pipeline:
             source = source or self._kept.source
             if box is None and model is None:
                 box, model = self._kept.box, self._kept.model or None
-            self.part = self._kept.part if part == WHOLE else part
+            self.part = self._kept.part if part == ALL_FRAMES else part
             self.notes = self._kept.notes | self.notes
         given = settings.changed() if isinstance(settings, Settings) else settings or {}
         self.settings = (self._kept.settings if self._kept is not None else Settings()).but(given)
         if source is None:
             raise SettingsError("a new run needs a source: give one")
         self.source = without_scheme(str(source))
-        self._box = Box.of(box) if box is not None else None
+        self._box = Box.parse(box) if box is not None else None
         self._record = None if record is None else Path(record)
         self._save_model = None if save_model is None else Path(save_model)
         self._model = Path(model) if model is not None else None
@@ -173,7 +173,7 @@ class Pipeline:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
         if self._box is not None:
-            self._box.inside(*self.size)
+            self._box.validated(*self.size)
         self.settings = self.settings.for_length(self.frames)
         path = self.source if self.live else str(Path(self.source).absolute())
         started = self._kept.started if self._kept else time.time()

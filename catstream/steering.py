@@ -60,7 +60,7 @@ class Control:
         It is another object, and what was learned of the one before is forgotten; with `keep`
         it is the same one, found again for the tracker. A paused pipeline follows this frame, and stays paused.
         """
-        return self._ask("set-box", Box.of(box), keep)
+        return self._ask("set-box", Box.parse(box), keep)
 
     def pause(self) -> Answer:
         """Stop taking frames; those of a live source pass by and are counted as skipped."""

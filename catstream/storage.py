@@ -15,14 +15,14 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 
-__all__ = ["is_locked", "is_writable", "lock", "place", "read", "write"]
+__all__ = ["is_locked", "is_writable", "lock", "read", "write", "write_atomically"]
 
 _KEY = "catstream"  # one metadata key only: with more, their order and so the bytes would vary
 _VERSION = 1  # of what the metadata means
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
-def place(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
+def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
     """Write a file beside its final name, then put it in place of the old one; it survives a power cut from then on.
 
     Parameters
@@ -89,18 +89,18 @@ def is_locked(handle: int) -> bool:
 def write(
     path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: dict[str, object], mode: int = 0o666
 ) -> None:
-    """Place a file of arrays and facts, with a mode as `place` takes it.
+    """Place a file of arrays and facts, with a mode as `write_atomically` takes it.
 
     Raises
     ------
     OSError
-        As `place` does.
+        As `write_atomically` does.
     """
     from safetensors.numpy import save
 
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    told = {"version": _VERSION, "facts": facts, "checksum": _checksum(contiguous, facts)}
-    place(path, save(contiguous, metadata={_KEY: json.dumps(told, sort_keys=True)}), mode)
+    metadata = {"version": _VERSION, "facts": facts, "checksum": _checksum(contiguous, facts)}
+    write_atomically(path, save(contiguous, metadata={_KEY: json.dumps(metadata, sort_keys=True)}), mode)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, object]]:
@@ -115,12 +115,12 @@ def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
 
     try:
         with safe_open(path, framework="numpy") as file:
-            told = json.loads((file.metadata() or {})[_KEY])
+            metadata = json.loads((file.metadata() or {})[_KEY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        facts = told["facts"]
-        if told["version"] != _VERSION:
-            raise ValueError(f"it is of version {told['version']}, this catstream reads {_VERSION}")
-        if told["checksum"] != _checksum(arrays, facts):
+        facts = metadata["facts"]
+        if metadata["version"] != _VERSION:
+            raise ValueError(f"it is of version {metadata['version']}, this catstream reads {_VERSION}")
+        if metadata["checksum"] != _checksum(arrays, facts):
             raise ValueError("its checksum does not fit")
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ProtocolError(f"{path} is not a whole file of catstream ({error}): take an older copy") from None

@@ -23,19 +23,19 @@ from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.readable import readable
 from catstream.wire.sockets import Subscriber
 
-__all__ = ["Gaps", "Subscription", "knock", "subscribe"]
+__all__ = ["GapCounter", "Subscription", "subscribe", "wait_until_running"]
 
 #: Seconds that the last messages have to come in after the end was heard: it travels by itself.
-_LAST_WORDS = 0.5
+_DRAIN_SECONDS = 0.5
 
 #: Seconds to wait for a sign of life: each process of a running pipeline is heard once a second.
-_PATIENCE = 5.0
+_HEALTH_TIMEOUT_SECONDS = 5.0
 
 #: Seconds from one look at the connections to the next: they say if the pipeline does not let this reader in.
-_LOOK_SECONDS = 1.0
+_CONNECTION_CHECK_SECONDS = 1.0
 
 #: What one can subscribe to, and its channel: of features, that of the copies.
-_OPEN = {
+_SUBSCRIBABLE = {
     **{name: name for name, channel in CHANNELS.items() if not channel.acknowledged and name != "lessons"},
     "features": "lessons",
 }
@@ -43,7 +43,7 @@ _OPEN = {
 Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features | Preview)
 
 
-class Gaps:
+class GapCounter:
     """Counts messages of a stream that never came, by what is missing between their `seq`, which begins with 1.
 
     missed  since the first that came; a restarted sender may go back
@@ -90,20 +90,22 @@ class Subscription(Generic[Message]):
     """
 
     def __init__(self, endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> None:
-        if channel not in _OPEN:
+        if channel not in _SUBSCRIBABLE:
             raise ServiceError(
-                f"one can subscribe to {', '.join(_OPEN)}, got {channel!r}: the others have one receiver"
+                f"one can subscribe to {', '.join(_SUBSCRIBABLE)}, got {channel!r}: the others have one receiver"
             )
         place = find(endpoint, keys)
         self.endpoint, self.timeout = str(place), timeout
         self.keys = str(place.keys.folder) if place.keys is not None else ""
         self.end: End | None = None
-        self._what, self._channel, self._gaps = channel, CHANNELS[_OPEN[channel]], Gaps()
-        self._newest: dict[str, float] = {}  # of each process that sends: what was taken last
-        self._closing = float("inf")  # when to wait no more
+        self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
+        self._last_identity: dict[str, float] = {}  # of each process that sends: what was taken last
+        self._close_time = float("inf")  # when to wait no more
         # A pipeline that begins here later waits until this subscription has come in.
-        self._waits = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
-        self._messages = Subscriber(self._channel.name, place, reader=self._waits.reader if self._waits else "")
+        self._announcement = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
+        self._messages = Subscriber(
+            self._channel.name, place, reader=self._announcement.reader if self._announcement else ""
+        )
         # By itself: a reader that is so slow that messages are dropped would miss the end among them.
         self._ends = Subscriber("tracks", place, only=End)
 
@@ -129,7 +131,7 @@ class Subscription(Generic[Message]):
 
     def close(self) -> None:
         """Attach no more."""
-        self._attached()
+        self._withdraw_announcement()
         self._messages.close()
         self._ends.close()
 
@@ -143,14 +145,14 @@ class Subscription(Generic[Message]):
         return self
 
     def __next__(self) -> Message:
-        patience = self._patience()
+        deadline = self._deadline()
         while (message := self._take()) is None:
             if self._ended():
                 raise StopIteration
             poller = select.poll()
             for socket in (self._messages, self._ends):
                 poller.register(socket.fileno(), select.POLLIN)
-            seconds = self._left(patience)
+            seconds = self._wait_seconds(deadline)
             poller.poll(seconds * 1000)
         return message
 
@@ -158,11 +160,11 @@ class Subscription(Generic[Message]):
         return self
 
     async def __anext__(self) -> Message:
-        patience = self._patience()
+        deadline = self._deadline()
         while (message := self._take()) is None:
             if self._ended():
                 raise StopAsyncIteration
-            await readable([self._messages, self._ends], self._left(patience))
+            await readable([self._messages, self._ends], self._wait_seconds(deadline))
         return message
 
     def _take(self) -> Message | None:
@@ -171,21 +173,21 @@ class Subscription(Generic[Message]):
             message = self._messages.receive(0)
             if isinstance(message, End):
                 if self._channel.keeps == "every":  # nothing is on its way behind it
-                    self.end, self._closing = message, 0.0
+                    self.end, self._close_time = message, 0.0
                     return None
             elif message is not None and self._new(message):
-                self._attached()
+                self._withdraw_announcement()
                 return message
         while self._ends.pending():
             end = self._ends.receive(0)
             if self.end is None and end is not None:
-                self.end, self._closing = end, monotonic() + _LAST_WORDS
+                self.end, self._close_time = end, monotonic() + _DRAIN_SECONDS
         return None
 
-    def _attached(self) -> None:
+    def _withdraw_announcement(self) -> None:
         """No pipeline has to wait for it any more."""
-        if self._waits is not None:
-            self._waits.close()
+        if self._announcement is not None:
+            self._announcement.close()
 
     def _new(self, message: Message) -> bool:
         """Whether it did not come before: a channel's last message is sent again when somebody new comes."""
@@ -194,33 +196,33 @@ class Subscription(Generic[Message]):
         if isinstance(message, Track | Features):
             self._gaps.take(message.seq)
             return True
-        name, mark = _mark(message)
-        known = self._newest.get(name)
-        self._newest[name] = mark
+        name, mark = _identity(message)
+        known = self._last_identity.get(name)
+        self._last_identity[name] = mark
         return mark != known
 
     def _ended(self) -> bool:
-        if self.end is None or monotonic() < self._closing:
+        if self.end is None or monotonic() < self._close_time:
             return False
         if self._channel.keeps == "every":
             self._gaps.take(self.end.seq)
         return True
 
-    def _patience(self) -> float:
+    def _deadline(self) -> float:
         return float("inf") if self.timeout is None else monotonic() + self.timeout
 
-    def _left(self, patience: float) -> float:
+    def _wait_seconds(self, deadline: float) -> float:
         """Seconds to wait before it is looked again; raises SilenceError if the time is over."""
         now = monotonic()
-        if now >= patience and self.end is None:
+        if now >= deadline and self.end is None:
             raise SilenceError(
-                f"no {self._what} came from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
+                f"no {self._name} came from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
             )
-        until = min(patience if self.end is None else float("inf"), self._closing, now + _LOOK_SECONDS)
+        until = min(deadline if self.end is None else float("inf"), self._close_time, now + _CONNECTION_CHECK_SECONDS)
         return max(0.0, until - now)
 
 
-def _mark(message: Health | Model | Sample | Preview) -> tuple[str, float]:
+def _identity(message: Health | Model | Sample | Preview) -> tuple[str, float]:
     """Who sent it, and what tells it from the one before."""
     if isinstance(message, Health):
         return message.process, message.time
@@ -275,7 +277,7 @@ def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys
     return Subscription(endpoint, channel, timeout=timeout, keys=keys)
 
 
-def knock(endpoint: str, keys: str = "", seconds: float = _PATIENCE) -> Endpoint:
+def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_TIMEOUT_SECONDS) -> Endpoint:
     """Where a pipeline runs, once it is heard: tracks and models may be silent for long where one does.
 
     Raises

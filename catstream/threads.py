@@ -40,35 +40,35 @@ class _Libraries:
         self._modules = 0  # how many were imported when libraries were looked for
         self._blas: list[Any] = []
         self._openmp: list[Any] = []
-        self._holders = 0
-        self._before: dict[str, tuple[Any, int]] = {}  # path -> a BLAS, and its threads before the first holder
+        self._users = 0
+        self._original: dict[str, tuple[Any, int]] = {}  # path -> a BLAS, and its threads before the first holder
 
-    def hold(self) -> list[tuple[Any, int]]:
-        """Go down to one thread; returns what `release` needs."""
+    def limit(self) -> list[tuple[Any, int]]:
+        """Go down to one thread; returns what `restore` needs."""
         with self._lock:
             self._find()
-            self._holders += 1
+            self._users += 1
             for library in self._blas:
-                if library.filepath not in self._before:
-                    self._before[library.filepath] = (library, library.get_num_threads() or 1)
+                if library.filepath not in self._original:
+                    self._original[library.filepath] = (library, library.get_num_threads() or 1)
                     _set(library, 1)
             own = [(library, library.get_num_threads() or 1) for library in self._openmp]
             for library, _ in own:
                 _set(library, 1)
             return own
 
-    def release(self, own: list[tuple[Any, int]]) -> None:
-        """Undo one `hold`."""
+    def restore(self, own: list[tuple[Any, int]]) -> None:
+        """Undo one `limit`."""
         with self._lock:
             for library, threads in own:
                 _set(library, threads)
-            self._holders -= 1
-            if self._holders:
+            self._users -= 1
+            if self._users:
                 return
-            for library, threads in self._before.values():
+            for library, threads in self._original.values():
                 if library.get_num_threads() == 1:  # otherwise somebody else has set it meanwhile: it is theirs
                     _set(library, threads)
-            self._before.clear()
+            self._original.clear()
 
     def _find(self) -> None:
         """Look for libraries, in a few milliseconds, if anything was imported since the last time."""
@@ -77,9 +77,9 @@ class _Libraries:
         from threadpoolctl import ThreadpoolController
 
         self._modules = len(sys.modules)
-        found = ThreadpoolController().lib_controllers
-        self._openmp = [library for library in found if _is_openmp(library)]
-        self._blas = [library for library in found if not _is_openmp(library)]
+        libraries = ThreadpoolController().lib_controllers
+        self._openmp = [library for library in libraries if _is_openmp(library)]
+        self._blas = [library for library in libraries if not _is_openmp(library)]
 
 
 def _is_openmp(library: Any) -> bool:
@@ -103,7 +103,7 @@ class one_thread(ContextDecorator):
 
     Parameters
     ----------
-    opencv : also hold OpenCV to one thread; this may not be used by several threads at once
+    opencv : also limit OpenCV to one thread; this may not be used by several threads at once
 
     >>> from threadpoolctl import threadpool_info
     >>> import numpy
@@ -114,7 +114,7 @@ class one_thread(ContextDecorator):
 
     def __init__(self, *, opencv: bool = False) -> None:
         self._opencv = opencv
-        self._held: list[tuple[list[tuple[Any, int]], int | None]] = []
+        self._entered: list[tuple[list[tuple[Any, int]], int | None]] = []
 
     def _recreate_cm(self) -> one_thread:
         return one_thread(opencv=self._opencv)  # a decorated function may run in several threads at once
@@ -126,11 +126,11 @@ class one_thread(ContextDecorator):
 
             threads = cv2.getNumThreads()
             cv2.setNumThreads(1)
-        self._held.append((_libraries.hold(), threads))
+        self._entered.append((_libraries.limit(), threads))
 
     def __exit__(self, *_: object) -> None:
-        own, threads = self._held.pop()
-        _libraries.release(own)
+        own, threads = self._entered.pop()
+        _libraries.restore(own)
         if threads is not None:
             import cv2
 

@@ -96,7 +96,7 @@ class Tracker:
         FrameError
             For an array that is not a frame.
         """
-        image, start = as_bgr(frame), Box.of(box)
+        image, start = as_bgr(frame), Box.parse(box)
         compressor, trainer = Compressor(self.settings), Trainer(self.settings)
         detector = Detector(self.settings)
         detector.prepare()  # a library is held to one thread if it is there when a call begins

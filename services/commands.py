@@ -48,7 +48,7 @@ class DesiredState:
     def save(self, path: Path) -> None:
         """Write them, whole or not at all."""
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        storage.place(path, json.dumps(asdict(self)).encode())
+        storage.write_atomically(path, json.dumps(asdict(self)).encode())
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -17,9 +17,9 @@ from catstream.messages import End, Features, Model, Position, Track
 from catstream.services.commands import CommandHandler, DesiredState
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
-from catstream.video.ahead import ahead
+from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password
-from catstream.video.source import WHOLE, open_source
+from catstream.video.source import ALL_FRAMES, open_source
 from catstream.wire.announced import readers_of
 from catstream.wire.sockets import Publisher, Sender, Subscriber
 
@@ -47,7 +47,7 @@ def main(
     owned: bool,
     recorded: bool = False,
     state: Path | None = None,
-    part: slice = WHOLE,
+    part: slice = ALL_FRAMES,
     since: float | None = None,
 ) -> None:
     """Follow the object to the last frame.
@@ -100,7 +100,7 @@ def main(
             )
         )
         line.source = frames
-        coming = frames if frames.live else stack.enter_context(closing(ahead(frames)))
+        coming = frames if frames.live else stack.enter_context(closing(read_ahead(frames)))
         reason, failed = "the source came to its end", False
         try:
             for frame in coming:

@@ -28,7 +28,7 @@ def with_object(command: Callable[..., None]) -> Callable[..., None]:
     def wrapped(box: str | None, model: Path | None, **options: Any) -> None:
         if box is not None and model is not None:
             raise click.UsageError("--box says where the object is, with --model it is searched for: give one of them")
-        command(box=Box.of(box) if box is not None else None, model=model, **options)
+        command(box=Box.parse(box) if box is not None else None, model=model, **options)
 
     return wrapped
 

@@ -22,7 +22,7 @@ from catstream.services.start import environment, service_command
 from catstream.services.watchdog import Watchdog
 from catstream.settings import Settings
 from catstream.video.frames import without_password
-from catstream.video.source import WHOLE, is_live
+from catstream.video.source import ALL_FRAMES, is_live
 from catstream.wire.endpoint import meeting_place, private_folder
 
 __all__ = ["NAMES", "Supervisor", "main"]
@@ -123,7 +123,7 @@ class Supervisor:
         *,
         model: Path | None = None,
         owned: bool,
-        part: slice = WHOLE,
+        part: slice = ALL_FRAMES,
         record: Path | None = None,
         state: Path | None = None,
         resume: bool = False,
@@ -262,7 +262,7 @@ class Supervisor:
         )
 
 
-def main(source: str, settings: Settings, box: Box | None, model: Path | None, part: slice = WHOLE) -> int:
+def main(source: str, settings: Settings, box: Box | None, model: Path | None, part: slice = ALL_FRAMES) -> int:
     """Run a pipeline for whoever subscribes, until the source ends or a signal comes.
 
     Returns

@@ -15,7 +15,7 @@ from catstream.errors import BoxError
     ids=["commas", "blanks", "tuple", "array", "iterator"],
 )
 def test_a_box_is_read_from_a_text_and_from_any_four_numbers(value):
-    assert Box.of(value) == Box(10.0, 20.0, 30.0, 40.0)
+    assert Box.parse(value) == Box(10.0, 20.0, 30.0, 40.0)
 
 
 @pytest.mark.parametrize(
@@ -25,11 +25,11 @@ def test_what_is_not_four_numbers_is_an_error_of_one_line_with_an_example(value)
     with pytest.raises(
         BoxError, match=r"a box is four numbers x,y,w,h in pixels, got .*: for example 120,80,64,48"
     ) as told:
-        Box.of(value)
+        Box.parse(value)
     assert "\n" not in str(told.value)
 
 
 def test_what_is_far_too_long_is_quoted_short():
     with pytest.raises(BoxError) as told:
-        Box.of(np.zeros((480, 640, 3)))
+        Box.parse(np.zeros((480, 640, 3)))
     assert len(str(told.value)) < 200

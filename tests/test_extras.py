@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from catstream.errors import MissingExtraError
-from catstream.extras import EXTRAS, install_command, need
+from catstream.extras import EXTRAS, install_command, require_extra
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 OPTIONAL = PROJECT["optional-dependencies"]
@@ -46,7 +46,7 @@ def test_a_package_whose_extra_is_missing_says_the_command(monkeypatch, package,
 
 @pytest.mark.parametrize("extra", EXTRAS)
 def test_an_extra_that_is_installed_says_nothing(extra):
-    need(extra)
+    require_extra(extra)
 
 
 def test_the_command_is_of_this_environment(monkeypatch):

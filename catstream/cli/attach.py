@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import click
 from rich.console import Console
 
-from catstream.subscription import knock
+from catstream.subscription import wait_until_running
 from catstream.wire.endpoint import Endpoint
 
 __all__ = ["wait_for_pipeline", "with_endpoint", "with_wait"]
@@ -41,4 +41,4 @@ def wait_for_pipeline(endpoint: str, keys: str, seconds: float) -> Endpoint:
         If no process answers in time.
     """
     with Console(stderr=True).status(f"waiting for a pipeline {endpoint and f'at {endpoint}'}"):
-        return knock(endpoint, keys, seconds)
+        return wait_until_running(endpoint, keys, seconds)

@@ -97,7 +97,7 @@ def set_box(pipeline: Control, box: str, keep: bool) -> str:
       catstream set-box 120,80,64,48
       catstream set-box 118,83,64,48 --keep
     """
-    return pipeline.set_box(Box.of(box), keep=keep).reason
+    return pipeline.set_box(Box.parse(box), keep=keep).reason
 
 
 @click.command()

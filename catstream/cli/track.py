@@ -20,7 +20,7 @@ from catstream.cli import INTERRUPTED
 from catstream.cli.interrupts import Interrupts
 from catstream.cli.serving import PORT, Address, AddressType, with_token
 from catstream.errors import ServiceError
-from catstream.extras import need
+from catstream.extras import require_extra
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
@@ -158,7 +158,7 @@ def track(
         save_model=notes.get("save_model"),
     )
     if view is not None:
-        need("view")
+        require_extra("view")
     output = Path(notes["output"]) if "output" in notes else None
     files = RunFiles(
         pipeline.name,

@@ -94,7 +94,7 @@ class Detector:
         """
         frame = Pyramid.of(image)
         # The window is wider than the object: the edge of an object tells most about where it is.
-        box = Box(*map(float, box)).inside(*frame.size)
+        box = Box(*map(float, box)).validated(*frame.size)
         window, scm = box.scaled(self.settings.search.context), None
         if self.settings.teaching.bootstrap == "scm":
             from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
@@ -146,7 +146,7 @@ class Detector:
             As `init` does.
         """
         frame = Pyramid.of(image)
-        self._box = self._sure_box = Box(*map(float, box)).inside(*frame.size).scaled(self.settings.search.context)
+        self._box = self._sure_box = Box(*map(float, box)).validated(*frame.size).scaled(self.settings.search.context)
         self.seq, self.state = self.seq + 1, "present"
         self._elsewhere, self._first_box = False, self._first_box or self._box
         self._balance = Balance()  # this box says anew where in it the colours lie
@@ -228,14 +228,14 @@ class Detector:
         frame = Pyramid.of(image)
         if self._scm is not None:
             score, box = self._scm.step(image)  # it has no word for absent
-            self._box = box.scaled(settings.search.context).held_in(*frame.size)
+            self._box = box.scaled(settings.search.context).with_centre_in(*frame.size)
             return self._answer(time, score, self._lesson(frame, Found(score, self._box)))
         found = self._find(frame) if self._first_box else self._seek(frame)
         self._elsewhere &= found.score < settings.belief.trust_score
         there = self._first_box is not None and self._there(found.score)
         if there:
             self.state = "present" if self.model.version else "bootstrapping"
-            self._box = self._balanced(extent.followed(self._box, found, settings), found).held_in(*frame.size)
+            self._box = self._balanced(extent.followed(self._box, found, settings), found).with_centre_in(*frame.size)
             if found.score >= settings.belief.confident_score:
                 self._sure_box = self._box
         else:

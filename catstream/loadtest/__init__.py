@@ -1,5 +1,5 @@
 """Load tests: real pipelines on a broadcast whose every frame is known, at a rate that does not wait for them."""
 
-from catstream.extras import need
+from catstream.extras import require_extra
 
-need("loadtest")
+require_extra("loadtest")

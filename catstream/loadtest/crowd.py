@@ -11,7 +11,7 @@ from catstream.loadtest.children import SPAWN, start
 from catstream.loadtest.listening import rounds
 from catstream.messages import End
 from catstream.services.loop import die_with
-from catstream.subscription import Gaps
+from catstream.subscription import GapCounter
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Subscriber
 
@@ -105,7 +105,7 @@ def _listen(
     die_with(parent)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     readers = {number: Subscriber("tracks", Endpoint.parse(endpoint, keys)) for number in numbers}
-    gaps = {number: Gaps() for number in numbers}
+    gaps = {number: GapCounter() for number in numbers}
     most, pause = pace
     for number, message in rounds(readers, pause, most):
         gaps[number].take(message.seq)

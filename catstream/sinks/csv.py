@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from catstream.messages import Track
 from catstream.sinks.lines import LineSink
-from catstream.video.results import COLUMNS, row, track_of
+from catstream.video.results import COLUMNS, format_row, parse_row
 
 __all__ = ["CsvSink"]
 
@@ -16,9 +16,9 @@ class CsvSink(LineSink):
 
     def line(self, track: Track) -> str:
         """The row of a track."""
-        return row(track)
+        return format_row(track)
 
     @classmethod
     def track(cls, line: str) -> Track:
         """The track of a row, without the time stamp of a live stream."""
-        return track_of(line)
+        return parse_row(line)

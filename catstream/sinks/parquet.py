@@ -12,7 +12,7 @@ from contextlib import closing
 from pathlib import Path
 
 from catstream.errors import VideoError
-from catstream.extras import need
+from catstream.extras import require_extra
 from catstream.messages import Track
 from catstream.sinks.sqlite import SqliteSink, track_of
 
@@ -37,7 +37,7 @@ class ParquetSink:
     """
 
     def __init__(self, path: Path, keep: int | None = None) -> None:
-        need("parquet")
+        require_extra("parquet")
         self.path, self._database = path, database_of(path)
         closed = path.exists() and not self._database.exists()
         self._rows = SqliteSink(self._database, keep)
@@ -71,7 +71,7 @@ def database_of(path: Path) -> Path:
 
 
 def _read(path: Path) -> Iterator[Track]:
-    need("parquet")
+    require_extra("parquet")
     from pyarrow.parquet import ParquetFile
 
     try:

@@ -116,7 +116,7 @@ class RunFiles:
         begun: list[Callable[[Track], None]] = []  # of the files that begin at the first frame
         with ExitStack() as stack:
             if self.output is not None:
-                new = not (self.output / results.table(self.name)).exists()
+                new = not (self.output / results.table_file(self.name)).exists()
                 discard(self._film())
                 writer = stack.enter_context(ResultsWriter(self.output, self.name, keep=keep))
                 rows.append(writer)
@@ -146,7 +146,7 @@ class RunFiles:
         """The results files, the video too."""
         if self.output is None:
             return []
-        return [*(self.output / file for file in results.files(self.name)), self._film()]
+        return [*(self.output / file for file in results.result_files(self.name)), self._film()]
 
     def _film(self) -> Path:
         return (self.output or Path()) / f"{self.name}.mp4"
@@ -154,9 +154,9 @@ class RunFiles:
     def _earlier(self) -> list[tuple[int, Callable[[], Iterator[Track]]]]:
         """Of each file that is there and holds all tracks: how many frames, and what reads them."""
         found: list[tuple[int, Callable[[], Iterator[Track]]]] = []
-        if self.output is not None and (self.output / results.table(self.name)).exists():
-            held = results.whole(self.output, self.name)
-            found.append((held, partial(results.tracks, self.output, self.name)))
+        if self.output is not None and (self.output / results.table_file(self.name)).exists():
+            held = results.complete_frames(self.output, self.name)
+            found.append((held, partial(results.read_tracks, self.output, self.name)))
         for file in self.files:
             read = reader(file)
             if read is not None and is_there(file):

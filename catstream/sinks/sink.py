@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from catstream.errors import VideoError
-from catstream.extras import need
+from catstream.extras import require_extra
 from catstream.messages import Track
 from catstream.sinks import parquet
 from catstream.sinks.csv import CsvSink
@@ -26,7 +26,7 @@ from catstream.sinks.sqlite import SqliteSink
 from catstream.sinks.video import VideoSink
 from catstream.storage import is_writable
 from catstream.video.frames import RATE
-from catstream.video.source import WHOLE
+from catstream.video.source import ALL_FRAMES
 
 __all__ = ["STDOUT", "SUFFIXES", "Sink", "check", "discard", "is_closed", "is_there", "open_sink", "reader"]
 
@@ -83,7 +83,7 @@ def check(path: Path, *, there: bool = False) -> None:
     if not there and is_there(path):
         raise VideoError(f"{path} is there already: give another name, or remove it")
     if path.suffix == ".parquet":
-        need("parquet")
+        require_extra("parquet")
     if path.is_dir() or not is_writable(path.parent):
         raise VideoError(f"cannot write {path}: give a file in a folder that exists and that you may write to")
 
@@ -106,7 +106,7 @@ def reader(path: Path) -> Callable[[Path], Iterator[Track]] | None:
 def open_sink(
     path: Path,
     source: str | None = None,
-    part: slice = WHOLE,
+    part: slice = ALL_FRAMES,
     *,
     image_rate: float = RATE,
     keep: int | None = None,

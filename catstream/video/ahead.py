@@ -7,10 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 from catstream.video.frames import Frame, Source
 
-__all__ = ["ahead"]
+__all__ = ["read_ahead"]
 
 
-def ahead(source: Source) -> Generator[Frame]:
+def read_ahead(source: Source) -> Generator[Frame]:
     """The frames of a source, one of them read before it is asked for: FFmpeg decodes without Python's lock.
 
     Not for a live source, whose newest frame it would hold back. Raises what the source raises, in its turn. Close it

@@ -21,7 +21,7 @@ _WHITE, _GREY, _DARK, _ORANGE = (245, 245, 245), (110, 110, 110), (32, 32, 32), 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 #: Height of the line of text below a picture, in pixels of one that is 640 wide; never less than three quarters of it.
-_LINE, _LEAST_UNIT = 26, 0.75
+_TEXT_HEIGHT, _MIN_UNIT = 26, 0.75
 
 
 def draw(image: np.ndarray, track: Track) -> np.ndarray:
@@ -37,15 +37,15 @@ def draw(image: np.ndarray, track: Track) -> np.ndarray:
     uint8 (h + k, w, 3), the frame above k rows of text: pixels keep their place, and none is covered by the text
     """
     height, width = image.shape[:2]
-    unit = max(width / 640, _LEAST_UNIT)
-    canvas = np.zeros((height + _line(width), width, 3), np.uint8)
+    unit = max(width / 640, _MIN_UNIT)
+    canvas = np.zeros((height + _text_height(width), width, 3), np.uint8)
     picture = canvas[:height]
     picture[:] = image
     colour = _COLOURS[track.state]
     if track.box is not None:
         x, y, w, h = track.box
-        _frame(picture, (x, y), (x + w, y + h), colour, width / 640)
-    _write_line(canvas[height:], track, colour, unit)
+        _draw_box(picture, (x, y), (x + w, y + h), colour, width / 640)
+    _draw_text(canvas[height:], track, colour, unit)
     return canvas
 
 
@@ -60,7 +60,7 @@ def draw_preview(preview: Preview, track: Track | None) -> bytes:
     if image is None:
         return preview.jpeg
     if track is None:
-        image = np.vstack([image, np.full((_line(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
+        image = np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
     else:
         scale = image.shape[1] / preview.width
         box = None if track.box is None else Box(*(side * scale for side in track.box))
@@ -92,12 +92,12 @@ def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int)
     return cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
 
 
-def _line(width: int) -> int:
+def _text_height(width: int) -> int:
     """Rows of text below a picture of this width."""
-    return round(_LINE * max(width / 640, _LEAST_UNIT))
+    return round(_TEXT_HEIGHT * max(width / 640, _MIN_UNIT))
 
 
-def _frame(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float) -> None:
+def _draw_box(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float) -> None:
     """A thin rectangle with strong corners, over a dark one, so that it shows on any background."""
     (left, top), (right, bottom) = (tuple(round(value) for value in corner) for corner in (start, end))
     thin, arm = max(1, round(1.2 * unit)), min(right - left, bottom - top) // 4
@@ -109,7 +109,7 @@ def _frame(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float) -
             cv2.polylines(canvas, [corner], False, colour, max(2, round(3 * unit)), cv2.LINE_AA)
 
 
-def _write_line(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> None:
+def _draw_text(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> None:
     """State, score as a bar and as a number, model and frame; in a narrow picture only the first of these."""
     height, width = canvas.shape[:2]
     canvas[:] = _DARK
@@ -157,7 +157,7 @@ class AnnotatedVideo:
 
     def __init__(self, path: str | Path, rate: float, size: tuple[int, int], *, sound: Path | None = None) -> None:
         width, height = size
-        self._writer = VideoWriter(path, rate, (width, height + _line(width)), sound=sound)
+        self._writer = VideoWriter(path, rate, (width, height + _text_height(width)), sound=sound)
 
     def write(self, image: np.ndarray, track: Track, time: float | None = None) -> None:
         """Add a frame, uint8 (h, w, 3) of the size announced, with its track; `time` as `VideoWriter.write` has it."""

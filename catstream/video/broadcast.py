@@ -28,9 +28,9 @@ import numpy as np
 
 __all__ = ["Broadcast", "Schedule", "jpeg"]
 
-_QUALITY = 90  # of JPEG: what cameras send
-_TICKS = 1_000_000  # of the stream's clock in a second
-_STILL = 25.0  # frames a second before anything is played
+_JPEG_QUALITY = 90  # of JPEG: what cameras send
+_TICKS_PER_SECOND = 1_000_000  # of the stream's clock in a second
+_STILL_RATE = 25.0  # frames a second before anything is played
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class Schedule:
 
 def jpeg(image: np.ndarray) -> bytes:
     """An image as a camera sends it."""
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
 
 
 class Broadcast:
@@ -96,9 +96,9 @@ class Broadcast:
 
     def __init__(self, pictures: Sequence[bytes], size: tuple[int, int], streams: int = 1) -> None:
         self._pictures, self._size, self._closed = pictures, size, threading.Event()
-        self._schedules = [Schedule(monotonic(), _STILL, frames=1)] * streams
+        self._schedules = [Schedule(monotonic(), _STILL_RATE, frames=1)] * streams
         self.late = 0.0
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Viewer, self))
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_ConnectionHandler, self))
         self._server.daemon_threads = True
         self.urls = [f"http://127.0.0.1:{self._server.server_port}/{number}" for number in range(streams)]
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
@@ -117,14 +117,14 @@ class Broadcast:
         """Send a stream to a reader until it is gone."""
         import av
 
-        clock, pipe = Fraction(1, _TICKS), _Pipe(file)
+        clock, pipe = Fraction(1, _TICKS_PER_SECOND), _WriteOnlyFile(file)
         with av.open(pipe, "w", format="nut", options={"flush_packets": "1"}) as container:
-            track: Any = container.add_stream("mjpeg", rate=Fraction(_STILL))
+            track: Any = container.add_stream("mjpeg", rate=Fraction(_STILL_RATE))
             track.width, track.height, track.pix_fmt, track.time_base = *self._size, "yuvj420p", clock
             for moment, picture in self._frames(stream):
                 packet = av.Packet(self._pictures[picture])
                 packet.stream, packet.time_base, packet.is_keyframe = track, clock, True
-                packet.pts = packet.dts = round(moment * _TICKS)
+                packet.pts = packet.dts = round(moment * _TICKS_PER_SECOND)
                 container.mux(packet)
                 if pipe.broken:
                     break
@@ -150,16 +150,16 @@ class Broadcast:
             while schedule is self._schedules[stream]:
                 due = schedule.due(number)
                 if (left := due - monotonic()) > 0:
-                    if self._closed.wait(min(left, 1 / _STILL)):
+                    if self._closed.wait(min(left, 1 / _STILL_RATE)):
                         return
-                    if left > 1 / _STILL:
+                    if left > 1 / _STILL_RATE:
                         continue
                     self.late = max(self.late, monotonic() - due)
                 yield due, schedule.picture(number, len(self._pictures))
                 number += 1
 
 
-class _Viewer(BaseHTTPRequestHandler):
+class _ConnectionHandler(BaseHTTPRequestHandler):
     """One connection."""
 
     disable_nagle_algorithm = True  # or the end of a frame waits for a delayed acknowledgement: 40 ms
@@ -182,7 +182,7 @@ class _Viewer(BaseHTTPRequestHandler):
         pass
 
 
-class _Pipe:
+class _WriteOnlyFile:
     """A file that can only be written to, as PyAV takes it; an error in it would be one of FFmpeg's, and unlike others.
 
     broken  whether the reader has left

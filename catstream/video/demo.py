@@ -102,11 +102,11 @@ def render(
     box : around the whole dahlia, also where a part is covered or outside; None
         where less than a tenth of it is to be seen
     """
-    stage = _Stage(seed)
+    scene = _Scene(seed)
     width, height = size
     across, down = width / SIZE[0], height / SIZE[1]
     for number in range(begin, begin + frames):
-        image, box = stage.shoot(FRAMES - 1 - abs(number % (2 * FRAMES - 2) - (FRAMES - 1)))
+        image, box = scene.render(FRAMES - 1 - abs(number % (2 * FRAMES - 2) - (FRAMES - 1)))
         if (width, height) != SIZE:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
             box = box and Box(box.x * across, box.y * down, box.w * across, box.h * down)
@@ -147,27 +147,27 @@ def write(
     return path, truth
 
 
-def _photograph(name: str) -> np.ndarray:
+def _load_photograph(name: str) -> np.ndarray:
     """One that scikit-learn ships, float32 BGR; its own function to load them needs Pillow."""
     path = files("sklearn") / "datasets" / "images" / f"{name}.jpg"
     return np.array(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR), np.float32)
 
 
-class _Stage:
+class _Scene:
     """The two photographs, cut up and ready: float32 colours of 0 to 255."""
 
     def __init__(self, seed: int) -> None:
-        lake, flower = _photograph("china"), _photograph("flower")
+        lake, flower = _load_photograph("china"), _load_photograph("flower")
         self.lake = cv2.resize(lake, None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_CUBIC).clip(0, 255)
         pagoda = cv2.fillPoly(np.zeros(self.lake.shape[:2], np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
         self.pagoda = cv2.GaussianBlur(pagoda, (0, 0), 1.2)
-        self.dahlia, self.mask, self.outline = _cut(flower)
+        self.dahlia, self.mask, self.outline = _cut_out_flower(flower)
         self.decoy = self.dahlia[..., [2, 0, 1]] * np.float32(0.9)
-        self.flight, self.away, self.camera = (_smooth(keys) for keys in (_FLIGHT, _DECOY, _CAMERA))
+        self.flight, self.away, self.camera = (_interpolate(keys) for keys in (_FLIGHT, _DECOY, _CAMERA))
         self.rng = np.random.default_rng(seed)
         self.noise = self.rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
 
-    def shoot(self, frame: int) -> tuple[np.ndarray, Box | None]:
+    def render(self, frame: int) -> tuple[np.ndarray, Box | None]:
         """The image of one frame of the story, full size, and the box."""
         left, top, light = self.camera[frame]
         sway = 3 * np.sin(frame / np.array([7.3, 5.1]))  # the camera is held by hand
@@ -175,9 +175,9 @@ class _Stage:
         image = cv2.warpAffine(self.lake, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
         front = cv2.warpAffine(self.pagoda, view, SIZE)
 
-        self._place(image, self.decoy, self._turn(self.away[frame], view), 1 - front)
-        turn = self._turn(self.flight[frame], view)
-        seen = self._place(image, self.dahlia, turn, 1 - front if frame <= _BEHIND else np.ones_like(front))
+        self._paint(image, self.decoy, self._flower_to_picture(self.away[frame], view), 1 - front)
+        turn = self._flower_to_picture(self.flight[frame], view)
+        seen = self._paint(image, self.dahlia, turn, 1 - front if frame <= _BEHIND else np.ones_like(front))
         low, high = self._limits(turn)
 
         y, x = self.rng.integers(SIZE[1]), self.rng.integers(SIZE[0])
@@ -185,7 +185,7 @@ class _Stage:
         box = Box(*map(float, (*low, *(high - low)))) if seen >= _VISIBLE else None
         return image.clip(0, 255).astype(np.uint8), box
 
-    def _turn(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
+    def _flower_to_picture(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
         """The affine map from the cut flower to the picture, float64 (2, 3)."""
         x, y, diameter, angle = place
         side = self.mask.shape[0]
@@ -198,7 +198,7 @@ class _Stage:
         points = self.outline @ turn[:, :2].T + turn[:, 2]
         return points.min(axis=0), points.max(axis=0)
 
-    def _place(self, image: np.ndarray, flower: np.ndarray, turn: np.ndarray, free: np.ndarray) -> float:
+    def _paint(self, image: np.ndarray, flower: np.ndarray, turn: np.ndarray, free: np.ndarray) -> float:
         """Lay the flower over the image where that is free; returns the share of it that shows."""
         low, high = self._limits(turn)
         left, top = np.maximum(np.floor(low) - 2, 0).astype(int)
@@ -213,7 +213,7 @@ class _Stage:
         return float(alpha.sum() / (self.mask.sum() * abs(np.linalg.det(turn[:, :2]))))
 
 
-def _cut(photograph: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cut_out_flower(photograph: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The large flower in a square: colours (s, s, 3), soft mask (s, s), outline points (k, 2)."""
     (x, y), reach, side = _DAHLIA, 144, 160
     window = slice(y - reach, y + reach), slice(x - reach, x + reach)
@@ -227,7 +227,7 @@ def _cut(photograph: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return colours, mask, outline[:, 0].astype(float)
 
 
-def _smooth(keys: np.ndarray) -> np.ndarray:
+def _interpolate(keys: np.ndarray) -> np.ndarray:
     """Key frames drawn out to a row for each of FRAMES frames, their corners rounded."""
     bend = np.hanning(27)[1:-1]
     frames = np.arange(FRAMES + len(bend) - 1) - len(bend) // 2

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-__all__ = ["RATE", "Frame", "Source", "Upright", "reason", "without_password"]
+__all__ = ["RATE", "Frame", "Source", "UprightConverter", "ffmpeg_reason", "without_password"]
 
 #: Frames per second of a source without a clock, if none is given.
 RATE = 25.0
@@ -78,7 +78,7 @@ class Source(ABC):
         self.close()
 
 
-class Upright:
+class UprightConverter:
     """Images of frames that PyAV decoded: phones store upright videos lying down, and the turn beside them.
 
     One for each source: to begin a conversion costs more than to convert.
@@ -94,7 +94,7 @@ class Upright:
         return np.ascontiguousarray(np.rot90(image, frame.rotation // 90))
 
 
-def reason(error: Any) -> str:
+def ffmpeg_reason(error: Any) -> str:
     """What FFmpeg says went wrong, in its words."""
     return (error.strerror or str(error)).lower()
 

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import cv2
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, Upright, reason, without_password
+from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, without_password
 
 __all__ = ["LiveSource"]
 
@@ -62,25 +62,25 @@ class LiveSource(Source):
     ) -> None:
         super().__init__(_name(text), RATE, (0, 0))
         self.skipped = self.reopened = 0
-        self._text, self._shown = text, without_password(text)
+        self._text, self._address = text, without_password(text)
         self._number, self._zero, self._idle = start, since, idle
-        self._upright = Upright()
-        self._news = threading.Condition()  # guards what follows
+        self._upright = UprightConverter()
+        self._condition = threading.Condition()  # guards what follows
         self._newest: tuple[float, Any] | None = None
         self._problem = ""  # why it is lost, empty while it is not
-        self._heard = monotonic()  # when the last frame came
+        self._last_frame_time = monotonic()  # when the last frame came
         self._closed = False
-        self._was_there = idle is not None  # without it, a source that never was there is an error, and not lost
+        self._was_open = idle is not None  # without it, a source that never was there is an error, and not lost
         self._thread = threading.Thread(target=self._read, name=f"reader of {self.name}", daemon=True)
         self._thread.start()
         self._first: Frame | None = None
         if idle is None:
-            self._first = self._opened()
+            self._first = self._first_frame()
 
     @property
     def counters(self) -> dict[str, float]:
         """`skipped`, `reopened`, and `lost_seconds`: how long it has been lost, 0 while it is not."""
-        silent = monotonic() - self._heard
+        silent = monotonic() - self._last_frame_time
         # A device that hangs is beyond every time-out of FFmpeg: at least it is said.
         lost = silent if self._problem or silent > _OPEN_SECONDS else 0.0
         return {"skipped": self.skipped, "reopened": self.reopened, "lost_seconds": lost}
@@ -89,35 +89,35 @@ class LiveSource(Source):
         if self._first is not None:
             frame, self._first = self._first, None
             return frame
-        while (newest := self._take()) is None:
+        while (newest := self._wait_for_newest()) is None:
             if self._closed or (self._idle is not None and self._idle()):
                 raise StopIteration
         return self._frame(*newest)
 
     def close(self) -> None:
-        with self._news:
+        with self._condition:
             self._closed, self._first, self._newest = True, None, None
-            self._news.notify_all()
+            self._condition.notify_all()
         # One that is frozen is not waited for: its thread ends with its time-out, or with the process.
         self._thread.join(1.0)
 
-    def _opened(self) -> Frame:
+    def _first_frame(self) -> Frame:
         """The first frame, or a VideoError: where a source was never there, its name is more likely wrong."""
-        while (newest := self._take()) is None:
+        while (newest := self._wait_for_newest()) is None:
             if self._problem:
                 self.close()
                 hint = f"; the folder of that name is ./{self._text}" if self._text.isdigit() else ""
                 raise VideoError(
-                    f"cannot open {self._shown!r} ({self._problem}): check that it is there and running, "
+                    f"cannot open {self._address!r} ({self._problem}): check that it is there and running, "
                     f"and its address{hint}"
                 )
         return self._frame(*newest)
 
-    def _take(self) -> tuple[float, Any] | None:
+    def _wait_for_newest(self) -> tuple[float, Any] | None:
         """The newest frame and when it came, None where none comes for a moment."""
-        with self._news:
+        with self._condition:
             if self._newest is None and not self._closed:
-                self._news.wait(_IDLE_SECONDS)
+                self._condition.wait(_IDLE_SECONDS)
             newest, self._newest = self._newest, None
         return newest
 
@@ -143,24 +143,24 @@ class LiveSource(Source):
             opened, problem = monotonic(), "it ended"
             try:
                 for decoded in self._decoded():
-                    self._keep(monotonic(), decoded)
+                    self._store_newest(monotonic(), decoded)
                     pause = _FIRST_PAUSE
             except av.FFmpegError as error:
-                problem = reason(error)
+                problem = ffmpeg_reason(error)
             except Exception as error:  # whatever it is: nobody would notice a thread that is gone
                 problem = str(error)
-            if monotonic() - max(opened, self._heard) >= _SILENT_SECONDS:
+            if monotonic() - max(opened, self._last_frame_time) >= _SILENT_SECONDS:
                 problem = "no picture comes"  # FFmpeg has many words for a time-out, and none of them says so
-            with self._news:
-                self._lose(problem)
-                self._news.wait_for(lambda: self._closed, pause * random.uniform(0.5, 1))
+            with self._condition:
+                self._report_loss(problem)
+                self._condition.wait_for(lambda: self._closed, pause * random.uniform(0.5, 1))
             pause = min(2 * pause, _LONGEST_PAUSE)
 
     def _decoded(self) -> Iterator[Any]:
         """Frames of one opening, up to its end; those that came damaged are left out."""
         import av
 
-        with _container(self._text) as container:
+        with _open_container(self._text) as container:
             stream = container.streams.video[0]
             stream.thread_type = "NONE"  # the processes are the parallelism
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
@@ -176,25 +176,25 @@ class LiveSource(Source):
                         due = monotonic() + _SILENT_SECONDS
                         yield frame
 
-    def _keep(self, moment: float, decoded: Any) -> None:
-        with self._news:
+    def _store_newest(self, moment: float, decoded: Any) -> None:
+        with self._condition:
             if self._closed:
                 return
             if self._problem:
                 self.reopened += 1
-                _log.warning("the source %s is back after %.1f s", self.name, moment - self._heard)
+                _log.warning("the source %s is back after %.1f s", self.name, moment - self._last_frame_time)
             self.skipped += self._newest is not None
-            self._newest, self._heard, self._problem, self._was_there = (moment, decoded), moment, "", True
-            self._news.notify()
+            self._newest, self._last_frame_time, self._problem, self._was_open = (moment, decoded), moment, "", True
+            self._condition.notify()
 
-    def _lose(self, problem: str) -> None:
+    def _report_loss(self, problem: str) -> None:
         """Say why, where that is news: a source may be away for days."""
-        if problem != self._problem and self._was_there and not self._closed:
+        if problem != self._problem and self._was_open and not self._closed:
             _log.warning("the source %s is lost (%s), and is opened again until it is back", self.name, problem)
         self._problem = problem
 
 
-def _container(text: str) -> Any:
+def _open_container(text: str) -> Any:
     """Open a camera or a stream; raises what PyAV raises, and VideoError where it holds no live picture."""
     import av
 

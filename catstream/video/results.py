@@ -22,7 +22,16 @@ from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import Track
 
-__all__ = ["COLUMNS", "ResultsWriter", "files", "row", "table", "track_of", "tracks", "whole"]
+__all__ = [
+    "COLUMNS",
+    "ResultsWriter",
+    "complete_frames",
+    "format_row",
+    "parse_row",
+    "read_tracks",
+    "result_files",
+    "table_file",
+]
 
 #: Of NAME.csv.
 COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version"
@@ -30,23 +39,23 @@ COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version"
 _ABSENT = "nan,nan,nan,nan"
 
 
-def table(name: str) -> str:
+def table_file(name: str) -> str:
     """Name of the file with a row a track."""
     return f"{name}.csv"
 
 
-def files(name: str) -> tuple[str, ...]:
+def result_files(name: str) -> tuple[str, ...]:
     """Names of all results files of a run."""
-    return (*_rows(name), table(name))
+    return (*_row_files(name), table_file(name))
 
 
-def row(track: Track) -> str:
+def format_row(track: Track) -> str:
     """The row of a track in NAME.csv."""
     box = ",,," if track.box is None else _sides(track.box)
     return f"{track.frame},{track.time:.6f},{track.state},{box},{track.score:.6f},{track.model_version}"
 
 
-def track_of(text: str) -> Track:
+def parse_row(text: str) -> Track:
     """The track of such a row; raises ValueError if it is none."""
     frame, seconds, state, x, y, w, h, score, version = text.split(",")
     box = Box(*map(float, (x, y, w, h))) if x else None
@@ -84,12 +93,12 @@ class ResultsWriter:
             with contextlib.ExitStack() as stack:
                 self.directory.mkdir(parents=True, exist_ok=True)
                 if keep is not None:
-                    self.rows = _cut(self.directory, name, keep)
+                    self.rows = _truncate(self.directory, name, keep)
                 self._boxes, self._scores, self._times, self._tracks = (
                     stack.enter_context(
                         (self.directory / file).open("w" if keep is None else "a", encoding="ascii", buffering=1)
                     )
-                    for file in files(name)
+                    for file in result_files(name)
                 )
                 if not self._tracks.tell():
                     self._tracks.write(COLUMNS + "\n")
@@ -104,11 +113,11 @@ class ResultsWriter:
         """Add one frame, and the seconds of work it took. A frame that has its row already is skipped."""
         if track.frame < self.rows:
             return
-        with self._to_disk():
+        with self._reporting_errors():
             for _ in range(track.frame - self.rows):
                 self._row(_ABSENT, "nan", "nan")
             self._row(_ABSENT if track.box is None else _sides(track.box), f"{track.score:.6f}", f"{seconds:.6f}")
-            self._tracks.write(row(track) + "\n")
+            self._tracks.write(format_row(track) + "\n")
         self.rows = track.frame + 1
 
     def _row(self, box: str, score: str, seconds: str) -> None:
@@ -117,11 +126,11 @@ class ResultsWriter:
 
     def close(self) -> None:
         """Close the files; what was written stays."""
-        with self._to_disk():  # where a row was not taken, it is tried once more
+        with self._reporting_errors():  # where a row was not taken, it is tried once more
             self._files.close()
 
     @contextlib.contextmanager
-    def _to_disk(self) -> Iterator[None]:
+    def _reporting_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -134,30 +143,30 @@ class ResultsWriter:
         self.close()
 
 
-def tracks(directory: Path, name: str) -> Iterator[Track]:
+def read_tracks(directory: Path, name: str) -> Iterator[Track]:
     """The tracks that `NAME.csv` holds, up to the first that is not whole; none where there is no file."""
-    for _, track in _lines(directory / table(name)):
+    for _, track in _parsed_lines(directory / table_file(name)):
         yield track
 
 
-def whole(directory: Path, name: str) -> int:
+def complete_frames(directory: Path, name: str) -> int:
     """How many frames are whole in every file."""
-    least = min(len(_row_ends(directory / file)) - 1 for file in _rows(name))
-    return max((track.frame + 1 for track in tracks(directory, name) if track.frame < least), default=0)
+    least = min(len(_row_ends(directory / file)) - 1 for file in _row_files(name))
+    return max((track.frame + 1 for track in read_tracks(directory, name) if track.frame < least), default=0)
 
 
-def _rows(name: str) -> tuple[str, ...]:
+def _row_files(name: str) -> tuple[str, ...]:
     """Files with a row a frame, also of one that no track was written for."""
     return f"{name}.txt", f"{name}_confidence.value", f"{name}_time.txt"
 
 
-def _lines(path: Path) -> Iterator[tuple[int, Track]]:
+def _parsed_lines(path: Path) -> Iterator[tuple[int, Track]]:
     """Where each line of `NAME.csv` ends, in bytes, and its track."""
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         end = len(file.readline())
         for line in file:
             try:
-                track = track_of(line.decode("ascii"))
+                track = parse_row(line.decode("ascii"))
             except ValueError:  # half a line, or what a disk holds where nothing was written yet
                 return
             if not line.endswith(b"\n"):
@@ -183,13 +192,13 @@ def _row_ends(path: Path) -> list[int]:
     return ends
 
 
-def _cut(directory: Path, name: str, keep: int) -> int:
+def _truncate(directory: Path, name: str, keep: int) -> int:
     """Keep so many frames, if so many are whole in every file, and cut off the others; returns how many are kept."""
-    rows = min(whole(directory, name), keep)
-    for file in _rows(name):
+    rows = min(complete_frames(directory, name), keep)
+    for file in _row_files(name):
         if (directory / file).exists():
             os.truncate(directory / file, _row_ends(directory / file)[rows])
-    if (path := directory / table(name)).exists():
-        ends = [end for end, track in _lines(path) if track.frame < rows]
+    if (path := directory / table_file(name)).exists():
+        ends = [end for end, track in _parsed_lines(path) if track.frame < rows]
         os.truncate(path, ends[-1] if ends else 0)
     return rows

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from catstream.video.frames import reason
+from catstream.video.frames import ffmpeg_reason
 
 __all__ = ["Sound"]
 
@@ -58,7 +58,7 @@ class Sound:
                 packet = self._next or next(self._packets)
             except (StopIteration, av.FFmpegError) as error:
                 if isinstance(error, av.FFmpegError):
-                    _log.warning("the sound ends at %.1f s: %s", end, reason(error))
+                    _log.warning("the sound ends at %.1f s: %s", end, ffmpeg_reason(error))
                 self.close()
                 return
             self._next = None

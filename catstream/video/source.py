@@ -35,34 +35,34 @@ import cv2
 import numpy as np
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, Upright, reason
+from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason
 
-__all__ = ["WHOLE", "image_files", "is_live", "natural_order", "open_source", "without_scheme"]
+__all__ = ["ALL_FRAMES", "image_files", "is_live", "natural_order", "open_source", "without_scheme"]
 
 #: All frames of a source.
-WHOLE = slice(None)
+ALL_FRAMES = slice(None)
 
 _IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 _VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
 _FOLDERS = ("img", "imgs", "color", "rgb")
-_HELP = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
-_LIVE = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+")
+_EXPECTED = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
+_LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+")
 
 #: A video that ends this much before its container says was cut off: rounding and audio explain less.
-_SHORT_SECONDS = 0.5
+_CUT_OFF_SECONDS = 0.5
 
 
 #: Reading a container that fails so often in a row, without a packet between, has come to its end.
-_MOST_FAILURES = 3
+_MAX_FAILURES = 3
 
 #: Bytes between two packets of a Matroska file that belong to none: the heads of clusters and blocks have far fewer.
-_MOST_BETWEEN = 4096
+_MAX_BYTES_BETWEEN_PACKETS = 4096
 
 #: A file larger than this, in bytes, is not read through to count its frames.
-_MOST_COUNTED = 1 << 30
+_MAX_COUNTED_BYTES = 1 << 30
 
 
-class _Recording(Source):
+class _FileSource(Source):
     """A source whose frames are all read. Its constructor decodes the first one.
 
     Parameters
@@ -130,14 +130,14 @@ def is_live(text: str | Path) -> bool:
     >>> [is_live(text) for text in ("0", "/dev/video2", "rtsp://10.0.0.7/stream", "./0", "walk.mp4")]
     [True, True, True, False, False]
     """
-    return _LIVE.fullmatch(str(text)) is not None
+    return _LIVE_ADDRESS.fullmatch(str(text)) is not None
 
 
 def open_source(
     text: str | Path,
     start: int = 0,
     *,
-    part: slice = WHOLE,
+    part: slice = ALL_FRAMES,
     since: float | None = None,
     idle: Callable[[], bool] | None = None,
     image_rate: float = RATE,
@@ -167,7 +167,7 @@ def open_source(
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
         raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
     if is_live(text):
-        if part != WHOLE:
+        if part != ALL_FRAMES:
             raise VideoError("of a live source only the newest frame can be had: leave start, end and stride away")
         from catstream.video.live import LiveSource  # here, as files do without its threads
 
@@ -178,18 +178,18 @@ def open_source(
             "write the video to a file, or serve it as a stream that can be opened again"
         )
     path = Path(without_scheme(str(text)))
-    images = partial(_images, part=part, start=start, rate=image_rate)
-    video = partial(_video, part=part, start=start, skip_damaged=skip_damaged)
+    images = partial(_open_images, part=part, start=start, rate=image_rate)
+    video = partial(_open_video, part=part, start=start, skip_damaged=skip_damaged)
     try:
         if path.is_dir():
-            return _folder(path, images, video)
+            return _open_folder(path, images, video)
         if path.is_file():
             return video(path)
         if re.search(r"%0?\d*d|[*?\[]", path.name):
             return images(path.parent.resolve().name, image_files(path))
     except OSError as error:
-        raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {_HELP}") from None
-    raise VideoError(f"there is no video or folder {str(text)!r}: {_HELP}")
+        raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {_EXPECTED}") from None
+    raise VideoError(f"there is no video or folder {str(text)!r}: {_EXPECTED}")
 
 
 def without_scheme(text: str) -> str:
@@ -220,18 +220,18 @@ def image_files(path: Path) -> list[Path]:
         Where there is none.
     """
     if path.is_dir():
-        found = [file for file in path.iterdir() if file.suffix.lower() in _IMAGES]
+        files = [file for file in path.iterdir() if file.suffix.lower() in _IMAGES]
     elif number := re.search(r"%0?(\d*)d", path.name):
         digits = rf"\d{{{number[1]},}}" if number[1] else r"\d+"
         name = re.escape(path.name[: number.start()]) + digits + re.escape(path.name[number.end() :])
-        found = [file for file in path.parent.glob("*") if re.fullmatch(name, file.name)]
+        files = [file for file in path.parent.glob("*") if re.fullmatch(name, file.name)]
     else:
-        found = list(path.parent.glob(path.name))
-    found = [file for file in found if not file.name.startswith(".")]
-    if not found:
+        files = list(path.parent.glob(path.name))
+    files = [file for file in files if not file.name.startswith(".")]
+    if not files:
         kinds = ", ".join(sorted(suffix[1:] for suffix in _IMAGES))
-        raise VideoError(f"there are no images at {str(path)!r}: {_HELP} (images are {kinds})")
-    return sorted(found, key=natural_order)
+        raise VideoError(f"there are no images at {str(path)!r}: {_EXPECTED} (images are {kinds})")
+    return sorted(files, key=natural_order)
 
 
 def natural_order(path: Path) -> list[Any]:
@@ -239,7 +239,7 @@ def natural_order(path: Path) -> list[Any]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _folder(path: Path, images: Callable[..., Source], video: Callable[..., Source]) -> Source:
+def _open_folder(path: Path, images: Callable[..., Source], video: Callable[..., Source]) -> Source:
     name = path.resolve().name
     for folder in (*(path / inner for inner in _FOLDERS), path):
         if folder.is_dir() and any(file.suffix.lower() in _IMAGES for file in folder.iterdir()):
@@ -247,13 +247,13 @@ def _folder(path: Path, images: Callable[..., Source], video: Callable[..., Sour
     videos = sorted(file for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
     if len(videos) == 1:
         return video(videos[0])
-    held = f"{len(videos)} videos" if videos else "neither images nor a video"
-    raise VideoError(f"the folder {str(path)!r} holds {held}: {_HELP}")
+    content = f"{len(videos)} videos" if videos else "neither images nor a video"
+    raise VideoError(f"the folder {str(path)!r} holds {content}: {_EXPECTED}")
 
 
-def _images(name: str, files: list[Path], *, part: slice, start: int, rate: float) -> Source:
+def _open_images(name: str, files: list[Path], *, part: slice, start: int, rate: float) -> Source:
     frames = _read_images(files, range(len(files))[part], start, rate)
-    return _Recording(name, frames, lambda: len(files), part, start, rate)
+    return _FileSource(name, frames, lambda: len(files), part, start, rate)
 
 
 def _read_images(files: list[Path], wanted: range, start: int, rate: float) -> Iterator[Frame]:
@@ -280,35 +280,35 @@ def _read_image(path: Path) -> np.ndarray | None:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _video(path: Path, *, part: slice, start: int, skip_damaged: bool) -> Source:
+def _open_video(path: Path, *, part: slice, start: int, skip_damaged: bool) -> Source:
     import av  # here, as it costs 0.1 s and folders do without
 
     try:
         container = av.open(str(path.absolute()))
     except (av.FFmpegError, OSError) as error:
-        raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_HELP}") from None
+        raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_EXPECTED}") from None
     # FFmpeg renders text files as video; nobody means that.
     streams = container.streams.video
     if not streams or streams[0].codec_context is None or container.format.name == "tty":
         container.close()
-        raise VideoError(f"there is no video in {str(path)!r}: {_HELP}")
+        raise VideoError(f"there is no video in {str(path)!r}: {_EXPECTED}")
     stream = streams[0]
     rate = float(stream.average_rate or stream.guessed_rate or RATE)
     stated, damage = stream.frames, _Damage(path, skip_damaged)
     images = _read_video(path, container, rate, range(sys.maxsize)[part], start, damage)
-    source = _Recording(path.stem, images, lambda: stated or _counted(path, rate), part, start, rate, damage)
+    source = _FileSource(path.stem, images, lambda: stated or _count_frames(path, rate), part, start, rate, damage)
     source.sound = path
     return source
 
 
-def _counted(path: Path, rate: float) -> int | None:
+def _count_frames(path: Path, rate: float) -> int | None:
     """Number of frames of a video whose container does not say it: its packets, which need not be decoded."""
     import av
 
     with av.open(str(path.absolute())) as container:
         stream = container.streams.video[0]
-        if path.stat().st_size > _MOST_COUNTED:
-            return round(_stated_seconds(container, stream) * rate) or None
+        if path.stat().st_size > _MAX_COUNTED_BYTES:
+            return round(_stated_duration(container, stream) * rate) or None
         count = 0
         with contextlib.suppress(av.FFmpegError):  # reading the frames says what is damaged
             count = sum(1 for packet in container.demux(stream) if packet.size)
@@ -318,7 +318,7 @@ def _counted(path: Path, rate: float) -> int | None:
 def _read_video(path: Path, container: Any, rate: float, wanted: range, start: int, damage: _Damage) -> Iterator[Frame]:
     stream = container.streams.video[0]
     stream.thread_type = "NONE"  # the processes are the parallelism
-    number, time, zero, shape, upright = 0, 0.0, None, None, Upright()
+    number, time, zero, shape, upright = 0, 0.0, None, None, UprightConverter()
     with container:
         for frame in _good_frames(container, stream, rate, damage):
             zero = frame.pts if zero is None else zero
@@ -376,7 +376,7 @@ def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> I
             try:
                 frames = stream.codec_context.decode(packet)
             except av.FFmpegError as error:
-                problem = reason(error)
+                problem = ffmpeg_reason(error)
         if problem:  # the good frames that wait in the decoder for their turn
             with contextlib.suppress(av.FFmpegError):
                 frames = stream.codec_context.decode(None)
@@ -402,7 +402,7 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
     """Packets, the last an empty one, each with what is wrong at its place: the empty text for nothing."""
     import av
 
-    end, place, failures, stated = 0.0, 0, 0, _stated_seconds(container, stream)
+    end, place, failures, stated = 0.0, 0, 0, _stated_duration(container, stream)
     matroska = "matroska" in container.format.name
     packets = container.demux()
     while True:
@@ -410,19 +410,19 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
             packet = next(packets)
         except av.FFmpegError as error:
             failures += 1
-            yield None, reason(error)
-            if failures == _MOST_FAILURES:
+            yield None, ffmpeg_reason(error)
+            if failures == _MAX_FAILURES:
                 return
             packets = container.demux()  # it reads on where it is
             continue
         failures = 0
         # FFmpeg passes over a damaged place in a Matroska file without a word.
-        missing = matroska and 0 < place < (packet.pos or 0) - _MOST_BETWEEN
+        missing = matroska and 0 < place < (packet.pos or 0) - _MAX_BYTES_BETWEEN_PACKETS
         place = max(place, (packet.pos or 0) + packet.size)
         if packet.stream is not stream:
             continue
         if packet.dts is None and not packet.size:
-            short = stated - end > max(_SHORT_SECONDS, 2 / rate)
+            short = stated - end > max(_CUT_OFF_SECONDS, 2 / rate)
             yield packet, f"it says it lasts {stated:.1f} s, and ends at {end:.1f} s" if short else ""
             return
         if packet.pts is not None:
@@ -430,7 +430,7 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
         yield packet, "data is missing" if packet.is_corrupt or missing else ""
 
 
-def _stated_seconds(container: Any, stream: Any) -> float:
+def _stated_duration(container: Any, stream: Any) -> float:
     """How long the video says it is, 0 where it does not say."""
     if stream.duration:
         return float(stream.duration * stream.time_base)

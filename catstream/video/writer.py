@@ -17,10 +17,10 @@ from catstream.video.sound import Sound
 __all__ = ["VideoWriter"]
 
 #: Steps of a video's clock per frame: how exactly a frame of a source without a constant rate keeps its time.
-_TICKS = 100
+_TICKS_PER_FRAME = 100
 
 #: Pixels of a picture that is still encoded for few bytes: 1920x1080 with a line of text below it.
-_LARGE = 1920 * 1200
+_LARGE_PIXELS = 1920 * 1200
 
 
 class VideoWriter:
@@ -62,13 +62,13 @@ class VideoWriter:
             ) from None
         h264 = "libx264" in av.codecs_available
         # Of a large picture, speed is worth more than bytes: at 3840x2160 twice as many frames per second.
-        preset = "veryfast" if size[0] * size[1] <= _LARGE else "ultrafast"
+        preset = "veryfast" if size[0] * size[1] <= _LARGE_PIXELS else "ultrafast"
         self._stream: Any = self._container.add_stream(
             "libx264" if h264 else "mpeg4",
             rate=self._rate,
             options={"preset": preset, "crf": "20"} if h264 else {"qscale": "3"},
         )
-        self._stream.codec_context.time_base = 1 / (self._rate * _TICKS)
+        self._stream.codec_context.time_base = 1 / (self._rate * _TICKS_PER_FRAME)
         self._stream.thread_count = 1  # the processes are the parallelism
         self._stream.pix_fmt = "yuv420p"
         # Both encoders share colour between 2x2 pixels, so an odd side grows by one.
@@ -89,12 +89,12 @@ class VideoWriter:
         time = self.frames / float(self._rate) if time is None else time
         self._first_time = self._first_time if self.frames else time
         # Two frames never share a time stamp, whatever a source says.
-        self._last_tick = max(self._last_tick + 1, round((time - self._first_time) * self._rate * _TICKS))
+        self._last_tick = max(self._last_tick + 1, round((time - self._first_time) * self._rate * _TICKS_PER_FRAME))
         down, across = self._stream.height - image.shape[0], self._stream.width - image.shape[1]
         even: Any = cv2.copyMakeBorder(image, 0, down, 0, across, cv2.BORDER_REPLICATE)
         frame = av.VideoFrame.from_ndarray(even, format="bgr24")
         frame.pts, frame.time_base = self._last_tick, self._stream.codec_context.time_base
-        with self._to_disk():
+        with self._reporting_errors():
             self._sound.copy(self._first_time, time)
             self._container.mux(self._stream.encode(frame))
         self.frames += 1
@@ -102,7 +102,7 @@ class VideoWriter:
     def close(self) -> None:
         """Finish the file and give it its name."""
         try:
-            with self._to_disk():
+            with self._reporting_errors():
                 with self._container:
                     if self.frames:
                         self._container.mux(self._stream.encode(None))
@@ -114,7 +114,7 @@ class VideoWriter:
                 self._part.unlink(missing_ok=True)
 
     @contextlib.contextmanager
-    def _to_disk(self) -> Iterator[None]:
+    def _reporting_errors(self) -> Iterator[None]:
         import av
 
         try:

@@ -1,5 +1,5 @@
 """The web page of a running pipeline: look at it, steer it, measure it."""
 
-from catstream.extras import need
+from catstream.extras import require_extra
 
-need("view")
+require_extra("view")

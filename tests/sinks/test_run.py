@@ -14,7 +14,7 @@ from catstream.messages import Position, Track
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT, open_sink, reader
 from catstream.video.demo import write
-from catstream.video.source import WHOLE, open_source
+from catstream.video.source import ALL_FRAMES, open_source
 
 NAMES = ["t.ndjson", "t.json", "t.csv", "t.txt", "t.sqlite", "t.parquet", "t.mp4"]
 
@@ -32,7 +32,7 @@ def files(tmp_path):
     def of(folder, names=NAMES, output=True):
         (tmp_path / folder).mkdir(exist_ok=True)
         results = tmp_path / folder / "out" if output else None
-        return RunFiles("demo", str(source), WHOLE, results, output, [tmp_path / folder / name for name in names])
+        return RunFiles("demo", str(source), ALL_FRAMES, results, output, [tmp_path / folder / name for name in names])
 
     return of
 
@@ -94,12 +94,12 @@ def test_results_that_are_there_are_refused_and_replaced_together_if_that_is_ask
     ):
         with pytest.raises(VideoError, match=words):
             again.check(overwrite=False, resumable=False)
-    without_video = RunFiles("demo", earlier.source, WHOLE, earlier.output, False, earlier.files)
+    without_video = RunFiles("demo", earlier.source, ALL_FRAMES, earlier.output, False, earlier.files)
     without_video.check(overwrite=True, resumable=False)
     fill(without_video, 0, 3)
     assert len(earlier.files[0].read_text().splitlines()) == 4
     assert not (earlier.output / "demo.mp4").exists(), "a video of other results would lie beside them"
-    other = RunFiles("street", earlier.source, WHOLE, earlier.output)
+    other = RunFiles("street", earlier.source, ALL_FRAMES, earlier.output)
     other.check(overwrite=False, resumable=False)
     fill(other, 0, 5)
     assert len((tmp_path / "run" / "out" / "demo.csv").read_text().splitlines()) == 4, "each source has its own table"
@@ -129,7 +129,7 @@ def test_a_file_of_somebody_else_is_not_gone_on_with(files):
 
 
 def test_standard_output_has_a_line_of_json_for_each_track(files, capsys):
-    run = RunFiles("demo", files("run").source, WHOLE, files=[STDOUT])
+    run = RunFiles("demo", files("run").source, ALL_FRAMES, files=[STDOUT])
     run.check(overwrite=False, resumable=True)
     fill(run, 0, 5)
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [track(k).to_dict() for k in range(5)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from catstream.errors import VideoError
-from catstream.video.ahead import ahead
+from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source
 
 
@@ -32,13 +32,13 @@ class Numbers(Source):
 
 def test_all_frames_come_in_order_read_by_another_thread():
     source = Numbers(5)
-    assert [frame.number for frame in ahead(source)] == [0, 1, 2, 3, 4]
+    assert [frame.number for frame in read_ahead(source)] == [0, 1, 2, 3, 4]
     assert len(source.readers) == 1
     assert threading.current_thread().name not in source.readers
 
 
 def test_what_breaks_is_told_after_the_frames_before_it():
-    frames = ahead(Numbers(2, VideoError("it breaks at frame 2")))
+    frames = read_ahead(Numbers(2, VideoError("it breaks at frame 2")))
     assert [next(frames).number, next(frames).number] == [0, 1]
     with pytest.raises(VideoError, match="frame 2"):
         next(frames)
@@ -46,7 +46,7 @@ def test_what_breaks_is_told_after_the_frames_before_it():
 
 def test_it_is_never_more_than_one_frame_ahead_and_its_thread_ends_with_it():
     source = Numbers(50)
-    with closing(ahead(source)) as frames:
+    with closing(read_ahead(source)) as frames:
         for frame in frames:
             assert source.read <= frame.number + 2
             if frame.number == 7:

@@ -106,7 +106,7 @@ def test_why_it_is_lost_is_logged_once(camera, monkeypatch, caplog, until):
         raise OSError("it is unplugged")
 
     with open_source(cam.url) as source:
-        monkeypatch.setattr(live, "_container", refuse)
+        monkeypatch.setattr(live, "_open_container", refuse)
         cam.leave()
         until(lambda: len(tried) > 5)
         assert source.counters["lost_seconds"] > 0
