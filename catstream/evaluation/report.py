@@ -38,7 +38,7 @@ def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
         own = [run for run in runs if run.tracker == tracker]
         films += map(film_of, worst(own, _OTHER_FILMS if place else _FILMS))
     sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
-    changed = {name: value for name, value in settings.values().items() if value != getattr(Settings(), name)}
+    changed = escape("\n".join(settings.changed()))
     body = [
         "<h1>How well it follows</h1>",
         f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
@@ -50,7 +50,7 @@ def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
         '<p class="about">White: the truth. Orange: the tracker.</p>' if films else "",
         *map(_film, films),
         "<h2>Settings that are not the default</h2>",
-        f"<pre>{escape(chr(10).join(f'{name} = {value!r}' for name, value in changed.items()) or 'none')}</pre>",
+        f"<pre>{changed or 'none'}</pre>",
     ]
     return write_page(path, "evaluation", body)
 

@@ -55,7 +55,7 @@ def test_the_report_needs_nothing_else(tmp_path, sequence, found, lost):
     assert page.count("<svg") == 2
     assert "data:image/jpeg;base64," in page
     assert not re.search(r"(src|href)=\"(?!data:)|<script|@import|url\(", page)
-    assert "coreset.size = 32" in page
+    assert "coreset.size=32" in page
     assert page.count("<tr") == 1 + 2 + 2
 
 

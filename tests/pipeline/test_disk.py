@@ -58,6 +58,7 @@ def test_a_disk_that_takes_nothing_stops_nothing_and_is_said(video, disk, until,
         for track in pipeline:
             tracks.append(track.frame)
             if track.frame == 15:
+                until(lambda: list((state / TREES).glob("*.safetensors")))
                 spoil(disk, until)
             if track.frame == 40:
                 with subscribe(pipeline.endpoint, "health", timeout=60) as reports:
