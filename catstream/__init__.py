@@ -1,4 +1,4 @@
-"""catstream learns to follow one object in a video stream, from a single box, on a CPU.
+"""catstream tracks one object in a video stream. It learns the object from a single box, online, on a CPU.
 
     import catstream
 
@@ -6,8 +6,8 @@
         for track in pipeline:
             print(track.frame, track.state, track.box, track.score)
 
-In one process, frame by frame: `catstream.Tracker`, used like a `cv2.Tracker`. From another process, while a
-pipeline runs: `catstream.subscribe` to hear it, `catstream.control` to steer it.
+`catstream.Tracker` tracks in one process, frame by frame, like a `cv2.Tracker`. While a pipeline runs, other processes
+receive its messages with `catstream.subscribe` and send commands to it with `catstream.control`.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name when it is first used: a process loads only what it needs."""
+    """Import a public name at its first use, so that a process loads only the modules that it needs."""
     if name not in _HOMES:
         raise AttributeError(f"module 'catstream' has no attribute {name!r}")
     return getattr(import_module(f"catstream.{_HOMES[name]}"), name)

@@ -1,4 +1,4 @@
-"""Tracks for roboflow's supervision, which draws, counts and filters detections."""
+"""Converts tracks to detections of Roboflow's supervision library, which draws, counts and filters them."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ __all__ = ["to_supervision"]
 
 
 def to_supervision(track: Track) -> Any:
-    """A track as `supervision.Detections`: one detection, or none where the object is absent.
+    """Convert a track to `supervision.Detections`: one detection, or none if the object is absent.
 
-    It has the corners of the box, the score from 0 to 1 as confidence, class 0, tracker 1, and in `data` the
-    `frame`, `state` and `model_version`. Needs the extra `catstream[supervision]`.
+    The detection has the corners of the box, the score, clipped to 0 to 1, as its confidence, class 0, tracker 1, and
+    `frame`, `state` and `model_version` in `data`. It needs the extra `catstream[supervision]`.
 
     Raises
     ------
     MissingExtraError
-        If supervision is not installed; says how to get it.
+        If supervision is not installed.
     """
     require_extra("supervision")
     from supervision import Detections

@@ -1,4 +1,4 @@
-"""Boxes: axis-aligned rectangles in pixels, `x, y, w, h`, as the benchmarks write them."""
+"""`Box`: an axis-aligned rectangle in pixels, `x, y, w, h`, the format of the public benchmarks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Box"]
 
 
 class Box(NamedTuple):
-    """A rectangle in pixels: its top left corner, its width and its height.
+    """A rectangle in pixels: top left corner, width and height.
 
     Examples
     --------
@@ -30,25 +30,28 @@ class Box(NamedTuple):
 
     @property
     def centre(self) -> tuple[float, float]:
-        """The point in the middle, (x, y)."""
+        """Centre of the box, (x, y)."""
         return self.x + self.w / 2, self.y + self.h / 2
 
     @property
     def area(self) -> float:
-        """Square pixels."""
+        """Area in square pixels."""
         return self.w * self.h
 
     def scaled(self, across: float, down: float | None = None) -> Box:
-        """The box with the same centre and `across` times the width, `down` times the height (as much where None)."""
+        """Return the box with the same centre, `across` times the width and `down` times the height.
+
+        If `down` is None, the height is scaled by `across` too.
+        """
         w, h = self.w * across, self.h * (across if down is None else down)
         return Box(self.x + (self.w - w) / 2, self.y + (self.h - h) / 2, w, h)
 
     def centred(self, x: float, y: float) -> Box:
-        """The box with the same size around another centre."""
+        """Return a box of the same size with another centre."""
         return Box(x - self.w / 2, y - self.h / 2, self.w, self.h)
 
     def with_centre_in(self, width: int, height: int) -> Box:
-        """The box moved, where it must be, until its centre is in a frame of this size.
+        """Return the box, moved if necessary so that its centre is inside a frame of this size.
 
         Examples
         --------
@@ -59,7 +62,7 @@ class Box(NamedTuple):
         return self.centred(min(max(x, 0), width - 1), min(max(y, 0), height - 1))
 
     def overlap(self, other: Box) -> float:
-        """Intersection over union, 0 to 1: the overlap score S of the benchmarks."""
+        """Return the intersection over union with another box, from 0 to 1."""
         w = min(self.x + self.w, other.x + other.w) - max(self.x, other.x)
         h = min(self.y + self.h, other.y + other.h) - max(self.y, other.y)
         if w <= 0 or h <= 0:
@@ -69,12 +72,12 @@ class Box(NamedTuple):
 
     @classmethod
     def parse(cls, value: str | Iterable[float]) -> Box:
-        """Read a box as people write it: four numbers, or a text `x,y,w,h` (commas, blanks or tabs between them).
+        """Make a box from four numbers or from a text `x,y,w,h`, separated by commas, blanks or tabs.
 
         Raises
         ------
         BoxError
-            If these are not four numbers.
+            If the value is not four numbers.
 
         Examples
         --------
@@ -94,22 +97,22 @@ class Box(NamedTuple):
         return cls(x, y, w, h)
 
     def validated(self, width: int, height: int) -> Box:
-        """The same box, once it is known to be a start for a frame of this size.
+        """Return the box unchanged if tracking can start with it in a frame of this size.
 
         Raises
         ------
         BoxError
-            Where a number is not finite, the box has no area, it is more than
-            twice as wide or high as the frame, or its centre lies outside it.
+            If a number is not finite, the width or height is less than 2 pixels or more than twice that of the frame,
+            or the centre is outside the frame.
         """
         if not all(math.isfinite(value) for value in self):
             raise BoxError(f"a box needs four finite numbers, got {self}: give x,y,w,h in pixels")
         if self.w < 2 or self.h < 2:
             raise BoxError(f"a box needs a width and a height of at least 2 pixels, got {self.w:g} x {self.h:g}")
-        # Such a box covers the frame from edge to edge, wherever in it its centre lies: it says nothing of an object.
+        # With its centre inside the frame, such a box covers the whole frame: it does not select an object.
         if self.w > 2 * width or self.h > 2 * height:
             raise BoxError(
-                f"a box may be twice as wide and high as the frame of {width} x {height} pixels, got "
+                f"a box may be at most twice as wide and high as the frame of {width} x {height} pixels, got "
                 f"{self.w:g} x {self.h:g}: draw it tight around the object"
             )
         x, y = self.centre

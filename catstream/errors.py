@@ -1,8 +1,8 @@
-"""What can go wrong, by name.
+"""The exceptions of catstream.
 
-Every message says what was expected, what came, and what to do. The command
-line prints it as one line and exits with 1; a program catches
-`CatstreamError`, or one of its kinds.
+Every message says what was expected, what was received, and what to do. The
+command line prints it as one line and exits with 1; a program catches
+`CatstreamError` or one of its subclasses.
 """
 
 __all__ = [
@@ -22,33 +22,33 @@ __all__ = [
 
 
 class CatstreamError(Exception):
-    """Any error that catstream raises on purpose."""
+    """Base class of all errors that catstream raises on purpose."""
 
 
 class SettingsError(CatstreamError, ValueError):
-    """A setting that does not exist, or a value it cannot take."""
+    """A setting does not exist, or has an invalid value."""
 
 
 class MissingExtraError(CatstreamError, ImportError):
-    """An optional dependency that is not installed; says how to install it."""
+    """An optional dependency is not installed; the message has the command that installs it."""
 
 
 class BoxError(CatstreamError, ValueError):
-    """A box that is not in the frame or far larger than it, has no area, or is not a number."""
+    """A box is outside the frame, far larger than the frame, has no area, or is not four finite numbers."""
 
 
 class FrameError(CatstreamError, ValueError):
-    """An array that is not a frame: of another type, shape or size, or with values that are no brightness."""
+    """An array is not a frame: its type, shape or size is wrong, or its values are outside the range of a pixel."""
 
 
 class VideoError(CatstreamError):
-    """A source of frames, or a place for results, that cannot be used."""
+    """A source of frames cannot be read, or results cannot be written."""
 
 
 class ProtocolError(CatstreamError, ValueError):
-    """A message that is not what the channel carries.
+    """A message does not conform to the protocol of its channel.
 
-    reason  what is wrong with it, in one word: health counts the refused by it
+    reason  category of the violation in one word, by which the health report counts such messages
     """
 
     def __init__(self, text: str, reason: str = "content") -> None:
@@ -57,20 +57,20 @@ class ProtocolError(CatstreamError, ValueError):
 
 
 class RecordingError(CatstreamError):
-    """A recording that cannot be written or read, or that is not whole enough."""
+    """A recording cannot be written or read, or lacks messages that are needed."""
 
 
 class ServiceError(CatstreamError):
-    """A process of the pipeline that failed, or that cannot start."""
+    """A process of the pipeline failed or cannot start."""
 
 
 class SetBackError(ServiceError):
-    """A receiver that needs messages once more that its sender does not have any more: its disk lost them."""
+    """A receiver lost messages that it had acknowledged as stored, and its sender no longer has them."""
 
 
 class SilenceError(ServiceError, TimeoutError):
-    """A pipeline from which nothing came in the time given."""
+    """No message arrived from a pipeline within the time-out."""
 
 
 class RefusedError(ServiceError):
-    """A command that a running pipeline did not carry out; says why."""
+    """A running pipeline did not execute a command; the message has the reason."""

@@ -22,12 +22,12 @@ EXTRAS = {
 
 
 def require_extra(extra: str) -> None:
-    """Check that the modules of an extra can be imported, without importing them.
+    """Check that the modules of an extra are installed, without importing them.
 
     Raises
     ------
     MissingExtraError
-        If one of them is not installed; says the command that installs the extra.
+        If one of them is not installed; the message has the command that installs the extra.
     """
     feature, modules = EXTRAS[extra]
     missing = [module for module in modules if find_spec(module) is None]
@@ -38,9 +38,9 @@ def require_extra(extra: str) -> None:
 
 
 def install_command(extra: str) -> str:
-    """The command that adds an extra to the catstream that is installed in this environment.
+    """Return the command that adds an extra to the catstream that is installed in this environment.
 
-    It is right for a checkout too: pip keeps the catstream that is there, and installs what the extra adds.
+    It works for a checkout too: pip keeps the installed catstream and adds the packages of the extra.
     """
     beside = Path(sys.executable).with_name("pip")
     pip = "pip" if shutil.which("pip") == str(beside) else f"{shlex.quote(sys.executable)} -m pip"

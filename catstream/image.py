@@ -1,4 +1,4 @@
-"""Images: what other libraries give as a picture, as the 8-bit BGR array that catstream computes with."""
+"""Converts the image arrays of other libraries to the 8-bit BGR arrays that catstream computes with."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from catstream.errors import FrameError
 __all__ = ["as_bgr"]
 
 _CHANNELS = (1, 3, 4)
-_HALF_STEP = 0.5 / 255  # of brightness: by so much an image that was resized may leave the range from 0 to 1
+_HALF_STEP = 0.5 / 255  # interpolation may exceed the range from 0 to 1 by this much
 _EXPECTED = "a frame is a numpy array (h, w, 3), blue green red, or (h, w) grey, of uint8, uint16 or float from 0 to 1"
 
 
 def as_bgr(image: Any) -> np.ndarray:
-    """An image as uint8 (h, w, 3), blue green red; itself if it is one that may be written to, in one piece.
+    """Return an image as a writable, contiguous uint8 array (h, w, 3), blue green red; no copy is made if it is one.
 
     Parameters
     ----------
-    image : array of shape (h, w, 3) BGR, (h, w, 4) BGRA, (h, w) or (h, w, 1) grey. uint8 is taken as it is, of uint16
-        the upper 8 bits, of a float from 0 to 1 the nearest of 255 steps. Transparency is left out. It may be
-        read-only, and a view of other memory
+    image : array of shape (h, w, 3) BGR, (h, w, 4) BGRA, (h, w) or (h, w, 1) grey. uint8 stays as it is; uint16 is
+        reduced to its upper 8 bits; floats from 0 to 1 are scaled to 255 and rounded. An alpha channel is dropped. The
+        array may be read-only and not contiguous
 
     Raises
     ------
     FrameError
-        For all else; says what came, and what to do.
+        For any other array.
 
     >>> as_bgr(np.full((2, 2, 1), 0.5))[0, 0]
     array([128, 128, 128], dtype=uint8)

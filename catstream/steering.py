@@ -1,11 +1,11 @@
-"""Steer a running pipeline: another object, a pause, what was learned, the end.
+"""Send commands to a running pipeline: select another object, pause, resume, save, stop.
 
     import catstream
 
     with catstream.control("run") as pipeline:
         pipeline.set_box((120, 80, 64, 48))
 
-Each command is asked again until it is answered, and carried out once.
+A command is resent until it is answered, and is executed once.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ __all__ = ["Control", "control"]
 
 
 class Control:
-    """Sends commands to one running pipeline; close it, or use it in a `with`. Any number of programs may have one.
+    """Sends commands to one running pipeline; close it, or use it in a `with`. Several clients may connect at once.
 
     Attributes
     ----------
     endpoint : str
-        Where it is attached.
+        Endpoint of the pipeline.
     source : str
-        The source that the pipeline follows, empty if that is not known here.
+        Source that the pipeline tracks; empty if it is unknown here.
     timeout : float
-        Seconds that a command may take.
+        Seconds to wait for the answer to a command.
 
     Raises
     ------
     RefusedError
-        From each command, if the pipeline does not carry it out; says why.
+        From each command, if the pipeline does not execute it.
     SilenceError
-        From each command, if no answer came in time; one that is on its way may still be carried out.
+        From each command, if no answer arrives in time; the command may still be executed later.
     ServiceError
-        From each command, if the pipeline does not let these keys steer.
+        From each command, if these keys do not have the role "steer".
     """
 
     def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> None:
@@ -55,44 +55,44 @@ class Control:
         self._commands = Requester("control", self._place)
 
     def set_box(self, box: str | Iterable[float], *, keep: bool = False) -> Answer:
-        """Say where the object is in the newest frame: x, y, w, h in pixels.
+        """Set the box of the object in the newest frame: x, y, w, h in pixels.
 
-        It is another object, and what was learned of the one before is forgotten; with `keep`
-        it is the same one, found again for the tracker. A paused pipeline follows this frame, and stays paused.
+        By default it is a new object, and everything learned of the previous one is dropped. With `keep` it is the same
+        object, and its box is corrected. A paused pipeline processes this frame and stays paused.
         """
         return self._ask("set-box", Box.parse(box), keep)
 
     def pause(self) -> Answer:
-        """Stop taking frames; those of a live source pass by and are counted as skipped."""
+        """Stop processing frames; the frames of a live source are counted as skipped."""
         return self._ask("pause")
 
     def resume(self) -> Answer:
-        """Take frames again."""
+        """Continue processing frames."""
         return self._ask("resume")
 
     def save(self, path: str | os.PathLike[str]) -> Answer:
-        """Write what was learned of the object to a file of this machine, whole or not at all: see `Learned`.
+        """Write the learned model and the coreset to a file on this machine, atomically; `Learned` reads it.
 
-        The pipeline writes nothing: the file is made here, of its newest model and sample.
+        The file is written by this process, from the pipeline's newest model and sample.
 
         Raises
         ------
         ServiceError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         answer = self._ask("save")
         if answer.box is None:
-            raise RefusedError("save: the object was not seen yet: ask again once it was")
+            raise RefusedError("save: the object was not detected yet: try again once it was")
         model, sample = self._newest(answer.version)
         Learned(model, sample, answer.box).save(path)
         return replace(answer, version=model.version)
 
     def stop(self) -> Answer:
-        """End the stream as if the source had come to its end: all that was learned is stored first."""
+        """End the run as if the source had ended: everything learned is stored first."""
         return self._ask("stop")
 
     def close(self) -> None:
-        """Let go; the pipeline goes on."""
+        """Disconnect; the pipeline continues."""
         self._commands.close()
 
     def __enter__(self) -> Self:
@@ -102,7 +102,7 @@ class Control:
         self.close()
 
     def _newest(self, version: int) -> tuple[Model, Sample]:
-        """The newest model, at least of this version, and the sample that it was learned from."""
+        """Return the newest model, of this version or a later one, and the sample that it was trained on."""
         model, samples, deadline = None, dict[int, Sample](), monotonic() + self.timeout
         with Subscriber("models", self._place) as models, Subscriber("samples", self._place) as newest:
             while monotonic() < deadline:
@@ -111,16 +111,16 @@ class Control:
                 if model is not None and model.version >= version and model.version in samples:
                     return model, samples[model.version]
         raise SilenceError(
-            f"no model and its sample came from {self.endpoint} within {self.timeout:g} s: "
-            "ask how it is (catstream status)"
+            f"no model with its sample arrived from {self.endpoint} within {self.timeout:g} s: "
+            "check the pipeline with catstream status"
         )
 
     def _ask(self, verb: Verb, box: Box | None = None, keep: bool = False) -> Answer:
         answer = self._commands.ask(Command(uuid4().hex, verb, box, keep), self.timeout)
         if answer is None:
             raise SilenceError(
-                f"nothing at {self.endpoint} answered {verb} within {self.timeout:g} s: is a pipeline running there, "
-                "and does it go on (catstream status)?"
+                f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "
+                "Check it with catstream status"
             )
         if not answer.done:
             raise RefusedError(f"{verb}: {answer.reason}")
@@ -128,21 +128,22 @@ class Control:
 
 
 def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> Control:
-    """Attach to a running pipeline, to steer it.
+    """Connect to a running pipeline to send commands.
 
     Parameters
     ----------
     endpoint : str
-        Where it runs, as the setting `run.endpoint` says it. Empty for the only pipeline of this user.
+        Endpoint of the pipeline, in the format of the setting `run.endpoint`. Empty for the only pipeline of this user.
     timeout : float
-        Seconds that a command may take.
+        Seconds to wait for the answer to a command.
     keys : str
-        Folder of the keys of this client, if the pipeline asks for some; they must be allowed to steer.
-    source : that the pipeline follows, instead of its endpoint: "walk.mp4"
+        Folder of the keys of this client, if the pipeline requires keys; their role must be "steer".
+    source : str
+        Source that the pipeline tracks, for example "walk.mp4", instead of its endpoint.
 
     Raises
     ------
     ServiceError
-        If `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
+        If `endpoint` is empty and not exactly one pipeline runs, or if the keys cannot be read.
     """
     return Control(endpoint, timeout=timeout, keys=keys, source=source)

@@ -1,4 +1,4 @@
-"""Atomic writes, locks of the kernel, and safetensors files of arrays and facts with a checksum (no code in them)."""
+"""Atomic file writes, file locks, and files of arrays and metadata in the safetensors format with a checksum."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from catstream.errors import ProtocolError
 
 __all__ = ["is_locked", "is_writable", "lock", "read", "write", "write_atomically"]
 
-_KEY = "catstream"  # one metadata key only: with more, their order and so the bytes would vary
-_VERSION = 1  # of what the metadata means
+_KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
+_VERSION = 1  # version of the metadata's format
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
 def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
-    """Write a file beside its final name, then put it in place of the old one; it survives a power cut from then on.
+    """Replace a file atomically. After the return, the new content survives a power cut.
 
     Parameters
     ----------
-    mode : who may read and write it from its first byte on, but for what the umask takes away
+    mode : permissions of the file, reduced by the umask
 
     Raises
     ------
     OSError
-        Where it cannot be written. What was there before stays as it was.
+        If the file cannot be written. The old file stays unchanged.
     """
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     try:
-        part.unlink(missing_ok=True)  # what a power cut left would keep its mode
+        part.unlink(missing_ok=True)  # a file left by a power cut would keep its old permissions
         with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())  # the new name must not be on disk before all that it names
+            os.fsync(file.fileno())  # the content must be on disk before the new name
         part.replace(path)
         _sync(path.parent)
     finally:
-        with contextlib.suppress(OSError):  # of a disk that is read-only now; the next one writes over it
+        with contextlib.suppress(OSError):  # the disk may have become read-only; the next write removes the file
             part.unlink(missing_ok=True)
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether a file can be made in a folder."""
+    """Return whether a file can be created in a folder."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             return True
@@ -89,12 +89,12 @@ def is_locked(handle: int) -> bool:
 def write(
     path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: dict[str, object], mode: int = 0o666
 ) -> None:
-    """Place a file of arrays and facts, with a mode as `write_atomically` takes it.
+    """Write arrays and JSON metadata (`facts`) to a file, atomically.
 
     Raises
     ------
     OSError
-        As `write_atomically` does.
+        If the file cannot be written, as in `write_atomically`.
     """
     from safetensors.numpy import save
 
@@ -104,12 +104,12 @@ def write(
 
 
 def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """Read what `write` wrote.
+    """Return the arrays and the metadata of a file that `write` wrote.
 
     Raises
     ------
     ProtocolError
-        Where the file is torn, damaged, or not one of ours.
+        If the file is incomplete or damaged, or was not written by catstream.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -121,14 +121,14 @@ def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
         if metadata["version"] != _VERSION:
             raise ValueError(f"it is of version {metadata['version']}, this catstream reads {_VERSION}")
         if metadata["checksum"] != _checksum(arrays, facts):
-            raise ValueError("its checksum does not fit")
+            raise ValueError("its checksum does not match")
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ProtocolError(f"{path} is not a whole file of catstream ({error}): take an older copy") from None
+        raise ProtocolError(f"{path} is not an undamaged file of catstream ({error}): use an older copy") from None
     return arrays, facts
 
 
 def _sync(folder: Path) -> None:
-    """Have the names in a folder on disk."""
+    """Write the directory entries of a folder to disk."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -137,7 +137,7 @@ def _sync(folder: Path) -> None:
 
 
 def _checksum(arrays: dict[str, np.ndarray], facts: dict[str, object]) -> int:
-    """CRC-32 of everything: names, shapes, types, numbers and facts."""
+    """Return the CRC-32 of the metadata and of the arrays with their names, shapes and types."""
     check = zlib.crc32(json.dumps(facts, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):
         check = zlib.crc32(f"{name} {array.dtype} {array.shape}".encode(), check)

@@ -1,4 +1,4 @@
-"""Attach to a running pipeline: its messages one by one, as they come.
+"""Subscribe to the messages of a running pipeline.
 
     import catstream
 
@@ -6,7 +6,7 @@
         for track in tracks:
             print(track.frame, track.state, track.box)
 
-The pipeline never waits for who is attached: a slow one misses tracks, and `missed` counts them.
+The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from catstream.wire.sockets import Subscriber
 
 __all__ = ["GapCounter", "Subscription", "subscribe", "wait_until_running"]
 
-#: Seconds that the last messages have to come in after the end was heard: it travels by itself.
+#: Seconds to wait for messages after the end was received; it arrives on a connection of its own and may overtake them.
 _DRAIN_SECONDS = 0.5
 
-#: Seconds to wait for a sign of life: each process of a running pipeline is heard once a second.
+#: Seconds to wait for a health report; each process of a running pipeline sends one every second.
 _HEALTH_TIMEOUT_SECONDS = 5.0
 
-#: Seconds from one look at the connections to the next: they say if the pipeline does not let this reader in.
+#: Seconds between checks of the connections, which report whether the pipeline has rejected the keys.
 _CONNECTION_CHECK_SECONDS = 1.0
 
-#: What one can subscribe to, and its channel: of features, that of the copies.
+#: Public name -> channel. Subscribers get features from the channel of copies.
 _SUBSCRIBABLE = {
     **{name: name for name, channel in CHANNELS.items() if not channel.acknowledged and name != "lessons"},
     "features": "lessons",
@@ -44,17 +44,17 @@ Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features | 
 
 
 class GapCounter:
-    """Counts messages of a stream that never came, by what is missing between their `seq`, which begins with 1.
+    """Counts lost messages of a stream by the gaps in their sequence numbers `seq`, which start with 1.
 
-    missed  since the first that came; a restarted sender may go back
-    before  those before the first that came
+    missed  messages lost after the first one was received; a restarted sender may repeat numbers
+    before  messages sent before the first one that was received
     """
 
     def __init__(self) -> None:
         self.missed = self.before = self._seq = 0
 
     def take(self, seq: int) -> None:
-        """Count what is missing before the next message that came, or before the end."""
+        """Count the messages missing before the number of the next message, or of the end."""
         if self._seq:
             self.missed += max(0, seq - self._seq - 1)
         else:
@@ -63,36 +63,37 @@ class GapCounter:
 
 
 class Subscription(Generic[Message]):
-    """Messages of one channel of a running pipeline, from now until its end; iterate it, with `for` or `async for`.
+    """The messages of one channel of a running pipeline, until the pipeline ends; iterate with `for` or `async for`.
 
-    Tracks and features come one a frame, a restarted detector may repeat some. Of models, samples, previews and the
-    health of each process the last one comes at once, then each that is the newest when it is
-    taken. At an endpoint that is named, it may be there before the pipeline: it waits, and gets every message from the
-    first one on, as the pipeline begins once it is connected (on the same machine, of the same user).
+    There is one track and one features message for each frame; after a restart of the detector some are repeated. For
+    models, samples, previews and health reports, the last message arrives at once; then each iteration returns the
+    newest, and older ones that were not read are dropped. A subscriber to a named endpoint may start before the
+    pipeline. If both run on the same machine as the same user, the pipeline waits for it, so that it receives every
+    message.
 
     Attributes
     ----------
     end : End or None
-        The pipeline's last message, None before it.
+        The last message of the pipeline; None before it was received.
     endpoint : str
-        Where it is attached.
+        Endpoint of the pipeline.
     keys : str
-        Folder of the keys that it connects with, empty without.
+        Folder of the client keys; empty if there are none.
     timeout : float or None
-        Seconds without a message after which iterating raises `SilenceError`.
+        Seconds without a message after which iteration raises `SilenceError`.
 
     Raises
     ------
     SilenceError
-        While iterating, if nothing came for as long as `timeout` says. It may be iterated on.
+        During iteration, if no message arrived within `timeout`. Iteration may continue afterwards.
     ServiceError
-        While iterating, if the pipeline does not let these keys in.
+        During iteration, if the pipeline rejects the keys.
     """
 
     def __init__(self, endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> None:
         if channel not in _SUBSCRIBABLE:
             raise ServiceError(
-                f"one can subscribe to {', '.join(_SUBSCRIBABLE)}, got {channel!r}: the others have one receiver"
+                f"expected one of the channels {', '.join(_SUBSCRIBABLE)}, got {channel!r}: subscribe to one of them"
             )
         place = find(endpoint, keys)
         self.endpoint, self.timeout = str(place), timeout
@@ -101,27 +102,27 @@ class Subscription(Generic[Message]):
         self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
         self._last_identity: dict[str, float] = {}  # of each process that sends: what was taken last
         self._close_time = float("inf")  # when to wait no more
-        # A pipeline that begins here later waits until this subscription has come in.
+        # A pipeline that starts here later waits until this subscription has connected.
         self._announcement = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
         self._messages = Subscriber(
             self._channel.name, place, reader=self._announcement.reader if self._announcement else ""
         )
-        # By itself: a reader that is so slow that messages are dropped would miss the end among them.
+        # A socket of its own for the end: if this subscriber is slow, the end could be among the dropped messages.
         self._ends = Subscriber("tracks", place, only=End)
 
     @property
     def missed(self) -> int:
-        """Tracks or features of the run that never came here: before it was attached, or because it was too slow."""
+        """Number of tracks or features that were not received: sent before the connection, or dropped."""
         return self._gaps.missed + self._gaps.before
 
     @property
     def missed_before(self) -> int:
-        """How many of those were sent before it was attached."""
+        """Number of those that were sent before the connection."""
         return self._gaps.before
 
     def losses(self) -> str:
-        """What is missing, for a person to read."""
-        before = f", {self.missed_before} of them before this began to listen" if self.missed_before else ""
+        """Describe the missed messages in words."""
+        before = f", {self.missed_before} of them before this subscriber connected" if self.missed_before else ""
         return f"{self.missed} missed{before}"
 
     @property
@@ -130,7 +131,7 @@ class Subscription(Generic[Message]):
         return self._messages.refused
 
     def close(self) -> None:
-        """Attach no more."""
+        """Disconnect."""
         self._withdraw_announcement()
         self._messages.close()
         self._ends.close()
@@ -168,11 +169,11 @@ class Subscription(Generic[Message]):
         return message
 
     def _take(self) -> Message | None:
-        """The next message, where it is here already."""
+        """Return the next message if one was received, without waiting."""
         while self._messages.pending():
             message = self._messages.receive(0)
             if isinstance(message, End):
-                if self._channel.keeps == "every":  # nothing is on its way behind it
+                if self._channel.keeps == "every":  # on this channel the end is the last message
                     self.end, self._close_time = message, 0.0
                     return None
             elif message is not None and self._new(message):
@@ -185,12 +186,12 @@ class Subscription(Generic[Message]):
         return None
 
     def _withdraw_announcement(self) -> None:
-        """No pipeline has to wait for it any more."""
+        """Tell pipelines at this endpoint not to wait for this subscriber any more."""
         if self._announcement is not None:
             self._announcement.close()
 
     def _new(self, message: Message) -> bool:
-        """Whether it did not come before: a channel's last message is sent again when somebody new comes."""
+        """Return whether a message is new. The last message is resent whenever another subscriber connects."""
         if isinstance(message, Run):
             return False
         if isinstance(message, Track | Features):
@@ -212,21 +213,21 @@ class Subscription(Generic[Message]):
         return float("inf") if self.timeout is None else monotonic() + self.timeout
 
     def _wait_seconds(self, deadline: float) -> float:
-        """Seconds to wait before it is looked again; raises SilenceError if the time is over."""
+        """Return the seconds to wait for the sockets. Raises SilenceError after the deadline."""
         now = monotonic()
         if now >= deadline and self.end is None:
             raise SilenceError(
-                f"no {self._name} came from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
+                f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
             )
         until = min(deadline if self.end is None else float("inf"), self._close_time, now + _CONNECTION_CHECK_SECONDS)
         return max(0.0, until - now)
 
 
 def _identity(message: Health | Model | Sample | Preview) -> tuple[str, float]:
-    """Who sent it, and what tells it from the one before."""
+    """Return the sender of a message, and a value that differs between successive messages of this sender."""
     if isinstance(message, Health):
         return message.process, message.time
-    if isinstance(message, Preview):  # while no frame is followed, all of a live source have one number
+    if isinstance(message, Preview):  # before tracking starts, all frames of a live source have the same number
         return "", hash((message.frame, message.jpeg))
     return "", message.version
 
@@ -256,36 +257,40 @@ def subscribe(
     endpoint: str, channel: Literal["previews"], *, timeout: float | None = ..., keys: str = ...
 ) -> Subscription[Preview]: ...
 def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> Subscription:
-    """Attach to a running pipeline.
+    """Subscribe to a channel of a running pipeline.
 
     Parameters
     ----------
     endpoint : str
-        Where it runs, or will run, as the setting `run.endpoint` says. Empty for the user's only running pipeline.
+        Endpoint of the pipeline, which may start later; the format is that of the setting `run.endpoint`. Empty for the
+        only running pipeline of this user.
     channel : str
         "tracks", "models", "health", "samples", "features" or "previews".
     timeout : float or None
-        Seconds without a message after which iterating raises `SilenceError`; None to wait for ever.
+        Seconds without a message after which iteration raises `SilenceError`; None to wait without limit.
     keys : str
-        Folder of the keys of this client, if the pipeline asks for some.
+        Folder of the keys of this client, if the pipeline requires keys.
 
     Raises
     ------
     ServiceError
-        If there is no such channel, `endpoint` is empty and not just one pipeline runs, or the keys cannot be read.
+        If there is no such channel, if `endpoint` is empty and not exactly one pipeline runs, or if the keys cannot be
+        read.
     """
     return Subscription(endpoint, channel, timeout=timeout, keys=keys)
 
 
 def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_TIMEOUT_SECONDS) -> Endpoint:
-    """Where a pipeline runs, once it is heard: tracks and models may be silent for long where one does.
+    """Wait for a health report of the pipeline, and return its endpoint.
+
+    Tracks and models are no sign of a running pipeline: they may pause for long.
 
     Raises
     ------
     ServiceError
-        Where `endpoint` is empty and not just one pipeline runs.
+        If `endpoint` is empty and not exactly one pipeline runs.
     SilenceError
-        If none is heard in time.
+        If no report arrives in time.
     """
     with subscribe(endpoint, "health", timeout=seconds, keys=keys) as health:
         next(health, None)

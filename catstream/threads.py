@@ -1,9 +1,9 @@
-"""How many threads linear algebra runs on: one, for as long as catstream computes.
+"""Limits linear algebra to one thread while catstream computes.
 
-The matrices here are small: with more threads, OpenBLAS spends its time waking and waiting for them (a tenth of the
-frames a second), and adds in another order. A process of catstream's own sets environment variables before numpy is
-imported (`limit_process`). Inside somebody else's process nothing may stay changed: there `one_thread` sets the
-number of threads around each call, and sets it back.
+The matrices are small. With more threads, OpenBLAS spends its time on synchronisation (a tenth of the frame rate), and
+the order of its sums changes, so results are not reproducible. The processes of a pipeline set environment variables
+before numpy is imported (`limit_process`). Inside a user's process, `one_thread` limits the number of threads during
+each call and restores it afterwards.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ _VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 
 
 def limit_process() -> None:
-    """Have all libraries of this process start on one thread, unless the user's environment says otherwise.
+    """Limit all libraries of this process to one thread, unless the user's environment sets another number.
 
-    To be called before numpy is imported: the libraries read the environment when they are loaded.
+    Call it before numpy is imported: the libraries read the environment when they are loaded.
     """
     for variable in _VARIABLES:
         os.environ.setdefault(variable, "1")
 
 
 class _Libraries:
-    """The threaded libraries that are loaded in this process, and who holds them at one thread.
+    """The threaded libraries that are loaded in this process, and a count of the users that limit them to one thread.
 
-    The number of threads of a BLAS is one for the whole process: the first holder sets it, and the last one to leave
-    sets it back. That of OpenMP belongs to the calling thread: each holder sets its own.
+    A BLAS has one number of threads for the whole process: the first user sets it, and the last one restores it. OpenMP
+    has one for each calling thread: each user sets and restores its own.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._modules = 0  # how many were imported when libraries were looked for
+        self._modules = 0  # number of imported modules at the last search for libraries
         self._blas: list[Any] = []
         self._openmp: list[Any] = []
         self._users = 0
         self._original: dict[str, tuple[Any, int]] = {}  # path -> a BLAS, and its threads before the first holder
 
     def limit(self) -> list[tuple[Any, int]]:
-        """Go down to one thread; returns what `restore` needs."""
+        """Set one thread; return the argument for `restore`."""
         with self._lock:
             self._find()
             self._users += 1
@@ -66,12 +66,12 @@ class _Libraries:
             if self._users:
                 return
             for library, threads in self._original.values():
-                if library.get_num_threads() == 1:  # otherwise somebody else has set it meanwhile: it is theirs
+                if library.get_num_threads() == 1:  # otherwise the user's program has changed it: keep that
                     _set(library, threads)
             self._original.clear()
 
     def _find(self) -> None:
-        """Look for libraries, in a few milliseconds, if anything was imported since the last time."""
+        """Search for libraries if a module was imported since the last search; takes a few milliseconds."""
         if len(sys.modules) == self._modules:
             return
         from threadpoolctl import ThreadpoolController
@@ -87,7 +87,7 @@ def _is_openmp(library: Any) -> bool:
 
 
 def _set(library: Any, threads: int) -> None:
-    # threadpoolctl lets only one thread of a process set OpenBLAS; here the last holder sets it back, whichever it is.
+    # threadpoolctl lets only one thread of a process set OpenBLAS; here any thread may be the last user.
     getattr(library, "_real_set_num_threads", library.set_num_threads)(threads)
 
 
@@ -97,9 +97,9 @@ _libraries = _Libraries()
 class one_thread(ContextDecorator):
     """Run linear algebra on one thread inside a `with`, or inside the function that it decorates.
 
-    May be nested, and used by several threads at once: what was set before holds again once the last one has left,
-    also after an exception. Meanwhile linear algebra in other threads of the process is on one thread, too.
-    Costs some microseconds.
+    It may be nested and used by several threads at once: the last one to leave restores the number of threads, also
+    after an exception. Meanwhile, linear algebra in other threads of the process runs on one thread, too. It costs a
+    few microseconds.
 
     Parameters
     ----------

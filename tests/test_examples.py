@@ -107,7 +107,7 @@ def test_the_rerun_subscriber_writes_what_the_viewer_would_show(beside, shown):
         pytest.skip(why)
     code, printed = beside.printed["rerun_subscriber.py"]
     assert code == 0
-    losses = r"(0 missed|(\d+) missed, \2 of them before this began to listen)"
+    losses = r"(0 missed|(\d+) missed, \2 of them before this subscriber connected)"
     assert re.fullmatch(rf"[1-9]\d* tracks, {losses}: the source came to its end\n", printed)
     data = shown.read_bytes()
     assert data.startswith(b"RRF2")

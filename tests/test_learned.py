@@ -60,7 +60,7 @@ def test_a_torn_file_is_refused(learned, tmp_path, share):
     learned.save(tmp_path / "one")
     whole = (tmp_path / "one").read_bytes()
     (tmp_path / "one").write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ProtocolError, match="not a whole file"):
+    with pytest.raises(ProtocolError, match="not an undamaged file"):
         Learned.load(tmp_path / "one")
 
 

@@ -210,10 +210,10 @@ def test_a_file_that_is_no_saved_tracker_is_refused(video, tmp_path):
     whole = bytearray(kept.read_bytes())
     whole[len(whole) // 2] ^= 1
     kept.write_bytes(whole)
-    with pytest.raises(ProtocolError, match="its checksum does not fit"):
+    with pytest.raises(ProtocolError, match="its checksum does not match"):
         Tracker.load(kept)
     kept.write_bytes(whole[:1000])
-    with pytest.raises(ProtocolError, match="not a whole file"):
+    with pytest.raises(ProtocolError, match="not an undamaged file"):
         Tracker.load(kept)
 
 

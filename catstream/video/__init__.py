@@ -1,1 +1,1 @@
-"""Frames in, results out: sources, results files and annotated video."""
+"""Reads frames from sources, and writes results files and annotated videos."""

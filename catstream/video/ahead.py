@@ -1,4 +1,4 @@
-"""Reading ahead: the next frame of a recording is decoded while one is followed."""
+"""Reading ahead: the next frame of a file is decoded while the current frame is tracked."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["read_ahead"]
 
 
 def read_ahead(source: Source) -> Generator[Frame]:
-    """The frames of a source, one of them read before it is asked for: FFmpeg decodes without Python's lock.
+    """Yield the frames of a source, and read the next one in a thread meanwhile: FFmpeg decodes without the GIL.
 
-    Not for a live source, whose newest frame it would hold back. Raises what the source raises, in its turn. Close it
-    before the source.
+    It is not for live sources, because the frame that was read ahead would be out of date. Errors of the source are
+    raised in order, after the frames before them. Close the generator before the source.
     """
     with ThreadPoolExecutor(1, "reader") as reader:
         coming = reader.submit(next, source, None)

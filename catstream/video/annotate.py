@@ -1,4 +1,4 @@
-"""Tracks drawn over their frames, for people to look at."""
+"""Draws tracks over their frames, for people to look at."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _COLOURS = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent"
 _WHITE, _GREY, _DARK, _ORANGE = (245, 245, 245), (110, 110, 110), (32, 32, 32), (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
-#: Height of the line of text below a picture, in pixels of one that is 640 wide; never less than three quarters of it.
+#: Height of the line of text below an image that is 640 pixels wide, and the smallest factor by which it is scaled.
 _TEXT_HEIGHT, _MIN_UNIT = 26, 0.75
 
 
@@ -30,11 +30,11 @@ def draw(image: np.ndarray, track: Track) -> np.ndarray:
     Parameters
     ----------
     image : uint8 (h, w, 3), blue green red
-    track : what was found in it
+    track : track of this frame
 
     Returns
     -------
-    uint8 (h + k, w, 3), the frame above k rows of text: pixels keep their place, and none is covered by the text
+    uint8 (h + k, w, 3): the frame, and k rows of pixels with the text below it
     """
     height, width = image.shape[:2]
     unit = max(width / 640, _MIN_UNIT)
@@ -50,11 +50,11 @@ def draw(image: np.ndarray, track: Track) -> np.ndarray:
 
 
 def draw_preview(preview: Preview, track: Track | None) -> bytes:
-    """A preview with the track of its frame drawn in, and a line of text below, which is empty if there is no track.
+    """Draw the track of its frame into a preview, with a line of text below; the line is empty without a track.
 
     Returns
     -------
-    JPEG, of the same size with and without a track
+    JPEG file, of the same size with and without a track
     """
     image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
@@ -69,17 +69,17 @@ def draw_preview(preview: Preview, track: Track | None) -> bytes:
 
 
 def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:
-    """A small picture of a frame with two boxes, the true one white, the other orange.
+    """Return a small image of a frame with the ground truth box in white and the tracker's box in orange.
 
     Parameters
     ----------
     image : uint8 (h, w, 3), blue green red
-    truth, box : float64 (4,), x, y, w, h; not drawn where NaN
-    width : of the picture in pixels
+    truth, box : float64 (4,), x, y, w, h; a box with NaN is not drawn
+    width : width of the small image in pixels
 
     Returns
     -------
-    JPEG
+    JPEG file
     """
     scale = width / image.shape[1]
     small = cv2.resize(image, (width, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
@@ -93,12 +93,12 @@ def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int)
 
 
 def _text_height(width: int) -> int:
-    """Rows of text below a picture of this width."""
+    """Return the height in pixels of the line of text below an image of this width."""
     return round(_TEXT_HEIGHT * max(width / 640, _MIN_UNIT))
 
 
 def _draw_box(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float) -> None:
-    """A thin rectangle with strong corners, over a dark one, so that it shows on any background."""
+    """Draw a thin rectangle with thick corners over a dark outline, so that it is visible on any background."""
     (left, top), (right, bottom) = (tuple(round(value) for value in corner) for corner in (start, end))
     thin, arm = max(1, round(1.2 * unit)), min(right - left, bottom - top) // 4
     cv2.rectangle(canvas, (left, top), (right, bottom), (0, 0, 0), thin + 2, cv2.LINE_AA)
@@ -110,7 +110,8 @@ def _draw_box(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float
 
 
 def _draw_text(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> None:
-    """State, score as a bar and as a number, model and frame; in a narrow picture only the first of these."""
+    """Draw the state, the score as a bar and a number, the model version and the frame number; in a narrow image only
+    the first of these."""
     height, width = canvas.shape[:2]
     canvas[:] = _DARK
     middle, line, thick = height // 2, height - round(9 * unit), max(1, round(unit))
@@ -138,21 +139,19 @@ def _draw_text(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> No
 
 
 class AnnotatedVideo:
-    """An MP4 of frames with their tracks drawn in; a context manager.
-
-    It is written with `catstream.video.writer.VideoWriter`, which see.
+    """Writes an MP4 of frames with their tracks drawn in, by `catstream.video.writer.VideoWriter`; a context manager.
 
     Parameters
     ----------
-    path : of the video to write
+    path : file to write
     rate : frames per second, on average
-    size : (width, height) of the frames that will come, in pixels
+    size : (width, height) of the frames in pixels
     sound : video file whose sound is copied, None for no sound
 
     Raises
     ------
     VideoError
-        If the file cannot be written, before any work is done.
+        If the file cannot be written.
     """
 
     def __init__(self, path: str | Path, rate: float, size: tuple[int, int], *, sound: Path | None = None) -> None:
@@ -160,11 +159,11 @@ class AnnotatedVideo:
         self._writer = VideoWriter(path, rate, (width, height + _text_height(width)), sound=sound)
 
     def write(self, image: np.ndarray, track: Track, time: float | None = None) -> None:
-        """Add a frame, uint8 (h, w, 3) of the size announced, with its track; `time` as `VideoWriter.write` has it."""
+        """Add a frame, uint8 (h, w, 3), with its track. `time` is as in `VideoWriter.write`."""
         self._writer.write(draw(image, track), time)
 
     def close(self) -> None:
-        """Finish the file and give it its name."""
+        """Finish the file and give it its final name."""
         self._writer.close()
 
     def __enter__(self) -> Self:

@@ -1,13 +1,13 @@
-"""A stream whose every frame is known: pictures that leave over HTTP at the moments of a schedule.
+"""A test stream over HTTP: known images are sent at the times of a schedule.
 
     with Broadcast(pictures, (640, 480)) as camera:
         source = open_source(camera.urls[0])
         camera.play(Schedule(start=monotonic() + 1, rate=25.0, frames=250))
 
-To put under load what follows a stream. Each frame is sent when it is due, whether or not those before it were
-taken: a slow reader finds frames late, none is left out. The time stamp of a frame in the stream is the moment at
-which it was due, by `time.monotonic`: so its number and its age are known wherever it arrives. The container is
-NUT: FFmpeg gives its frames at once, and holds one back of others.
+It is the load generator of the load tests. Each frame is sent when it is due, even if the receiver has not read the
+frames before it; a slow receiver gets frames late, but none is left out. The time stamp of a frame in the stream is its
+due time by `time.monotonic`, so the receiver can compute its number and its age. The container is NUT, because FFmpeg
+returns its frames without delay; for other containers it buffers one frame.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ import numpy as np
 
 __all__ = ["Broadcast", "Schedule", "jpeg"]
 
-_JPEG_QUALITY = 90  # of JPEG: what cameras send
-_TICKS_PER_SECOND = 1_000_000  # of the stream's clock in a second
-_STILL_RATE = 25.0  # frames a second before anything is played
+_JPEG_QUALITY = 90  # as cameras use it
+_TICKS_PER_SECOND = 1_000_000  # time base of the stream
+_STILL_RATE = 25.0  # frames per second of the still image before a schedule is played
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """When each frame is due. Before the first and after the last one the picture stands still.
+    """The due time of each frame. Before the first and after the last frame, a still image is sent.
 
-    start   moment of `time.monotonic` at which frame 0 is due
-    rate    frames a second
-    frames  how many there are
+    start   due time of frame 0, by `time.monotonic`
+    rate    frames per second
+    frames  number of frames
 
     >>> clip = Schedule(start=100.0, rate=25.0, frames=50)
     >>> clip.due(5), clip.number(100.2), clip.following(100.21)
@@ -51,19 +51,19 @@ class Schedule:
     frames: int
 
     def due(self, number: int) -> float:
-        """The moment of a frame."""
+        """Return the due time of a frame."""
         return self.start + number / self.rate
 
     def number(self, moment: float) -> int:
-        """The frame that is due at a moment, or nearest to it."""
+        """Return the frame whose due time is nearest to a moment."""
         return round((moment - self.start) * self.rate)
 
     def following(self, moment: float) -> int:
-        """The first frame that is due at a moment or after it."""
+        """Return the first frame that is due at a moment or after it."""
         return math.ceil((moment - self.start) * self.rate)
 
     def picture(self, number: int, pictures: int) -> int:
-        """Which of so many pictures a frame shows: forwards, backwards, and so on, without a jump.
+        """Return the index of the image that a frame shows, out of `pictures`: forwards, then backwards, and so on.
 
         >>> [Schedule(0.0, 25.0, 7).picture(number, 3) for number in range(-2, 9)]
         [0, 0, 0, 1, 2, 1, 0, 1, 2, 2, 2]
@@ -73,25 +73,25 @@ class Schedule:
 
 
 def jpeg(image: np.ndarray) -> bytes:
-    """An image as a camera sends it."""
+    """Return an image as JPEG, in the quality of a network camera."""
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
 
 
 class Broadcast:
-    """Serves streams of the same pictures on loopback; a context manager.
+    """Serves streams of the same images on the loopback interface; a context manager.
 
-    Several streams are not in step: the frames of each are due a part of a frame after those of the one before.
+    The schedules of n streams are shifted by 1/n of a frame each, so that frames are not due at the same time.
 
     Parameters
     ----------
-    pictures : JPEG files
-    size : (width, height) of all of them, in pixels
-    streams : how many there are
+    pictures : images as JPEG files
+    size : (width, height) of all images in pixels
+    streams : number of streams
 
     Attributes
     ----------
-    urls : of each stream
-    late : seconds by which it sent a frame too late at most, and that was not a reader's fault
+    urls : URL of each stream
+    late : largest delay in seconds of a sent frame that was not caused by a slow receiver
     """
 
     def __init__(self, pictures: Sequence[bytes], size: tuple[int, int], streams: int = 1) -> None:
@@ -105,7 +105,7 @@ class Broadcast:
         self._thread.start()
 
     def play(self, schedule: Schedule) -> list[Schedule]:
-        """Show the pictures from now on as a schedule says; returns that of each stream."""
+        """Start to send the images by a schedule; return the schedule of each stream."""
         step = 1 / (schedule.rate * len(self._schedules))
         self._schedules = [
             replace(schedule, start=schedule.start + number * step) for number in range(len(self._schedules))
@@ -114,7 +114,7 @@ class Broadcast:
         return self._schedules
 
     def send(self, stream: int, file: BufferedIOBase) -> None:
-        """Send a stream to a reader until it is gone."""
+        """Send a stream to one receiver until it disconnects."""
         import av
 
         clock, pipe = Fraction(1, _TICKS_PER_SECOND), _WriteOnlyFile(file)
@@ -130,7 +130,7 @@ class Broadcast:
                     break
 
     def close(self) -> None:
-        """Close all connections, and take no more."""
+        """Close all connections and the server."""
         self._closed.set()
         self._server.shutdown()
         self._server.server_close()
@@ -143,7 +143,7 @@ class Broadcast:
         self.close()
 
     def _frames(self, stream: int) -> Iterator[tuple[float, int]]:
-        """Moment and picture of each frame from now on, when it is due; of a new schedule once there is one."""
+        """Yield due time and image of each frame when it is due; switch to a new schedule as soon as it is set."""
         while not self._closed.is_set():
             schedule = self._schedules[stream]
             number = schedule.following(monotonic())
@@ -160,9 +160,9 @@ class Broadcast:
 
 
 class _ConnectionHandler(BaseHTTPRequestHandler):
-    """One connection."""
+    """Handles one HTTP connection."""
 
-    disable_nagle_algorithm = True  # or the end of a frame waits for a delayed acknowledgement: 40 ms
+    disable_nagle_algorithm = True  # otherwise the end of a frame waits 40 ms for a delayed acknowledgement
 
     def __init__(self, broadcast: Broadcast, *arguments: Any) -> None:
         self._broadcast = broadcast
@@ -183,9 +183,9 @@ class _ConnectionHandler(BaseHTTPRequestHandler):
 
 
 class _WriteOnlyFile:
-    """A file that can only be written to, as PyAV takes it; an error in it would be one of FFmpeg's, and unlike others.
+    """A write-only file for PyAV. Errors are recorded instead of raised: PyAV would turn them into FFmpeg errors.
 
-    broken  whether the reader has left
+    broken  whether the receiver has disconnected
     """
 
     def __init__(self, file: BufferedIOBase) -> None:

@@ -1,9 +1,9 @@
-"""A video with known truth, rendered from two photographs that scikit-learn ships.
+"""Renders a test video with exact ground truth from two photographs that scikit-learn ships.
 
-A dahlia drifts through the air over a Chinese lake while the camera pans. It
-turns, grows and shrinks, clouds change the light, a look-alike of another
-colour crosses it; a pagoda covers it, later it flies before that pagoda, leaves
-the picture and comes back elsewhere. The same arguments give the same pixels.
+A dahlia moves over a picture of a lake while the camera pans. It rotates and
+changes its size, the brightness changes, a dahlia of another colour crosses
+it, a pagoda occludes it, and it leaves the image and returns at another place.
+The same arguments give the same pixels.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from catstream.video.writer import VideoWriter
 
 __all__ = ["FRAMES", "RATE", "SIZE", "render", "write"]
 
-#: Frames of the whole story, frames a second, and pixels (width, height) of the full size.
+#: Number of different frames, frames per second, and full size (width, height) in pixels.
 FRAMES, RATE, SIZE = 600, 30.0, (640, 480)
 
-_ZOOM = 1.5  # of the photograph of the lake: the rest of this file is in its enlarged pixels
+_ZOOM = 1.5  # enlargement of the photograph of the lake; coordinates below are in the enlarged photograph
 _BEHIND = 280  # the last frame in which the dahlia is behind the pagoda
-_VISIBLE = 0.1  # with less of it to see than this share, the dahlia counts as absent
-_NOISE = 4.0  # standard deviation of the camera's noise, in grey levels
+_VISIBLE = 0.1  # if a smaller share of the dahlia is visible, it counts as absent
+_NOISE = 4.0  # standard deviation of the sensor noise, in grey levels
 
-#: Frame, dahlia's centre x and y, diameter, angle in degrees.
+#: Key frames of the dahlia: frame, centre x and y, diameter, angle in degrees.
 _FLIGHT = np.array(
     [
         (0, 800, 190, 104, 0),
@@ -49,10 +49,10 @@ _FLIGHT = np.array(
     ]
 )
 
-#: The same of the look-alike.
+#: Key frames of the distractor, the dahlia of another colour.
 _DECOY = np.array([(0, 400, 60, 96, 0), (40, 560, 110, 92, 60), (110, 760, 420, 88, 200), (180, 1100, 520, 90, 300)])
 
-#: Frame, left and top of the picture, light: 1 is the photograph's.
+#: Key frames of the camera: frame, left and top of the view, brightness relative to the photograph.
 _CAMERA = np.array(
     [
         (0, 316, 20, 1.0),
@@ -67,10 +67,10 @@ _CAMERA = np.array(
     ]
 )
 
-#: Centre of the dahlia, in pixels of its photograph.
+#: Centre of the dahlia in its photograph, in pixels.
 _DAHLIA = (308, 221)
 
-#: Outline of the pagoda, in pixels of the photograph as it is.
+#: Outline of the pagoda in the photograph before enlargement, in pixels.
 _PAGODA = np.array(
     [
         (196, 50), (198, 32), (213, 32), (216, 52), (240, 82), (318, 122), (320, 130), (300, 134), (294, 158),
@@ -84,23 +84,22 @@ _PAGODA = np.array(
 def render(
     frames: int = FRAMES, size: tuple[int, int] = SIZE, seed: int = 0, *, begin: int = 0
 ) -> Iterator[tuple[np.ndarray, Box | None]]:
-    """Images of the demo in order, each with the dahlia's box.
+    """Yield the images of the demo in order, each with the box of the dahlia.
 
-    After `FRAMES` the story runs backwards, then forwards again, so that a video
-    of any length has no jump in it.
+    After `FRAMES` images the sequence runs backwards, then forwards again, so that a video of any length has no jump.
 
     Parameters
     ----------
-    frames : how many
-    size : (width, height) of the images; other shapes than 4:3 are stretched
-    seed : of the camera's noise
-    begin : number of the first frame in the story
+    frames : number of images
+    size : (width, height) of the images; if it is not 4:3, the images are stretched
+    seed : seed of the sensor noise
+    begin : number of the first image
 
     Yields
     ------
     image : uint8 (height, width, 3), blue green red
-    box : around the whole dahlia, also where a part is covered or outside; None
-        where less than a tenth of it is to be seen
+    box : box of the whole dahlia, including parts that are occluded or outside the image; None if less than a tenth of
+        it is visible
     """
     scene = _Scene(seed)
     width, height = size
@@ -123,18 +122,18 @@ def write(
 
     Parameters
     ----------
-    folder : where; made if it is not there
-    frames, size : see `render`
-    done : called with the number of frames written so far
+    folder : folder to write to; it is made if it does not exist
+    frames, size : as in `render`
+    done : function that is called with the number of frames written so far
 
     Returns
     -------
-    the video, and the object's box in each frame, None where it is absent
+    path of the video, and the box of the object in each frame, None if it is absent
 
     Raises
     ------
     VideoError
-        Where the folder cannot be written to.
+        If the folder cannot be written to.
     """
     path, truth = folder / "demo.mp4", []
     with VideoWriter(path, RATE, size) as video:
@@ -148,13 +147,13 @@ def write(
 
 
 def _load_photograph(name: str) -> np.ndarray:
-    """One that scikit-learn ships, float32 BGR; its own function to load them needs Pillow."""
+    """Load a photograph that scikit-learn ships as float32 BGR. Scikit-learn's own loader needs Pillow."""
     path = files("sklearn") / "datasets" / "images" / f"{name}.jpg"
     return np.array(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR), np.float32)
 
 
 class _Scene:
-    """The two photographs, cut up and ready: float32 colours of 0 to 255."""
+    """Renders single frames from the two photographs; colours are float32, 0 to 255."""
 
     def __init__(self, seed: int) -> None:
         lake, flower = _load_photograph("china"), _load_photograph("flower")
@@ -168,9 +167,9 @@ class _Scene:
         self.noise = self.rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
 
     def render(self, frame: int) -> tuple[np.ndarray, Box | None]:
-        """The image of one frame of the story, full size, and the box."""
+        """Return the image of one frame in full size, and the box."""
         left, top, light = self.camera[frame]
-        sway = 3 * np.sin(frame / np.array([7.3, 5.1]))  # the camera is held by hand
+        sway = 3 * np.sin(frame / np.array([7.3, 5.1]))  # camera shake
         view = np.array([[1, 0, -left - sway[0]], [0, 1, -top - sway[1]]])  # lake -> picture
         image = cv2.warpAffine(self.lake, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
         front = cv2.warpAffine(self.pagoda, view, SIZE)
@@ -186,7 +185,7 @@ class _Scene:
         return image.clip(0, 255).astype(np.uint8), box
 
     def _flower_to_picture(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """The affine map from the cut flower to the picture, float64 (2, 3)."""
+        """Return the affine map from the flower image to the frame, float64 (2, 3)."""
         x, y, diameter, angle = place
         side = self.mask.shape[0]
         turn = cv2.getRotationMatrix2D((side / 2, side / 2), angle, diameter / side)
@@ -194,12 +193,15 @@ class _Scene:
         return turn
 
     def _limits(self, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Left top and right bottom of the flower in the picture."""
+        """Return the top left and bottom right corners of the flower in the frame."""
         points = self.outline @ turn[:, :2].T + turn[:, 2]
         return points.min(axis=0), points.max(axis=0)
 
     def _paint(self, image: np.ndarray, flower: np.ndarray, turn: np.ndarray, free: np.ndarray) -> float:
-        """Lay the flower over the image where that is free; returns the share of it that shows."""
+        """Paint the flower over the unoccluded part of the image; return the visible share of the flower.
+
+        free : float32 (h, w), 1 for pixels that nothing occludes
+        """
         low, high = self._limits(turn)
         left, top = np.maximum(np.floor(low) - 2, 0).astype(int)
         right, bottom = np.minimum(np.ceil(high) + 2, SIZE).astype(int)
@@ -214,7 +216,7 @@ class _Scene:
 
 
 def _cut_out_flower(photograph: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The large flower in a square: colours (s, s, 3), soft mask (s, s), outline points (k, 2)."""
+    """Cut the large flower out of its photograph: colours (s, s, 3), soft mask (s, s), outline points (k, 2)."""
     (x, y), reach, side = _DAHLIA, 144, 160
     window = slice(y - reach, y + reach), slice(x - reach, x + reach)
     colours = cv2.resize(photograph[window], (side, side), interpolation=cv2.INTER_AREA)
@@ -228,7 +230,7 @@ def _cut_out_flower(photograph: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _interpolate(keys: np.ndarray) -> np.ndarray:
-    """Key frames drawn out to a row for each of FRAMES frames, their corners rounded."""
+    """Interpolate key frames to one row for each of `FRAMES` frames, and smooth the changes of direction."""
     bend = np.hanning(27)[1:-1]
     frames = np.arange(FRAMES + len(bend) - 1) - len(bend) // 2
     lines = (np.interp(frames, keys[:, 0], column) for column in keys[:, 1:].T)

@@ -1,4 +1,4 @@
-"""Frames, and what every source of them has, whether it is a recording or live."""
+"""`Frame`, and `Source`, the base class of files and live sources."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 __all__ = ["RATE", "Frame", "Source", "UprightConverter", "ffmpeg_reason", "without_password"]
 
-#: Frames per second of a source without a clock, if none is given.
+#: Frames per second of a source without time stamps, if none is given.
 RATE = 25.0
 
 
@@ -21,10 +21,10 @@ RATE = 25.0
 class Frame:
     """One image of a source.
 
-    number  0, 1, 2 ... of the frames that the source gives, which are not all of a live one, or of a part
-    time    seconds since the start of the video; of a live source, when this frame came
-    image   uint8 (h, w, 3), blue green red; grey is expanded
-    pts     time stamp of the frame in a live stream, seconds of a clock of the stream's own; None of a file
+    number  0, 1, 2 ... over the frames that the source returns; skipped frames have no number
+    time    seconds since the start of the video; for a live source, the arrival time
+    image   uint8 (h, w, 3), blue green red; a grey image is expanded
+    pts     presentation time stamp in a live stream, in seconds of the stream's own clock; None for a file
     """
 
     number: int
@@ -34,15 +34,13 @@ class Frame:
 
 
 class Source(ABC):
-    """Frames in order, once, and what is known of them before they are read.
+    """An iterator over frames, in order and once. Close it, or use it in a `with`.
 
-    name    what results are called: the stem of a file, the name of a folder
+    name    name for results: the stem of a file, or the name of a folder
     rate    frames per second
     size    (width, height) of the first frame in pixels
-    live    whether frames pass by whether they are read or not
-    sound   video file whose sound belongs to the frames; None if there is none
-
-    Close it, or use it in a `with`.
+    live    whether the source is live: frames that are not read in time are lost
+    sound   video file with the sound of these frames, or None
     """
 
     live = False
@@ -53,12 +51,12 @@ class Source(ABC):
 
     @property
     def frames(self) -> int | None:
-        """Number of frames that the source has; None if that cannot be known, as of a live source."""
+        """Number of frames of the source; None if it is unknown, as it is for a live source."""
         return None
 
     @property
     def counters(self) -> dict[str, float]:
-        """Counts of the frames that a source has lost: name -> number."""
+        """Counters of frames that were lost, by name."""
         return {}
 
     def __iter__(self) -> Iterator[Frame]:
@@ -69,7 +67,7 @@ class Source(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let the source go. Iterating afterwards ends at once."""
+        """Close the source. Iteration afterwards ends at once."""
 
     def __enter__(self) -> Self:
         return self
@@ -79,9 +77,9 @@ class Source(ABC):
 
 
 class UprightConverter:
-    """Images of frames that PyAV decoded: phones store upright videos lying down, and the turn beside them.
+    """Converts frames that PyAV decoded to BGR arrays, and applies the rotation that phones store as metadata.
 
-    One for each source: to begin a conversion costs more than to convert.
+    Create one for each source: setting up the conversion costs more than the conversion of a frame.
     """
 
     def __init__(self) -> None:
@@ -95,12 +93,12 @@ class UprightConverter:
 
 
 def ffmpeg_reason(error: Any) -> str:
-    """What FFmpeg says went wrong, in its words."""
+    """Return FFmpeg's own description of an error."""
     return (error.strerror or str(error)).lower()
 
 
 def without_password(source: str) -> str:
-    """The address of a stream without its user and password; any other source as it is.
+    """Return the address of a stream without user and password, and any other source unchanged.
 
     >>> without_password("rtsp://me:secret@10.0.0.7/stream1")
     'rtsp://10.0.0.7/stream1'

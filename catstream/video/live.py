@@ -1,8 +1,8 @@
-"""Live sources: cameras and network streams. Always the newest frame; what is lost is opened again, for ever.
+"""Live sources: cameras and network streams. They give the newest frame, and reconnect after a loss, without limit.
 
-A thread reads and decodes whatever comes and keeps the newest frame, so that who takes frames slowly gets few of them,
-and never old ones: the rest are counted. Where nothing comes for a while, or the stream ends or breaks, the
-source is closed and opened anew, after pauses that double, until it is back or nobody wants it any more.
+A thread reads and decodes continuously and keeps only the newest frame. A slow consumer therefore gets fewer frames,
+never old ones; the skipped frames are counted. If no frame arrives within a time-out, or the stream ends or fails, the
+source is closed and reopened with exponential backoff until it is back or the consumer closes it.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg
 
 __all__ = ["LiveSource"]
 
-#: Time-outs: to open a source and get its first frame, and from a frame to the next.
+#: Time-outs for opening a source and its first frame, and between two frames.
 _OPEN_SECONDS, _SILENT_SECONDS = 10.0, 5.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.25, 8.0
 _IDLE_SECONDS = 0.1
 
 _OPTIONS = {
-    # Over UDP a lost packet is a damaged picture; a camera that knows no TCP is still heard.
+    # TCP first, because over UDP a lost packet damages the picture; a camera without TCP is still received over UDP.
     "rtsp": {"rtsp_flags": "prefer_tcp", "analyzeduration": "500000"},
     "http": {"analyzeduration": "500000"},
 }
@@ -39,20 +39,20 @@ _log = logging.getLogger(__name__)
 
 
 class LiveSource(Source):
-    """The newest frame of a camera or a stream, each time one is asked for; see `catstream.video.source.open_source`.
+    """A camera or a stream; each iteration gives its newest frame. `catstream.video.source.open_source` opens one.
 
-    Iterating waits for a frame that was not taken yet. Should the source come back with other
-    pixels, its frames are scaled to the size of the first one.
+    Iteration waits for a frame that was not returned yet. If the source reconnects with another image size, its frames
+    are scaled to the size of the first one.
 
     Attributes
     ----------
-    skipped : frames that came and were not taken, as a newer one came
-    reopened : how often it was lost and came back
+    skipped : number of frames that were replaced by a newer one before they were returned
+    reopened : number of times that the source was lost and came back
 
     Raises
     ------
     VideoError
-        From the constructor, where it cannot be opened and no `idle` was given; never later.
+        From the constructor, if the source cannot be opened and no `idle` was given; never later.
     """
 
     live = True
@@ -65,12 +65,12 @@ class LiveSource(Source):
         self._text, self._address = text, without_password(text)
         self._number, self._zero, self._idle = start, since, idle
         self._upright = UprightConverter()
-        self._condition = threading.Condition()  # guards what follows
+        self._condition = threading.Condition()  # guards the fields below
         self._newest: tuple[float, Any] | None = None
-        self._problem = ""  # why it is lost, empty while it is not
-        self._last_frame_time = monotonic()  # when the last frame came
+        self._problem = ""  # why the source is lost; empty while it is not
+        self._last_frame_time = monotonic()
         self._closed = False
-        self._was_open = idle is not None  # without it, a source that never was there is an error, and not lost
+        self._was_open = idle is not None  # without `idle`, a source that was never open is an error and not a loss
         self._thread = threading.Thread(target=self._read, name=f"reader of {self.name}", daemon=True)
         self._thread.start()
         self._first: Frame | None = None
@@ -79,9 +79,9 @@ class LiveSource(Source):
 
     @property
     def counters(self) -> dict[str, float]:
-        """`skipped`, `reopened`, and `lost_seconds`: how long it has been lost, 0 while it is not."""
+        """`skipped`, `reopened`, and `lost_seconds`: seconds since the source was lost, 0 while it is not."""
         silent = monotonic() - self._last_frame_time
-        # A device that hangs is beyond every time-out of FFmpeg: at least it is said.
+        # FFmpeg has no time-out for a device that hangs, so a long silence counts as a loss too.
         lost = silent if self._problem or silent > _OPEN_SECONDS else 0.0
         return {"skipped": self.skipped, "reopened": self.reopened, "lost_seconds": lost}
 
@@ -98,23 +98,22 @@ class LiveSource(Source):
         with self._condition:
             self._closed, self._first, self._newest = True, None, None
             self._condition.notify_all()
-        # One that is frozen is not waited for: its thread ends with its time-out, or with the process.
+        # The thread of a device that hangs is not waited for: it ends with its time-out or with the process.
         self._thread.join(1.0)
 
     def _first_frame(self) -> Frame:
-        """The first frame, or a VideoError: where a source was never there, its name is more likely wrong."""
+        """Return the first frame. Raises VideoError at the first failure, because the address is probably wrong."""
         while (newest := self._wait_for_newest()) is None:
             if self._problem:
                 self.close()
                 hint = f"; the folder of that name is ./{self._text}" if self._text.isdigit() else ""
                 raise VideoError(
-                    f"cannot open {self._address!r} ({self._problem}): check that it is there and running, "
-                    f"and its address{hint}"
+                    f"cannot open {self._address!r} ({self._problem}): check that it is running, and its address{hint}"
                 )
         return self._frame(*newest)
 
     def _wait_for_newest(self) -> tuple[float, Any] | None:
-        """The newest frame and when it came, None where none comes for a moment."""
+        """Return the newest frame and its arrival time, or None if no frame arrives within `_IDLE_SECONDS`."""
         with self._condition:
             if self._newest is None and not self._closed:
                 self._condition.wait(_IDLE_SECONDS)
@@ -135,7 +134,7 @@ class LiveSource(Source):
     # --- the thread ------------------------------------------------------------------------------
 
     def _read(self) -> None:
-        """Keep the newest frame, of one opening after the other."""
+        """Read frames and keep the newest; reconnect after each loss."""
         import av
 
         pause = _FIRST_PAUSE
@@ -147,29 +146,29 @@ class LiveSource(Source):
                     pause = _FIRST_PAUSE
             except av.FFmpegError as error:
                 problem = ffmpeg_reason(error)
-            except Exception as error:  # whatever it is: nobody would notice a thread that is gone
+            except Exception as error:  # an unexpected error must not end the thread silently
                 problem = str(error)
             if monotonic() - max(opened, self._last_frame_time) >= _SILENT_SECONDS:
-                problem = "no picture comes"  # FFmpeg has many words for a time-out, and none of them says so
+                problem = "no frame arrives"  # FFmpeg's messages for a time-out are unclear
             with self._condition:
                 self._report_loss(problem)
                 self._condition.wait_for(lambda: self._closed, pause * random.uniform(0.5, 1))
             pause = min(2 * pause, _LONGEST_PAUSE)
 
     def _decoded(self) -> Iterator[Any]:
-        """Frames of one opening, up to its end; those that came damaged are left out."""
+        """Yield the undamaged frames of one connection, until it ends."""
         import av
 
         with _open_container(self._text) as container:
             stream = container.streams.video[0]
-            stream.thread_type = "NONE"  # the processes are the parallelism
+            stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
             due = monotonic() + _OPEN_SECONDS
             for packet in container.demux(stream):
-                if self._closed or monotonic() > due:  # of a packet that a time-out ended, half is missing
+                if self._closed or monotonic() > due:  # a packet that was cut off by a time-out is incomplete
                     return
                 decoded: list[Any] = []
-                with contextlib.suppress(av.FFmpegError):  # of a damaged packet; the next may be whole
+                with contextlib.suppress(av.FFmpegError):  # the packet is damaged; the next may be whole
                     decoded = stream.codec_context.decode(packet)
                 for frame in decoded:
                     if not frame.is_corrupt:
@@ -188,14 +187,14 @@ class LiveSource(Source):
             self._condition.notify()
 
     def _report_loss(self, problem: str) -> None:
-        """Say why, where that is news: a source may be away for days."""
+        """Log the reason of a loss, once for each reason: a source may be lost for days."""
         if problem != self._problem and self._was_open and not self._closed:
-            _log.warning("the source %s is lost (%s), and is opened again until it is back", self.name, problem)
+            _log.warning("the source %s is lost (%s); it is reopened until it is back", self.name, problem)
         self._problem = problem
 
 
 def _open_container(text: str) -> Any:
-    """Open a camera or a stream; raises what PyAV raises, and VideoError where it holds no live picture."""
+    """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
     import av
 
     kind = urlsplit(text).scheme.rstrip("s")
@@ -208,9 +207,9 @@ def _open_container(text: str) -> Any:
     )
     problem = ""
     if not container.streams.video or container.streams.video[0].codec_context is None:
-        problem = "there is no picture in it"
+        problem = "it has no video"
     elif kind == "http" and container.duration:
-        problem = f"it is a recording of {container.duration / 1e6:.0f} s: fetch it, and give the file"
+        problem = f"it is a recording of {container.duration / 1e6:.0f} s: download it, and give the file"
     if problem:
         container.close()
         raise VideoError(problem)
@@ -218,7 +217,7 @@ def _open_container(text: str) -> Any:
 
 
 def _name(text: str) -> str:
-    """What results are called: the last word of the address, else the host; without user and password.
+    """Return the name for results: the last part of the address, or the host; without user and password.
 
     >>> [_name(text) for text in ("0", "/dev/video2", "rtsp://me:secret@10.0.0.7:554/cam/one.sdp?x=1", "http://10.0.0.7")]
     ['video0', 'video2', 'one', '10.0.0.7']

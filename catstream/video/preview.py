@@ -1,4 +1,4 @@
-"""Small pictures of frames, for a person to look at."""
+"""Small JPEG images of frames, for people to look at."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 
 __all__ = ["SIDE", "jpeg"]
 
-#: Pixels of the longer side, at most.
+#: Maximum length of the longer side in pixels.
 SIDE = 640
 
 _QUALITY = 80
 
 
 def jpeg(image: np.ndarray, side: int = SIDE) -> bytes:
-    """A JPEG of an image, shrunk until its longer side has at most `side` pixels.
+    """Return an image as JPEG, scaled down if its longer side exceeds `side` pixels.
 
     Parameters
     ----------

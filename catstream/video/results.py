@@ -1,13 +1,13 @@
-"""Results of a run as text files: a row a frame, flushed as it is written.
+"""Results of a run as text files with one row for each frame. Each row is flushed as it is written.
 
-    NAME.txt               x,y,w,h in pixels; nan,nan,nan,nan where the object is absent
+    NAME.txt               x,y,w,h in pixels; nan,nan,nan,nan if the object is absent
     NAME_confidence.value  the score
-    NAME_time.txt          seconds of work that the frame took
+    NAME_time.txt          processing time of the frame in seconds
     NAME.csv               frame, seconds since the start of the source, state, x, y, w, h, score, model_version
 
-The first three are what the benchmarks' toolkits read. Two lockstep runs write
-the same NAME.txt, NAME_confidence.value and NAME.csv, byte for byte;
-NAME_time.txt is measured and is never the same twice.
+The toolkits of the public benchmarks read the first three. Two lockstep runs
+write the same NAME.txt, NAME_confidence.value and NAME.csv, byte for byte;
+NAME_time.txt is measured and differs between runs.
 """
 
 from __future__ import annotations
@@ -33,30 +33,30 @@ __all__ = [
     "table_file",
 ]
 
-#: Of NAME.csv.
+#: Header of NAME.csv.
 COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version"
 
 _ABSENT = "nan,nan,nan,nan"
 
 
 def table_file(name: str) -> str:
-    """Name of the file with a row a track."""
+    """Return the name of the CSV file, which has one row for each track."""
     return f"{name}.csv"
 
 
 def result_files(name: str) -> tuple[str, ...]:
-    """Names of all results files of a run."""
+    """Return the names of all results files of a run."""
     return (*_row_files(name), table_file(name))
 
 
 def format_row(track: Track) -> str:
-    """The row of a track in NAME.csv."""
+    """Return the row of a track in NAME.csv."""
     box = ",,," if track.box is None else _sides(track.box)
     return f"{track.frame},{track.time:.6f},{track.state},{box},{track.score:.6f},{track.model_version}"
 
 
 def parse_row(text: str) -> Track:
-    """The track of such a row; raises ValueError if it is none."""
+    """Return the track of a row of NAME.csv. Raises ValueError if it is not such a row."""
     frame, seconds, state, x, y, w, h, score, version = text.split(",")
     box = Box(*map(float, (x, y, w, h))) if x else None
     return Track(int(frame) + 1, int(frame), float(seconds), _state(state), box, float(score), int(version))
@@ -69,21 +69,21 @@ def _sides(box: Box) -> str:
 class ResultsWriter:
     """Writes the results files of one run; a context manager.
 
-    Row k is frame `start + k` of the source: frames that no track was written
-    for (a live source skipped them) get a row of nan.
+    Row k belongs to frame `start + k` of the source. A frame without a track (a live source skipped it) gets a row of
+    nan.
 
     Parameters
     ----------
-    directory : where to write; made if it is not there
-    name : of the run, usually that of the source
+    directory : folder of the results; it is made if it does not exist
+    name : name of the run, usually that of the source
     start : number of the first frame
-    keep : go on with the files that are there, after their rows of frames before this one that are whole in every
-        file; None to replace them
+    keep : append to the existing files after the frames before `keep` that are complete in every file; None replaces
+        the files
 
     Raises
     ------
     VideoError
-        Where the directory cannot be written to, before any work is done; or takes no more, later.
+        From the constructor if the folder cannot be written to; later if a write fails.
     """
 
     def __init__(self, directory: str | Path, name: str, start: int = 0, *, keep: int | None = None) -> None:
@@ -106,11 +106,11 @@ class ResultsWriter:
         except OSError as error:
             raise VideoError(
                 f"cannot write results to {str(directory)!r} ({error.strerror}): "
-                "give a folder that exists or can be made, and that you may write to"
+                "give a folder that exists or can be made, and that you have permission to write to"
             ) from None
 
     def write(self, track: Track, seconds: float) -> None:
-        """Add one frame, and the seconds of work it took. A frame that has its row already is skipped."""
+        """Add the track of one frame and its processing time. A frame that already has a row is skipped."""
         if track.frame < self.rows:
             return
         with self._reporting_errors():
@@ -125,8 +125,8 @@ class ResultsWriter:
             file.write(text + "\n")
 
     def close(self) -> None:
-        """Close the files; what was written stays."""
-        with self._reporting_errors():  # where a row was not taken, it is tried once more
+        """Close the files."""
+        with self._reporting_errors():  # closing retries a row whose write failed
             self._files.close()
 
     @contextlib.contextmanager
@@ -144,30 +144,30 @@ class ResultsWriter:
 
 
 def read_tracks(directory: Path, name: str) -> Iterator[Track]:
-    """The tracks that `NAME.csv` holds, up to the first that is not whole; none where there is no file."""
+    """Yield the tracks in `NAME.csv` up to the first incomplete row; none if there is no file."""
     for _, track in _parsed_lines(directory / table_file(name)):
         yield track
 
 
 def complete_frames(directory: Path, name: str) -> int:
-    """How many frames are whole in every file."""
+    """Return the number of frames that are complete in every file."""
     least = min(len(_row_ends(directory / file)) - 1 for file in _row_files(name))
     return max((track.frame + 1 for track in read_tracks(directory, name) if track.frame < least), default=0)
 
 
 def _row_files(name: str) -> tuple[str, ...]:
-    """Files with a row a frame, also of one that no track was written for."""
+    """Return the names of the files that have a row for every frame, with or without a track."""
     return f"{name}.txt", f"{name}_confidence.value", f"{name}_time.txt"
 
 
 def _parsed_lines(path: Path) -> Iterator[tuple[int, Track]]:
-    """Where each line of `NAME.csv` ends, in bytes, and its track."""
+    """Yield each track of `NAME.csv` with the byte offset at which its line ends."""
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         end = len(file.readline())
         for line in file:
             try:
                 track = parse_row(line.decode("ascii"))
-            except ValueError:  # half a line, or what a disk holds where nothing was written yet
+            except ValueError:  # an incomplete line, or a block that was never written before a power cut
                 return
             if not line.endswith(b"\n"):
                 return
@@ -182,7 +182,7 @@ def _state(text: str) -> Any:
 
 
 def _row_ends(path: Path) -> list[int]:
-    """Where each whole row of a file ends, in bytes."""
+    """Return the byte offsets at which the complete rows of a file end."""
     ends = [0]
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         for line in file:
@@ -193,7 +193,7 @@ def _row_ends(path: Path) -> list[int]:
 
 
 def _truncate(directory: Path, name: str, keep: int) -> int:
-    """Keep so many frames, if so many are whole in every file, and cut off the others; returns how many are kept."""
+    """Truncate all files to the same number of complete frames, at most `keep`; return that number."""
     rows = min(complete_frames(directory, name), keep)
     for file in _row_files(name):
         if (directory / file).exists():

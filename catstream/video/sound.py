@@ -1,4 +1,4 @@
-"""The sound of a video file, copied as it is into a video whose picture is written anew."""
+"""Copies the sound of a video file, without re-encoding, into a video that is being written."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _log = logging.getLogger(__name__)
 
 
 class Sound:
-    """Copies the first sound track of a file; does nothing if there is none that the new container can hold.
+    """Copies the first sound track of a file; does nothing if there is none, or the new container does not support it.
 
     Parameters
     ----------
-    path : of the file, None for no sound
+    path : file with the sound, None for no sound
     container : `av.container.OutputContainer` to copy to, before its first packet
     """
 
@@ -31,7 +31,7 @@ class Sound:
         try:
             source = av.open(str(path.absolute()))
         except (av.FFmpegError, OSError) as error:
-            _log.warning("the sound of %s cannot be read (%s), and is left out", path, error.strerror)
+            _log.warning("the sound of %s is left out: it cannot be read (%s)", path, error.strerror)
             return
         try:
             self._stream = source.streams.audio[0]
@@ -50,7 +50,7 @@ class Sound:
         self._next: Any = None
 
     def copy(self, start: float, end: float) -> None:
-        """Copy what sounds from `start` up to `end`, in seconds of the source; calls follow one another in time."""
+        """Copy the sound from `start` up to `end`, in seconds of the source. Calls must be in order of time."""
         import av
 
         while self._source is not None:
@@ -74,7 +74,7 @@ class Sound:
                 self._container.mux(packet)
 
     def close(self) -> None:
-        """Close the file that is copied from."""
+        """Close the file with the sound."""
         if self._source is not None:
             self._source.close()
             self._source = None

@@ -1,23 +1,23 @@
-"""Sources: where frames come from, by one text that a person types.
+"""Opens sources of frames. One text names the source, as a user types it.
 
     with open_source("walk.mp4") as source:
         for frame in source:
             print(frame.number, frame.time, frame.image.shape)
 
-What the text may be:
+The text is one of these:
 
-    a video file        all that FFmpeg reads; every frame once, in order
+    a video file        any format that FFmpeg reads; every frame is read once, in order
     a folder            its images in natural order (2.png before 10.png), or those of its `img`, `color` or `rgb`
-                        folder, or its one video: so the sequence folders of the benchmarks open as they are
+                        folder, or its only video; sequence folders of the public benchmarks open unchanged
     a pattern           images/%05d.png or images/*.png
     a camera            0 or /dev/video0
     a stream            rtsp://HOST/PATH, or http://HOST/PATH for MJPEG
-    a file:// address   file:///home/me/walk.mp4, as other programs copy it
+    a file:// address   file:///home/me/walk.mp4
 
-Files and images are read to their last frame and none is skipped. If a file is
-damaged, its good frames come first and then a `VideoError`; with
-`run.skip_damaged` it is read on after the damaged place. Cameras and streams are
-live: see `catstream.video.live`.
+Files and images are read to the last frame, and no frame is skipped. If a file
+is damaged, the frames before the damage are returned and then `VideoError` is
+raised; with `skip_damaged`, reading continues after the damage. Cameras and
+streams are live: see `catstream.video.live`.
 """
 
 from __future__ import annotations
@@ -48,35 +48,35 @@ _FOLDERS = ("img", "imgs", "color", "rgb")
 _EXPECTED = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
 _LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+")
 
-#: A video that ends this much before its container says was cut off: rounding and audio explain less.
+#: A video that ends this many seconds before its stated duration was cut off. Rounding and audio cause less.
 _CUT_OFF_SECONDS = 0.5
 
-
-#: Reading a container that fails so often in a row, without a packet between, has come to its end.
+#: After this many consecutive read errors without a packet, the container is treated as ended.
 _MAX_FAILURES = 3
 
-#: Bytes between two packets of a Matroska file that belong to none: the heads of clusters and blocks have far fewer.
+#: If more bytes than this lie between two packets of a Matroska file, data is damaged. Cluster and block headers are
+#: far smaller.
 _MAX_BYTES_BETWEEN_PACKETS = 4096
 
-#: A file larger than this, in bytes, is not read through to count its frames.
+#: The frames of a larger file (in bytes) are estimated from its duration instead of being counted.
 _MAX_COUNTED_BYTES = 1 << 30
 
 
 class _FileSource(Source):
-    """A source whose frames are all read. Its constructor decodes the first one.
+    """A video file or a set of images. No frame is skipped; the constructor decodes the first frame.
 
     Parameters
     ----------
-    stream : the frames of `part`, from number `start` of them on
-    total : returns how many frames the whole source has, None if that cannot be known
+    stream : the frames of `part`, starting with number `start` within the part
+    total : function that returns the number of frames of the whole source, or None if it is unknown
     rate : frames per second of the whole source
-    damage : of the file that `stream` reads
+    damage : counter of the damaged frames in the file that `stream` reads
 
     Raises
     ------
     VideoError
-        From the constructor if there is no first frame, from the iterator if the source is damaged, after its good
-        frames.
+        From the constructor if there is no first frame; from the iterator at the first damage, after the frames before
+        it.
     """
 
     def __init__(
@@ -92,10 +92,10 @@ class _FileSource(Source):
         self._stream, self._total, self._part, self._damage = stream, total, part, damage
         self._first: Frame | None = next(stream, None)
         if self._first is None:
-            wanted = range(sys.maxsize)[part][start:]
-            end = " on" if part.stop is None else f" to before {wanted.stop}"
+            numbers = range(sys.maxsize)[part][start:]
+            end = "" if part.stop is None else f" and before frame {numbers.stop}"
             raise VideoError(
-                f"{name} has {total() or 'no'} frames, numbered from 0, and none to follow from frame {wanted.start}"
+                f"{name} has {total() or 'no'} frames, numbered from 0, and none from frame {numbers.start} on"
                 f"{end}: give an earlier first frame, or another source"
             )
         height, width = self._first.image.shape[:2]
@@ -108,7 +108,7 @@ class _FileSource(Source):
 
     @property
     def counters(self) -> dict[str, float]:
-        """`damaged`: how many frames could not be decoded and were left out."""
+        """`damaged`: number of frames that could not be decoded and were left out."""
         return {"damaged": self._damage.frames} if self._damage is not None and self._damage.frames else {}
 
     def __next__(self) -> Frame:
@@ -125,7 +125,7 @@ class _FileSource(Source):
 
 
 def is_live(text: str | Path) -> bool:
-    """Whether this names a camera or a stream. A number is a camera: a folder of that name is ./0.
+    """Return whether a text names a camera or a stream. A number names a camera; a folder named 0 is ./0.
 
     >>> [is_live(text) for text in ("0", "/dev/video2", "rtsp://10.0.0.7/stream", "./0", "walk.mp4")]
     [True, True, True, False, False]
@@ -143,39 +143,39 @@ def open_source(
     image_rate: float = RATE,
     skip_damaged: bool = False,
 ) -> Source:
-    """Open what `text` names, see the module.
+    """Open the source that `text` names; the docstring of the module lists the kinds.
 
     Parameters
     ----------
-    text : what and where
-    start : number of the first frame wanted, of those in the part. In a file those before it are decoded, never
-        guessed at; a live source counts from there
-    part : which frames of a file or folder there are for whoever reads, `slice(100, 200, 2)` for 100, 102 ... 198
-    since : moment of `time.monotonic` that the times of a live source count from, its first frame where None
-    idle : called ten times a second while a live source gives no frame; where it returns True, iterating ends.
-        Who gives one waits for the first frame too, however long it takes: opening then never fails, and the
-        size is known with the first frame
-    image_rate : frames per second of images, which have no clock
-    skip_damaged : read a video file on after a damaged place. The frames that cannot be decoded are left out, the
-        next good one takes the next number, and its time is the true one
+    text : name of the source
+    start : number of the first frame to return, counted within the part. The frames before it in a file are decoded
+        and dropped; a live source numbers its first frame `start`
+    part : the frames of a file or folder that are read, for example `slice(100, 200, 2)` for 100, 102 ... 198
+    since : zero of the time stamps of a live source, as `time.monotonic` gives it; None for its first frame
+    idle : function that is called ten times a second while a live source gives no frame; if it returns True, iteration
+        ends. With it, opening a live source never fails: iteration waits for the first frame for any length of time,
+        and the size is known with that frame
+    image_rate : frames per second of a folder of images
+    skip_damaged : continue after damage in a video file. The frames that cannot be decoded are left out; the next good
+        frame gets the next number and keeps its own time stamp
 
     Raises
     ------
     VideoError
-        If there is nothing, or nothing readable; says what was expected.
+        If the source does not exist or cannot be read.
     """
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
         raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
     if is_live(text):
         if part != ALL_FRAMES:
-            raise VideoError("of a live source only the newest frame can be had: leave start, end and stride away")
-        from catstream.video.live import LiveSource  # here, as files do without its threads
+            raise VideoError("a live source gives only its newest frame: leave out start, end and stride")
+        from catstream.video.live import LiveSource  # imported here because files do not need its threads
 
         return LiveSource(str(text), start, since=since, idle=idle)
     if str(text) == "-":
         raise VideoError(
-            "a pipe cannot be read again after a process was restarted, so standard input is no source: "
-            "write the video to a file, or serve it as a stream that can be opened again"
+            "standard input is not a source, because a restarted process cannot read it again: "
+            "write the video to a file, or serve it as a stream"
         )
     path = Path(without_scheme(str(text)))
     images = partial(_open_images, part=part, start=start, rate=image_rate)
@@ -193,12 +193,12 @@ def open_source(
 
 
 def without_scheme(text: str) -> str:
-    """The path that a file:// address names; any other text as it is.
+    """Return the path of a file:// address, and any other text unchanged.
 
     Raises
     ------
     VideoError
-        For a file of another machine.
+        If the address names another machine.
 
     >>> without_scheme("file:///videos/a%20walk.mp4"), without_scheme("./0")
     ('/videos/a walk.mp4', './0')
@@ -207,17 +207,17 @@ def without_scheme(text: str) -> str:
         return text
     address = urlsplit(text)
     if address.netloc not in ("", "localhost"):
-        raise VideoError(f"{text!r} names a file of another machine: copy it here, or give file:///PATH")
+        raise VideoError(f"{text!r} names a file on another machine: copy it here, or give file:///PATH")
     return unquote(address.path)
 
 
 def image_files(path: Path) -> list[Path]:
-    """Images in a folder or of a pattern (%05d, *), in natural order.
+    """Return the image files in a folder, or those that match a pattern (%05d, *), in natural order.
 
     Raises
     ------
     VideoError
-        Where there is none.
+        If there are no images.
     """
     if path.is_dir():
         files = [file for file in path.iterdir() if file.suffix.lower() in _IMAGES]
@@ -235,7 +235,7 @@ def image_files(path: Path) -> list[Path]:
 
 
 def natural_order(path: Path) -> list[Any]:
-    """Key of an order in which 10 comes after 2."""
+    """Sort key by which 10 comes after 2."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
@@ -272,7 +272,7 @@ def _read_images(files: list[Path], wanted: range, start: int, rate: float) -> I
 
 
 def _read_image(path: Path) -> np.ndarray | None:
-    """An image as uint8 (h, w, 3), None if it cannot be read. OpenCV's own warnings are not printed."""
+    """Return an image as uint8 (h, w, 3), or None if it cannot be read; OpenCV's warnings are suppressed."""
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         return cv2.imread(str(path), cv2.IMREAD_COLOR)
@@ -281,13 +281,13 @@ def _read_image(path: Path) -> np.ndarray | None:
 
 
 def _open_video(path: Path, *, part: slice, start: int, skip_damaged: bool) -> Source:
-    import av  # here, as it costs 0.1 s and folders do without
+    import av  # imported here because it takes 0.1 s and folders do not need it
 
     try:
         container = av.open(str(path.absolute()))
     except (av.FFmpegError, OSError) as error:
         raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_EXPECTED}") from None
-    # FFmpeg renders text files as video; nobody means that.
+    # FFmpeg opens any text file as a video of its text (format "tty").
     streams = container.streams.video
     if not streams or streams[0].codec_context is None or container.format.name == "tty":
         container.close()
@@ -302,7 +302,7 @@ def _open_video(path: Path, *, part: slice, start: int, skip_damaged: bool) -> S
 
 
 def _count_frames(path: Path, rate: float) -> int | None:
-    """Number of frames of a video whose container does not say it: its packets, which need not be decoded."""
+    """Count the frames of a video whose container does not state their number, by its packets, without decoding."""
     import av
 
     with av.open(str(path.absolute())) as container:
@@ -310,14 +310,14 @@ def _count_frames(path: Path, rate: float) -> int | None:
         if path.stat().st_size > _MAX_COUNTED_BYTES:
             return round(_stated_duration(container, stream) * rate) or None
         count = 0
-        with contextlib.suppress(av.FFmpegError):  # reading the frames says what is damaged
+        with contextlib.suppress(av.FFmpegError):  # damage is reported later, when the frames are read
             count = sum(1 for packet in container.demux(stream) if packet.size)
         return count or None
 
 
 def _read_video(path: Path, container: Any, rate: float, wanted: range, start: int, damage: _Damage) -> Iterator[Frame]:
     stream = container.streams.video[0]
-    stream.thread_type = "NONE"  # the processes are the parallelism
+    stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
     number, time, zero, shape, upright = 0, 0.0, None, None, UprightConverter()
     with container:
         for frame in _good_frames(container, stream, rate, damage):
@@ -333,14 +333,14 @@ def _read_video(path: Path, container: Any, rate: float, wanted: range, start: i
                 shape = image.shape
                 yield Frame(wanted.index(number), time, image)
             number += 1
-            if number >= wanted.stop:  # what comes after the part may be damaged
+            if number >= wanted.stop:  # damage after the part must not be an error
                 return
 
 
 class _Damage:
-    """Decides what a damaged place in a video file means: reading ends there, or goes on at the next key frame.
+    """Counts the frames lost to damage in a video file, or raises at the first damage unless it is to be skipped.
 
-    frames  how many were left out there, as the time stamps tell
+    frames  number of frames that were left out, by the time stamps around the damage
     """
 
     def __init__(self, path: Path, skip: bool) -> None:
@@ -348,22 +348,22 @@ class _Damage:
         self.frames = 0
 
     def report(self, problem: str, good: int) -> None:
-        """Take note of a damaged place after so many good frames.
+        """Report damage after `good` undamaged frames.
 
         Raises
         ------
         VideoError
-            Unless damaged places are skipped.
+            Unless damage is to be skipped.
         """
         if not self._skip:
             raise VideoError(
-                f"{str(self._path)!r} breaks at frame {good} ({problem}): the frames before are good; "
-                "--skip-damaged (skip_damaged=True) goes on after the damaged place"
+                f"{str(self._path)!r} is damaged at frame {good} ({problem}): the frames before it are good; "
+                "--skip-damaged (skip_damaged=True) continues after the damage"
             )
 
 
 def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> Iterator[Any]:
-    """Decoded frames that are whole, in order; `damage` is told of the places between them that are not."""
+    """Yield the undamaged frames in order, and report each damage between them to `damage`."""
     import av
 
     count, last, since_damage, waits_for_key = 0, None, False, False
@@ -377,7 +377,7 @@ def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> I
                 frames = stream.codec_context.decode(packet)
             except av.FFmpegError as error:
                 problem = ffmpeg_reason(error)
-        if problem:  # the good frames that wait in the decoder for their turn
+        if problem:  # fetch the good frames that are still in the decoder's reorder buffer
             with contextlib.suppress(av.FFmpegError):
                 frames = stream.codec_context.decode(None)
         for frame in frames:
@@ -399,7 +399,8 @@ def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> I
 
 
 def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, str]]:
-    """Packets, the last an empty one, each with what is wrong at its place: the empty text for nothing."""
+    """Yield each packet with a description of the damage before or in it, "" if there is none. The last packet is the
+    empty one that flushes the decoder."""
     import av
 
     end, place, failures, stated = 0.0, 0, 0, _stated_duration(container, stream)
@@ -413,17 +414,17 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
             yield None, ffmpeg_reason(error)
             if failures == _MAX_FAILURES:
                 return
-            packets = container.demux()  # it reads on where it is
+            packets = container.demux()  # continues at the current position
             continue
         failures = 0
-        # FFmpeg passes over a damaged place in a Matroska file without a word.
+        # FFmpeg skips damaged parts of a Matroska file without an error.
         missing = matroska and 0 < place < (packet.pos or 0) - _MAX_BYTES_BETWEEN_PACKETS
         place = max(place, (packet.pos or 0) + packet.size)
         if packet.stream is not stream:
             continue
         if packet.dts is None and not packet.size:
             short = stated - end > max(_CUT_OFF_SECONDS, 2 / rate)
-            yield packet, f"it says it lasts {stated:.1f} s, and ends at {end:.1f} s" if short else ""
+            yield packet, f"its stated duration is {stated:.1f} s, it ends at {end:.1f} s" if short else ""
             return
         if packet.pts is not None:
             end = max(end, float((packet.pts + (packet.duration or 0) - (stream.start_time or 0)) * stream.time_base))
@@ -431,10 +432,10 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
 
 
 def _stated_duration(container: Any, stream: Any) -> float:
-    """How long the video says it is, 0 where it does not say."""
+    """Return the duration that the container states for the video stream in seconds, 0 if it states none."""
     if stream.duration:
         return float(stream.duration * stream.time_base)
     if clock := re.fullmatch(r"(\d+):(\d+):([\d.]+)", stream.metadata.get("DURATION", "")):
         return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3])
-    # Without a duration of its own, only where no sound can outlast the picture.
+    # The container's duration is that of its longest stream, so it counts only if the video is the only stream.
     return (container.duration or 0) / 1e6 if len(container.streams) == 1 else 0.0

@@ -1,4 +1,4 @@
-"""Videos written frame by frame."""
+"""Writes videos frame by frame."""
 
 from __future__ import annotations
 
@@ -16,36 +16,34 @@ from catstream.video.sound import Sound
 
 __all__ = ["VideoWriter"]
 
-#: Steps of a video's clock per frame: how exactly a frame of a source without a constant rate keeps its time.
+#: Steps of the video's time base per frame: the precision of time stamps if the frame rate is not constant.
 _TICKS_PER_FRAME = 100
 
-#: Pixels of a picture that is still encoded for few bytes: 1920x1080 with a line of text below it.
+#: The largest image, in pixels, that is encoded with the slower preset: 1920x1080 with a line of text below it.
 _LARGE_PIXELS = 1920 * 1200
 
 
 class VideoWriter:
     """Writes an MP4; a context manager.
 
-    The codec is H.264 if this FFmpeg has it, else MPEG-4. The file gets its name when it is
-    closed and whole; until then it is NAME.part. A run that wrote no frame
-    leaves nothing, nor does one that could not write it whole: an MP4 without
-    its end cannot be read.
+    The codec is H.264 if this FFmpeg has it, else MPEG-4. The file is NAME.part until it is closed, and gets its final
+    name then. If no frame was written, or writing failed, no file is left: an MP4 without its index cannot be read.
 
     Parameters
     ----------
-    path : of the video to write
+    path : file to write
     rate : frames per second, on average
-    size : (width, height) of the frames that will come, in pixels
-    sound : video file whose sound is copied beside the frames, None for no sound
+    size : (width, height) of the frames in pixels
+    sound : video file whose sound is copied, None for no sound
 
     Raises
     ------
     VideoError
-        If the file cannot be written, before any work is done; or takes no more, later.
+        From the constructor if the file cannot be written; later if a write fails.
     """
 
     def __init__(self, path: str | Path, rate: float, size: tuple[int, int], *, sound: Path | None = None) -> None:
-        import av  # here, as only those who ask for a video pay for it
+        import av  # imported here because only the writing of videos needs it
 
         self.path = Path(path)
         self.frames = 0
@@ -58,10 +56,10 @@ class VideoWriter:
             self._container = av.open(str(self._part.absolute()), "w", format="mp4")
         except (OSError, av.FFmpegError) as error:
             raise VideoError(
-                f"cannot write the video {str(path)!r} ({error.strerror}): give a place that you may write to"
+                f"cannot write the video {str(path)!r} ({error.strerror}): give a path that you may write to"
             ) from None
         h264 = "libx264" in av.codecs_available
-        # Of a large picture, speed is worth more than bytes: at 3840x2160 twice as many frames per second.
+        # Large images use the faster preset: at 3840x2160 it encodes twice as many frames per second.
         preset = "veryfast" if size[0] * size[1] <= _LARGE_PIXELS else "ultrafast"
         self._stream: Any = self._container.add_stream(
             "libx264" if h264 else "mpeg4",
@@ -69,9 +67,9 @@ class VideoWriter:
             options={"preset": preset, "crf": "20"} if h264 else {"qscale": "3"},
         )
         self._stream.codec_context.time_base = 1 / (self._rate * _TICKS_PER_FRAME)
-        self._stream.thread_count = 1  # the processes are the parallelism
+        self._stream.thread_count = 1  # the processes of the pipeline already use the cores
         self._stream.pix_fmt = "yuv420p"
-        # Both encoders share colour between 2x2 pixels, so an odd side grows by one.
+        # Both encoders subsample colour by 2x2 pixels, so an odd side is padded by one pixel.
         self._stream.width, self._stream.height = (side + side % 2 for side in size)
         self._sound = Sound(sound, self._container)
 
@@ -80,15 +78,15 @@ class VideoWriter:
 
         Parameters
         ----------
-        image : uint8 (h, w, 3) blue green red, of the size announced
-        time : seconds of the source at which it is shown; the video begins with the first of them. If None, frames
-            follow one another at the rate announced
+        image : uint8 (h, w, 3), blue green red, of the size given to the constructor
+        time : time stamp in seconds of the source; the first one is the start of the video. If None, frames have the
+            constant rate given to the constructor
         """
         import av
 
         time = self.frames / float(self._rate) if time is None else time
         self._first_time = self._first_time if self.frames else time
-        # Two frames never share a time stamp, whatever a source says.
+        # Time stamps must increase, even if those of the source do not.
         self._last_tick = max(self._last_tick + 1, round((time - self._first_time) * self._rate * _TICKS_PER_FRAME))
         down, across = self._stream.height - image.shape[0], self._stream.width - image.shape[1]
         even: Any = cv2.copyMakeBorder(image, 0, down, 0, across, cv2.BORDER_REPLICATE)
@@ -100,7 +98,7 @@ class VideoWriter:
         self.frames += 1
 
     def close(self) -> None:
-        """Finish the file and give it its name."""
+        """Finish the file and give it its final name."""
         try:
             with self._reporting_errors():
                 with self._container:
@@ -110,7 +108,7 @@ class VideoWriter:
                     self._part.replace(self.path)
         finally:
             self._sound.close()
-            with contextlib.suppress(OSError):  # of a disk that is read-only now
+            with contextlib.suppress(OSError):  # the disk may have become read-only
                 self._part.unlink(missing_ok=True)
 
     @contextlib.contextmanager
@@ -120,7 +118,7 @@ class VideoWriter:
         try:
             yield
         except (OSError, av.FFmpegError) as error:
-            self.frames = 0  # as nothing can be read: to write on to such a file ends the process
+            self.frames = 0  # the file is unreadable; writing more to it would crash the process
             raise VideoError(f"cannot write the video {str(self.path)!r} any more: {error.strerror}") from None
 
     def __enter__(self) -> Self:

@@ -99,7 +99,7 @@ def test_where_no_pipeline_runs_one_line_says_so(said, tmp_path, verb):
     words = {"set-box": ["1,2,3,4"], "save": [tmp_path / "one"]}.get(verb, [])
     code, output, errors = said(verb, *words, "--endpoint", tmp_path / "run", "--timeout", 0.2)
     assert (code, output) == (1, "")
-    assert errors.startswith("catstream: nothing at ")
-    assert f"answered {verb} within 0.2 s: is a pipeline running there" in errors
+    assert errors.startswith(f"catstream: no answer to {verb} from ")
+    assert "within 0.2 s: is a pipeline running there" in errors
     nowhere = {**os.environ, "TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}
     assert said(verb, *words, env=nowhere)[2].startswith("catstream: no pipeline of yours is running")

@@ -120,7 +120,7 @@ def test_a_truncated_video_is_followed_up_to_the_break(video, said_by_process, t
     assert 0 < good < 60
     code, _, errors = said_by_process("track", broken, "--box", box, "--output", tmp_path / "out")
     assert code == 1
-    assert f"breaks at frame {good}" in one_line(errors)
+    assert f"is damaged at frame {good}" in one_line(errors)
     assert len((tmp_path / "out" / "broken.txt").read_text().splitlines()) == good
 
 
@@ -237,6 +237,6 @@ def encoded(source, path):
 def readable(path):
     """How many frames come before the break."""
     frames = []
-    with open_source(path) as source, pytest.raises(VideoError, match="breaks at frame"):
+    with open_source(path) as source, pytest.raises(VideoError, match="is damaged at frame"):
         frames.extend(frame.number for frame in source)
     return len(frames)

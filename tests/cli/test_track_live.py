@@ -114,7 +114,7 @@ def test_a_server_that_freezes_and_dies_is_followed_again_with_what_was_learned(
         rtsp(port)
         run.until(lambda counters: counters["reopened"] == 2 and counters["model_version"] >= learned + 5)
         rows, errors = run.stopped()
-    assert "the source one is lost (no picture comes)" in errors
+    assert "the source one is lost (no frame arrives)" in errors
     assert errors.count("the source one is back after") == 2
     assert "lost and opened again 2 times" in errors
     assert [int(row["frame"]) for row in rows] == list(range(len(rows)))

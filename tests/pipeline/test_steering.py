@@ -269,7 +269,7 @@ def test_a_model_that_cannot_be_used_is_refused_before_anything_starts(video, sa
     path, boxes = video
     torn = tmp_path / "torn"
     torn.write_bytes(saved.read_bytes()[:-9])
-    with pytest.raises(ProtocolError, match="not a whole file"):
+    with pytest.raises(ProtocolError, match="not an undamaged file"):
         Pipeline(path, model=torn)
     with pytest.raises(ServiceError, match="no saved model"):
         Pipeline(path, model=tmp_path / "none")

@@ -34,7 +34,7 @@ def test_a_truncated_video_gives_the_frames_before_the_break(real, tmp_path, sha
                 np.testing.assert_array_equal(frame.image, next(images))
                 count += 1
 
-    with pytest.raises(VideoError, match="breaks at frame"):
+    with pytest.raises(VideoError, match="is damaged at frame"):
         read()
     assert 0.6 * share < count / len(sequence) < 1.4 * share
 

@@ -93,7 +93,7 @@ def test_a_camera_that_is_silent_is_opened_again(camera, monkeypatch, caplog, un
         cam.sends.set()
         until(lambda: source.reopened == 1)
         next(source)
-    assert "one is lost (no picture comes)" in caplog.text
+    assert "one is lost (no frame arrives)" in caplog.text
     assert "one is back after" in caplog.text
 
 
@@ -171,6 +171,6 @@ def test_a_recording_behind_a_url_is_refused(tmp_path):
     folder = partial(SimpleHTTPRequestHandler, directory=tmp_path)
     with ThreadingHTTPServer(("127.0.0.1", 0), folder) as server:
         threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-        with pytest.raises(VideoError, match="a recording of 2 s: fetch it"):
+        with pytest.raises(VideoError, match="a recording of 2 s: download it"):
             open_source(f"http://127.0.0.1:{server.server_port}/walk.mp4")
         server.shutdown()

@@ -190,7 +190,7 @@ def test_damage_in_the_middle_ends_a_video_there(video, name):
     good, message = broken(path)
     assert good == list(range(len(good)))
     assert 20 < len(good) < 80
-    assert "breaks at frame" in message
+    assert "is damaged at frame" in message
 
 
 def test_a_video_without_its_index_says_that_it_cannot_be_read(video):
@@ -218,7 +218,7 @@ def test_text_is_not_a_video(tmp_path, name, text):
 
 
 def test_a_start_after_the_end_is_refused(video):
-    with pytest.raises(VideoError, match="has 5 frames, numbered from 0, and none to follow from frame 5 on"):
+    with pytest.raises(VideoError, match="has 5 frames, numbered from 0, and none from frame 5 on"):
         open_source(video("a.avi", frames=5), start=5)
 
 
@@ -317,7 +317,7 @@ def test_a_part_that_counts_backwards_is_refused(images, part):
 
 @pytest.mark.parametrize("part", [slice(5, 5), slice(9, None)], ids=str)
 def test_a_part_without_a_frame_is_refused_and_the_error_says_how_many_there_are(images, part):
-    with pytest.raises(VideoError, match=f"has 9 frames, numbered from 0, and none to follow from frame {part.start}"):
+    with pytest.raises(VideoError, match=f"has 9 frames, numbered from 0, and none from frame {part.start} on"):
         open_source(images("walk", [f"{number}.png" for number in range(9)]), part=part)
 
 

@@ -155,7 +155,7 @@ def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, un
     assert np.array_equal(heard[0].rows, features(3).rows)
     assert subscription.missed == 2 + 2 + 1
     assert subscription.missed_before == 2
-    assert subscription.losses() == "5 missed, 2 of them before this began to listen"
+    assert subscription.losses() == "5 missed, 2 of them before this subscriber connected"
 
 
 def test_what_nobody_listens_to_is_not_even_made(endpoint, until):
@@ -216,7 +216,7 @@ def test_a_waiting_task_can_be_cancelled_and_hears_silence(endpoint, tracks):
 
 @pytest.mark.parametrize("channel", ["lessons", "results", "frames"])
 def test_a_channel_for_one_receiver_is_refused(endpoint, channel):
-    with pytest.raises(ServiceError, match="one can subscribe to samples, models, tracks, health"):
+    with pytest.raises(ServiceError, match="expected one of the channels samples, models, tracks, health"):
         catstream.subscribe(str(endpoint), channel)
 
 
