@@ -13,7 +13,7 @@ from typing import Any
 from accuracy import MEANS, accuracy_command, changed, compared, difference, means, spread, videos
 from table import Table, publish
 
-from catstream.evaluation.runs import Run
+from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import PRESETS, Settings
 
 COLUMNS = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error", "runs changed")
@@ -72,7 +72,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         yield Table("The paper's tracker", COLUMNS, beside(whole, paper), note)
 
 
-def beside(whole: list[Run], runs: dict[str, list[Run]]) -> list[tuple[str | float, ...]]:
+def beside(whole: list[EvaluationRun], runs: dict[str, list[EvaluationRun]]) -> list[tuple[str | float, ...]]:
     """A row for each variant: its means, what is lost against the whole, and in how many runs it shows."""
     return [
         (name, *means(found), spread(found), *difference(whole, found), changed(whole, found))

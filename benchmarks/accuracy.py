@@ -16,7 +16,7 @@ from table import command
 
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import evaluate
-from catstream.evaluation.runs import Run
+from catstream.evaluation.runs import EvaluationRun
 from catstream.evaluation.summary import rows_of
 from catstream.settings import Settings
 
@@ -46,7 +46,7 @@ def videos(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
 
 def compared(
     options: argparse.Namespace, sequences: list[Sequence], variants: dict[str, Settings]
-) -> dict[str, list[Run]]:
+) -> dict[str, list[EvaluationRun]]:
     """Runs of catstream with each of several settings, by their name, in the same order in each."""
     return {
         name: evaluate(
@@ -62,18 +62,18 @@ def compared(
     }
 
 
-def means(runs: Iterable[Run]) -> tuple[float, float, float]:
+def means(runs: Iterable[EvaluationRun]) -> tuple[float, float, float]:
     """AUC, success and precision, over the starts of each sequence and then over the sequences."""
     rows = rows_of(runs)
     return tuple(fmean(getattr(row, measure.lower()) for row in rows) for measure in MEANS)
 
 
-def spread(runs: Iterable[Run]) -> float:
+def spread(runs: Iterable[EvaluationRun]) -> float:
     """Standard deviation of the AUC over the starts of a sequence, the mean over the sequences."""
     return fmean(row.auc_spread for row in rows_of(runs))
 
 
-def difference(runs: list[Run], others: list[Run]) -> tuple[float, float]:
+def difference(runs: list[EvaluationRun], others: list[EvaluationRun]) -> tuple[float, float]:
     """Mean difference of AUC over the sequences, and its standard error: above twice that it is hardly chance.
 
     Starts of one sequence are alike: they count as one.
@@ -83,7 +83,7 @@ def difference(runs: list[Run], others: list[Run]) -> tuple[float, float]:
     return float(apart.mean()), float(apart.std(ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else 0.0
 
 
-def changed(runs: list[Run], others: list[Run]) -> int:
+def changed(runs: list[EvaluationRun], others: list[EvaluationRun]) -> int:
     """How many runs have another box anywhere."""
     pairs = zip(runs, others, strict=True)
     return sum(not np.array_equal(run.boxes, other.boxes, equal_nan=True) for run, other in pairs)

@@ -23,7 +23,7 @@ from throughput import MODES, steps
 from catstream.errors import SettingsError
 from catstream.evaluation.onepass import evaluate, follow
 from catstream.evaluation.peers import Peer
-from catstream.evaluation.runs import Run
+from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
 PEERS = ("csrt", "kcf", "mil")
@@ -130,7 +130,7 @@ def beside_peers(options: argparse.Namespace) -> Table:
     return Table("Beside OpenCV's trackers", columns, rows, f"{len(own)} sequences, {note}")
 
 
-def together(runs: list[Run]) -> float:
+def together(runs: list[EvaluationRun]) -> float:
     """Frames a second over all runs, the first frame of each apart."""
     return sum(len(run.seconds) - 1 for run in runs) / sum(float(run.seconds[1:].sum()) for run in runs)
 

@@ -16,8 +16,8 @@ from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.detection.detector import Detector
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import starts_of
-from catstream.evaluation.runs import Run
+from catstream.evaluation.onepass import start_frames
+from catstream.evaluation.runs import EvaluationRun
 from catstream.paper.scm import SparseCollaborativeModel
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
@@ -43,11 +43,11 @@ class Recipe:
 
 def follow_all(
     options: argparse.Namespace, sequences: list[Sequence], recipes: dict[str, Recipe]
-) -> dict[str, list[Run]]:
+) -> dict[str, list[EvaluationRun]]:
     """Runs of each recipe over all sequences and starts, in the same order in each."""
     starts, jobs = (1, 1) if options.quick else (options.starts, options.jobs)
-    tasks = [(recipes, sequence, start) for sequence in sequences for start in starts_of(sequence, starts)]
-    runs: dict[str, list[Run]] = {name: [] for name in recipes}
+    tasks = [(recipes, sequence, start) for sequence in sequences for start in start_frames(sequence, starts)]
+    runs: dict[str, list[EvaluationRun]] = {name: [] for name in recipes}
     with ProcessPoolExecutor(jobs, mp_context=SPAWN) as pool:
         for found in (map if jobs == 1 else pool.map)(follow_each, *zip(*tasks, strict=True)):
             for run in found:
@@ -55,7 +55,7 @@ def follow_all(
     return runs
 
 
-def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: int) -> list[Run]:
+def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: int) -> list[EvaluationRun]:
     """Runs of each recipe on one sequence, from the same frame."""
     runs = []
     # SCM depends on none of what recipes differ in, and takes longer than all else: each frame once for all of them.
@@ -88,7 +88,7 @@ class Shared:
         return self.found[self.told - 1]
 
 
-def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> Run:
+def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> EvaluationRun:
     """The loop of `catstream.tracker.Tracker`, with other trees, and an end to learning."""
     frames = len(sequence) - start
     settings = recipe.settings.for_length(frames)
@@ -103,4 +103,4 @@ def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> Run:
             boxes.append(track.box or (np.nan,) * 4)
             scores.append(track.score)
             moments.append(perf_counter())
-    return Run(name, sequence, start, np.array(boxes), np.array(scores), np.diff(moments))
+    return EvaluationRun(name, sequence, start, np.array(boxes), np.array(scores), np.diff(moments))

@@ -20,7 +20,7 @@ from accuracy import MEANS, accuracy_command, compared, difference, means, video
 from table import Table, publish
 
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import starts_of
+from catstream.evaluation.onepass import start_frames
 from catstream.settings import Settings
 
 #: Bootstrap -> its settings. SCM follows all n frames where each gives one row: no copies.
@@ -50,7 +50,7 @@ def pieces_of(sequence: Sequence, places: int, frames: int) -> list[Sequence]:
             boxes=sequence.boxes[start : start + frames],
             begin=sequence.begin + start,
         )
-        for start in starts_of(sequence, places)
+        for start in start_frames(sequence, places)
     ]
 
 

@@ -75,7 +75,7 @@ def evaluate(
         from catstream.evaluation.datasets import find_sequences
         from catstream.evaluation.onepass import evaluate as run_all
         from catstream.evaluation.report import write_report
-        from catstream.evaluation.runs import Run
+        from catstream.evaluation.runs import EvaluationRun
         from catstream.evaluation.summary import rows_of, to_json
 
     names = [name.strip() for name in trackers.split(",") if name.strip()]
@@ -93,7 +93,7 @@ def evaluate(
         def begin(frames: int) -> None:
             progress.update(task, total=frames)
 
-        def done(run: Run) -> None:
+        def done(run: EvaluationRun) -> None:
             progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}")
 
         runs = run_all(

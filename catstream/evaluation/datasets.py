@@ -27,7 +27,7 @@ from catstream.video.source import natural_order, open_source
 __all__ = ["Sequence", "find_sequences"]
 
 #: Sequences of OTB whose truth does not begin with their first image, by name and number of boxes.
-_BEGIN = {("david", 471): 299}
+_FIRST_FRAMES = {("david", 471): 299}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,16 +78,16 @@ def find_sequences(path: str | Path) -> list[Sequence]:
         Where there is none, or a truth that cannot be read.
     """
     path = Path(path)
-    found = _sequences(path)
-    if not found and path.is_dir():
+    sequences = _sequences(path)
+    if not sequences and path.is_dir():
         for folder in sorted((inner for inner in path.iterdir() if inner.is_dir()), key=natural_order):
-            found += _sequences(folder)
-    if not found:
+            sequences += _sequences(folder)
+    if not sequences:
         raise VideoError(
             f"there is no annotated sequence in {str(path)!r}: expected a folder of frames with groundtruth_rect.txt "
             "(x,y,w,h), gt.txt (TLD), groundtruth.txt (VOT) or FOLDER.txt (Princeton), or a folder of such folders"
         )
-    return found
+    return sequences
 
 
 def _sequences(folder: Path) -> list[Sequence]:
@@ -113,7 +113,7 @@ def _sequence(name: str, folder: Path, file: Path, reader: Callable[[np.ndarray]
     boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
     if np.isnan(boxes).all():
         raise VideoError(f"{str(file)!r} has no box at all: the object must be somewhere")
-    return Sequence(name, folder, boxes, _BEGIN.get((name.lower(), len(boxes)), 0))
+    return Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
 
 
 def _numbers(file: Path) -> np.ndarray:

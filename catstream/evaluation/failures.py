@@ -1,4 +1,4 @@
-"""Film strips: a few frames around the place where a run went wrong."""
+"""FailureStrip strips: a few frames around the place where a run went wrong."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from catstream.evaluation.metrics import overlaps
-from catstream.evaluation.runs import Run
+from catstream.evaluation.runs import EvaluationRun
 from catstream.video.annotate import thumbnail
 
-__all__ = ["Film", "film_of", "worst"]
+__all__ = ["FailureStrip", "failure_strip", "worst_runs"]
 
 #: Frames shown, counted from the first bad one; the last bad one is shown too.
 _AROUND = (-20, -5, 0, 5, 20)
@@ -18,7 +18,7 @@ _WIDTH = 240
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Film:
+class FailureStrip:
     """What went wrong in a run, for people to look at.
 
     run        shown
@@ -27,20 +27,20 @@ class Film:
     pictures   (row, JPEG bytes) in order; the truth is white, the tracker's box orange
     """
 
-    run: Run
+    run: EvaluationRun
     first: int
     length: int
     pictures: list[tuple[int, bytes]]
 
 
-def worst(runs: list[Run], count: int) -> list[Run]:
+def worst_runs(runs: list[EvaluationRun], count: int) -> list[EvaluationRun]:
     """At most `count` runs with the most bad frames for their length, the worst first; good ones are left out."""
     shares = [_bad(run).mean() for run in runs]
     order = np.argsort(shares, kind="stable")[::-1][:count]
     return [runs[place] for place in order if shares[place] > 0.05]
 
 
-def film_of(run: Run) -> Film:
+def failure_strip(run: EvaluationRun) -> FailureStrip:
     """The film of one run; reads the frames it needs."""
     first, length = _longest(_bad(run))
     last = len(run.boxes) - 1
@@ -51,10 +51,10 @@ def film_of(run: Run) -> Film:
             pictures.append((row, thumbnail(image, run.truth[row], run.boxes[row], _WIDTH)))
         if row == wanted[-1]:
             break
-    return Film(run, first, length, pictures)
+    return FailureStrip(run, first, length, pictures)
 
 
-def _bad(run: Run) -> np.ndarray:
+def _bad(run: EvaluationRun) -> np.ndarray:
     """Frames where the overlap is 0.5 or less, or where something is found that is not there, bool (frames,)."""
     there = np.isfinite(run.truth).all(axis=1)
     found = np.isfinite(run.boxes).all(axis=1)

@@ -108,8 +108,8 @@ def long_term(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray) -> L
     if not len(answered):
         return LongTerm(0.0, 0.0, 0.0)
     shared = np.cumsum(overlaps(boxes, truth)[answered])
-    sure = confidence[answered]
-    ends = np.append(sure[1:] != sure[:-1], True)  # equal confidences pass a threshold together
+    confidences = confidence[answered]
+    ends = np.append(confidences[1:] != confidences[:-1], True)  # equal confidences pass a threshold together
     precision = (shared / np.arange(1, len(answered) + 1))[ends]
     recall = (shared / _present(truth).sum())[ends]
     f_score = 2 * precision * recall / np.maximum(precision + recall, np.finfo(float).tiny)

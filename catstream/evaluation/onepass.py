@@ -13,31 +13,31 @@ from catstream.box import Box
 from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.peers import PEERS, Peer
-from catstream.evaluation.runs import Run, claim, label, load, save
-from catstream.evaluation.workers import results
+from catstream.evaluation.runs import EvaluationRun, load, prepare_folder, run_name, save
+from catstream.evaluation.workers import run_tasks
 from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.tracker import Tracker
 
-__all__ = ["TRACKERS", "evaluate", "follow", "starts_of"]
+__all__ = ["TRACKERS", "evaluate", "follow", "start_frames"]
 
 #: What can be evaluated.
 TRACKERS = ("catstream", *PEERS)
 
 
-def starts_of(sequence: Sequence, count: int) -> list[int]:
+def start_frames(sequence: Sequence, count: int) -> list[int]:
     """`count` frames to start from, evenly spread; where the object is absent, the next with it.
 
     This is temporal robustness (OTB): on a hard clip a single run says little.
     """
     present = np.flatnonzero(np.isfinite(sequence.boxes).all(axis=1))
-    wanted = np.arange(count) * len(sequence) // count
-    places = np.searchsorted(present, wanted)
+    tasks = np.arange(count) * len(sequence) // count
+    places = np.searchsorted(present, tasks)
     return sorted({int(present[place]) for place in places if place < len(present)})
 
 
-def follow(tracker: str, settings: Settings, sequence: Sequence, start: int = 0) -> Run:
-    """Run one tracker from one start to the end of a sequence, in this process."""
+def follow(tracker: str, settings: Settings, sequence: Sequence, start: int = 0) -> EvaluationRun:
+    """EvaluationRun one tracker from one start to the end of a sequence, in this process."""
     frames = len(sequence) - start
     worker = Tracker(settings.for_length(frames)) if tracker == "catstream" else Peer(tracker)
     given = Box(*map(float, sequence.boxes[start]))
@@ -54,7 +54,7 @@ def follow(tracker: str, settings: Settings, sequence: Sequence, start: int = 0)
             boxes[row] = box
         confidence[row] = worker.track.score if isinstance(worker, Tracker) else float(box is not None)
     # What is stored and what is measured at once are the same numbers.
-    return Run(tracker, sequence, start, boxes.round(4), confidence.round(6), seconds.round(8))
+    return EvaluationRun(tracker, sequence, start, boxes.round(4), confidence.round(6), seconds.round(8))
 
 
 def evaluate(
@@ -66,9 +66,9 @@ def evaluate(
     jobs: int = 1,
     output: Path | None = None,
     begin: Callable[[int], None] = lambda _: None,
-    done: Callable[[Run], None] = lambda _: None,
+    done: Callable[[EvaluationRun], None] = lambda _: None,
     failed: Callable[[CatstreamError], None] | None = None,
-) -> list[Run]:
+) -> list[EvaluationRun]:
     """All trackers on all sequences.
 
     Parameters
@@ -92,53 +92,53 @@ def evaluate(
         `output` holds runs made with other settings.
     """
     trackers = list(dict.fromkeys(trackers))
-    _check(sequences, trackers)
+    _validate_names(sequences, trackers)
     if output is not None:
-        claim(output, settings)
-    runs: dict[tuple[str, str], Run] = {}
+        prepare_folder(output, settings)
+    runs: dict[tuple[str, str], EvaluationRun] = {}
 
-    def add(run: Run) -> None:
+    def add(run: EvaluationRun) -> None:
         runs[run.tracker, run.name] = run
         done(run)
 
-    wanted = [
+    tasks = [
         (tracker, settings, sequence, start)
         for sequence in sequences
         for tracker in trackers
-        for start in starts_of(sequence, starts)
+        for start in start_frames(sequence, starts)
     ]
-    begin(sum(len(sequence) - start for _, _, sequence, start in wanted))
+    begin(sum(len(sequence) - start for _, _, sequence, start in tasks))
     missing = []
-    for task in wanted:
+    for task in tasks:
         tracker, _, sequence, start = task
         run = None if output is None else load(output, tracker, sequence, start)
         if run is None:
             missing.append(task)
         else:
             add(run)
-    for result in _work(missing, output, jobs):
-        if isinstance(result, Run):
+    for result in _run_all(missing, output, jobs):
+        if isinstance(result, EvaluationRun):
             add(result)
         elif failed is None:
             raise result
         else:
             failed(result)
-    names = [(tracker, label(sequence, start)) for tracker, _, sequence, start in wanted]
+    names = [(tracker, run_name(sequence, start)) for tracker, _, sequence, start in tasks]
     return [runs[name] for name in names if name in runs]
 
 
-def _work(tasks: list[Any], output: Path | None, jobs: int) -> Iterator[Run | CatstreamError]:
+def _run_all(tasks: list[Any], output: Path | None, jobs: int) -> Iterator[EvaluationRun | CatstreamError]:
     if jobs == 1:
-        yield from (_follow(output, *task) for task in tasks)
+        yield from (_follow_and_save(output, *task) for task in tasks)
         return
     # Long ones first, so that none is left running alone at the end.
     ranked = sorted(tasks, key=lambda task: task[3] - len(task[2]))
-    yield from results(_follow, [(output, *task) for task in ranked], jobs)
+    yield from run_tasks(_follow_and_save, [(output, *task) for task in ranked], jobs)
 
 
-def _follow(
+def _follow_and_save(
     output: Path | None, tracker: str, settings: Settings, sequence: Sequence, start: int
-) -> Run | CatstreamError:
+) -> EvaluationRun | CatstreamError:
     """`follow`, and keep the run. On one core: all trackers have the same conditions, the jobs are the parallelism."""
     try:
         with one_thread(opencv=True):
@@ -146,11 +146,11 @@ def _follow(
         if output is not None:
             save(output, run)
     except CatstreamError as error:
-        return CatstreamError(f"{tracker} on {label(sequence, start)}: {error}")
+        return CatstreamError(f"{tracker} on {run_name(sequence, start)}: {error}")
     return run
 
 
-def _check(sequences: list[Sequence], trackers: list[str]) -> None:
+def _validate_names(sequences: list[Sequence], trackers: list[str]) -> None:
     if not trackers:
         raise SettingsError(f"no tracker is given: there are {', '.join(TRACKERS)}")
     for tracker in trackers:

@@ -34,7 +34,7 @@ class Peer:
     """
 
     def __init__(self, name: str) -> None:
-        self._create = _find(name)
+        self._create = _constructor(name)
         self._tracker: Any = None
 
     def init(self, frame: np.ndarray, box: Sequence[float]) -> None:
@@ -64,7 +64,7 @@ class Peer:
         return (True, Box(*map(float, box))) if found else (False, None)
 
 
-def _find(name: str) -> Callable[[], Any]:
+def _constructor(name: str) -> Callable[[], Any]:
     for home in (cv2, getattr(cv2, "legacy", None)):
         create = getattr(home, f"{PEERS[name]}_create", None)
         if create is not None:

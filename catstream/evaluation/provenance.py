@@ -79,11 +79,11 @@ def machine() -> dict[str, Any]:
 
 def _versions() -> dict[str, str]:
     """Of the libraries that are installed."""
-    found = {}
+    versions = {}
     for library in _LIBRARIES:
         with suppress(PackageNotFoundError):
-            found[library] = version(library)
-    return found
+            versions[library] = version(library)
+    return versions
 
 
 def _processor() -> str:

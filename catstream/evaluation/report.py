@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from catstream.evaluation.films import Film, film_of, worst
+from catstream.evaluation.failures import FailureStrip, failure_strip, worst_runs
 from catstream.evaluation.metrics import OVERLAPS, PIXELS, precision_plot, success_plot
-from catstream.evaluation.runs import Run
+from catstream.evaluation.runs import EvaluationRun
 from catstream.evaluation.summary import Row, mean_of, rows_of
 from catstream.html.page import table, write_page
 from catstream.html.plots import SHARES, Axis, plot
@@ -20,12 +20,12 @@ from catstream.settings import Settings
 
 __all__ = ["write_report"]
 
-_FILMS = 8  # of the first tracker
-_OTHER_FILMS = 2  # of each other
+_STRIPS = 8  # of the first tracker
+_OTHER_STRIPS = 2  # of each other
 
 
-def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
-    """Write the report of an evaluation; reads frames for the film strips of the worst runs.
+def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> Path:
+    """Write the report of an evaluation; reads frames for the strip strips of the worst runs.
 
     Raises
     ------
@@ -33,10 +33,10 @@ def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
         Where the file cannot be written.
     """
     rows = rows_of(runs)
-    films: list[Film] = []
+    strips: list[FailureStrip] = []
     for place, tracker in enumerate(dict.fromkeys(run.tracker for run in runs)):
         own = [run for run in runs if run.tracker == tracker]
-        films += map(film_of, worst(own, _OTHER_FILMS if place else _FILMS))
+        strips += map(failure_strip, worst_runs(own, _OTHER_STRIPS if place else _STRIPS))
     sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
     changed = escape("\n".join(settings.changed()))
     body = [
@@ -46,27 +46,29 @@ def write_report(path: Path, runs: list[Run], settings: Settings) -> Path:
         _plots(runs),
         "<h2>Sequences</h2>",
         _table(rows),
-        "<h2>Worst failures</h2>" if films else "",
-        '<p class="about">White: the truth. Orange: the tracker.</p>' if films else "",
-        *map(_film, films),
+        "<h2>Worst failures</h2>" if strips else "",
+        '<p class="about">White: the truth. Orange: the tracker.</p>' if strips else "",
+        *map(_strip_html, strips),
         "<h2>Settings that are not the default</h2>",
         f"<pre>{changed or 'none'}</pre>",
     ]
     return write_page(path, "evaluation", body)
 
 
-def _plots(runs: list[Run]) -> str:
+def _plots(runs: list[EvaluationRun]) -> str:
     """Success and precision of each tracker, averaged over the sequences."""
 
     def curves(
         places: np.ndarray, measure: Callable[..., np.ndarray], at: Callable[[np.ndarray], float]
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        found: dict[str, dict[str, list[np.ndarray]]] = {}
+        by_tracker: dict[str, dict[str, list[np.ndarray]]] = {}
         for run in runs:  # as in the table: first over the starts of a sequence
-            found.setdefault(run.tracker, {}).setdefault(run.sequence.name, []).append(measure(run.boxes, run.truth))
+            by_tracker.setdefault(run.tracker, {}).setdefault(run.sequence.name, []).append(
+                measure(run.boxes, run.truth)
+            )
         means = {
             tracker: np.mean([np.mean(plots, axis=0) for plots in sequences.values()], axis=0)
-            for tracker, sequences in found.items()
+            for tracker, sequences in by_tracker.items()
         }
         ranked = sorted(means.items(), key=lambda item: -at(item[1]))
         return {f"{tracker}  {at(curve):.3f}": (places, curve) for tracker, curve in ranked}
@@ -105,14 +107,14 @@ def _share(value: float | None) -> str:
     )
 
 
-def _film(film: Film) -> str:
-    run, pictures = film.run, []
-    for row, jpeg in film.pictures:
+def _strip_html(strip: FailureStrip) -> str:
+    run, pictures = strip.run, []
+    for row, jpeg in strip.pictures:
         number = f"frame {run.start + row}"
         source = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
         pictures.append(f'<figure><img alt="{number}" src="{source}"><figcaption>{number}</figcaption></figure>')
     return (
-        f"<p><b>{escape(run.name)}</b>, {run.tracker}: wrong for {film.length} frames from frame "
-        f"{run.start + film.first} on; success {run.score().success:.3f}</p>\n"
-        f'<div class="film">{"".join(pictures)}</div>'
+        f"<p><b>{escape(run.name)}</b>, {run.tracker}: wrong for {strip.length} frames from frame "
+        f"{run.start + strip.first} on; success {run.score().success:.3f}</p>\n"
+        f'<div class="strip">{"".join(pictures)}</div>'
     )

@@ -27,11 +27,11 @@ from catstream.evaluation.metrics import Score, score
 from catstream.evaluation.peers import OPENCV
 from catstream.settings import Settings
 
-__all__ = ["Run", "claim", "label", "load", "save"]
+__all__ = ["EvaluationRun", "load", "prepare_folder", "run_name", "save"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class EvaluationRun:
     """What one tracker answered on one sequence from one start.
 
     tracker     its name
@@ -52,7 +52,7 @@ class Run:
     @property
     def name(self) -> str:
         """Of the sequence, and where it was started if not at the front."""
-        return label(self.sequence, self.start)
+        return run_name(self.sequence, self.start)
 
     @property
     def truth(self) -> np.ndarray:
@@ -69,12 +69,12 @@ class Run:
         return score(self.boxes, self.truth, self.confidence)
 
 
-def label(sequence: Sequence, start: int) -> str:
+def run_name(sequence: Sequence, start: int) -> str:
     """What a run is called."""
     return f"{sequence.name}@{start}" if start else sequence.name
 
 
-def claim(output: Path, settings: Settings) -> None:
+def prepare_folder(output: Path, settings: Settings) -> None:
     """Make the folder for runs, and see that those in it were made with these settings, and these versions.
 
     Raises
@@ -108,7 +108,7 @@ def _files(output: Path, tracker: str, name: str) -> tuple[Path, Path, Path]:
     return folder / f"{stem}.txt", folder / f"{stem}_confidence.value", folder / f"{stem}_time.value"
 
 
-def save(output: Path, run: Run) -> None:
+def save(output: Path, run: EvaluationRun) -> None:
     """Write a run; the folder of VOT's layout appears last and whole, so that it says: finished.
 
     Raises
@@ -134,7 +134,7 @@ def save(output: Path, run: Run) -> None:
         raise VideoError(f"its result cannot be written to {str(home)!r} ({error.strerror}): make room") from None
 
 
-def load(output: Path, tracker: str, sequence: Sequence, start: int) -> Run | None:
+def load(output: Path, tracker: str, sequence: Sequence, start: int) -> EvaluationRun | None:
     """A finished run, or None where there is none, or it began on another box.
 
     Raises
@@ -142,11 +142,11 @@ def load(output: Path, tracker: str, sequence: Sequence, start: int) -> Run | No
     CatstreamError
         Where there is one that cannot be read.
     """
-    boxes, confidence, seconds = _files(output, tracker, label(sequence, start))
+    boxes, confidence, seconds = _files(output, tracker, run_name(sequence, start))
     if not boxes.parent.is_dir():
         return None
     try:
-        run = Run(
+        run = EvaluationRun(
             tracker,
             sequence,
             start,

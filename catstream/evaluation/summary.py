@@ -9,7 +9,7 @@ from statistics import fmean, pstdev
 from typing import Any
 
 from catstream.evaluation.provenance import provenance
-from catstream.evaluation.runs import Run
+from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
 __all__ = ["MEASURES", "Row", "mean_of", "rows_of", "to_json"]
@@ -44,9 +44,9 @@ class Row:
     fps: float
 
 
-def rows_of(runs: Iterable[Run]) -> list[Row]:
+def rows_of(runs: Iterable[EvaluationRun]) -> list[Row]:
     """A row for each sequence and tracker, in the order in which they come."""
-    groups: dict[tuple[str, str], list[Run]] = {}
+    groups: dict[tuple[str, str], list[EvaluationRun]] = {}
     for run in runs:
         groups.setdefault((run.sequence.name, run.tracker), []).append(run)
     return [_row(name, tracker, group) for (name, tracker), group in groups.items()]
@@ -68,7 +68,7 @@ def to_json(rows: list[Row], settings: Settings) -> dict[str, Any]:
     return {**provenance(settings), "sequences": [dataclasses.asdict(row) for row in rows], "mean": mean_of(rows)}
 
 
-def _row(name: str, tracker: str, runs: list[Run]) -> Row:
+def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
     scores = [run.score() for run in runs]
     long = [score.long_term for score in scores if score.long_term is not None]
     return Row(

@@ -17,12 +17,12 @@ from catstream.errors import ServiceError
 from catstream.services.loop import die_with
 from catstream.services.start import SPAWN
 
-__all__ = ["results"]
+__all__ = ["run_tasks"]
 
 _CTRL_C = {signal.SIGINT}
 
 
-def results(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
+def run_tasks(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
     """What `work(*task)` gives for each task, in the order in which they are done; `jobs` processes at once.
 
     If the caller stops early, as on Ctrl-C, the workers are killed: none is left.
@@ -33,9 +33,9 @@ def results(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
         If a worker was killed by somebody else.
     """
     others = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=_begin, initargs=(os.getpid(),)) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=_init_worker, initargs=(os.getpid(),)) as pool:
         try:
-            for future in as_completed(_submitted(pool, work, tasks)):
+            for future in as_completed(_submit(pool, work, tasks)):
                 yield future.result()
         except BrokenProcessPool:
             raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
@@ -45,8 +45,8 @@ def results(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
             raise
 
 
-def _submitted(pool: ProcessPoolExecutor, work: Any, tasks: list[Any]) -> list[Future[Any]]:
-    """Workers are started here, and inherit that SIGINT is blocked: until `_begin` it could only be a traceback."""
+def _submit(pool: ProcessPoolExecutor, work: Any, tasks: list[Any]) -> list[Future[Any]]:
+    """Submit all tasks. The workers, which are started here, inherit a blocked SIGINT until `_init_worker` unblocks it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _CTRL_C)
     try:
         return [pool.submit(work, *task) for task in tasks]
@@ -54,7 +54,7 @@ def _submitted(pool: ProcessPoolExecutor, work: Any, tasks: list[Any]) -> list[F
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin(parent: int) -> None:
+def _init_worker(parent: int) -> None:
     """Ctrl-C reaches the workers too, and ends them: the parent is the one that speaks, and none outlives it."""
     die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -24,9 +24,9 @@ tr.mean td { font-weight: 600; } small { opacity: .65; }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(380px, 100%), 1fr)); gap: 1.2rem; }
 svg text { font-size: 12px; fill: currentColor; } svg .title { font-size: 14px; font-weight: 600; }
 svg .grid { stroke: var(--line); }
-.film { display: flex; gap: .5rem; overflow-x: auto; padding-bottom: .4rem; }
-.film figure { margin: 0; } .film img { display: block; border-radius: 4px; }
-.film figcaption { font-size: 12px; }
+.strip { display: flex; gap: .5rem; overflow-x: auto; padding-bottom: .4rem; }
+.strip figure { margin: 0; } .strip img { display: block; border-radius: 4px; }
+.strip figcaption { font-size: 12px; }
 pre { background: var(--soft); padding: .8rem; border-radius: 6px; overflow-x: auto; }
 """
 

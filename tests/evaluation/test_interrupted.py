@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from catstream.cli import INTERRUPTED, interruptible
-from catstream.evaluation.workers import results
+from catstream.evaluation.workers import run_tasks
 
 EVALUATE = [sys.executable, "-c", "from catstream.cli import main; main()", "evaluate"]
 
@@ -34,7 +34,7 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_leaves_none(walk, tmp_pa
 
 
 def test_a_caller_that_stops_early_leaves_no_worker():
-    given = results(abs, [(-1,), (-2,), (-3,)], jobs=2)
+    given = run_tasks(abs, [(-1,), (-2,), (-3,)], jobs=2)
     assert next(given) in {1, 2, 3}
     workers = multiprocessing.active_children()
     given.close()

@@ -14,9 +14,9 @@ import pytest
 from catstream.errors import BoxError, CatstreamError, SettingsError, VideoError
 from catstream.evaluation import onepass, runs
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import evaluate, follow, starts_of
+from catstream.evaluation.onepass import evaluate, follow, start_frames
 from catstream.evaluation.peers import PEERS, Peer
-from catstream.evaluation.runs import Run, load, save
+from catstream.evaluation.runs import EvaluationRun, load, save
 from catstream.evaluation.summary import MEASURES, mean_of, rows_of, to_json
 from catstream.settings import Settings
 
@@ -24,10 +24,12 @@ SETTINGS = Settings()
 
 
 @pytest.fixture
-def run(sequence, found) -> Run:
+def run(sequence, found) -> EvaluationRun:
     frames = len(sequence)
     found[0], found[9] = sequence.boxes[0], np.nan
-    return Run("catstream", sequence, 0, found.round(4), np.linspace(1, 0.5, frames).round(6), np.full(frames, 0.02))
+    return EvaluationRun(
+        "catstream", sequence, 0, found.round(4), np.linspace(1, 0.5, frames).round(6), np.full(frames, 0.02)
+    )
 
 
 @pytest.fixture
@@ -39,7 +41,7 @@ def counted(monkeypatch, found):
         calls.append((tracker, sequence.name, start))
         frames, boxes = len(sequence) - start, found[start:].round(4)
         boxes[0] = sequence.boxes[start].round(4)
-        return Run(tracker, sequence, start, boxes, np.ones(frames), np.full(frames, 0.01))
+        return EvaluationRun(tracker, sequence, start, boxes, np.ones(frames), np.full(frames, 0.01))
 
     monkeypatch.setattr(onepass, "follow", instead)
     return calls
@@ -67,11 +69,11 @@ def test_a_later_start_is_a_run_of_its_own(sequence):
 
 
 def test_starts_are_spread_over_the_frames_with_the_object(sequence):
-    assert starts_of(sequence, 1) == [0]
-    assert starts_of(sequence, 2) == [0, 8]  # the object is absent in 5, 6 and 7
-    assert starts_of(sequence, 4) == [0, 3, 8, 9]
+    assert start_frames(sequence, 1) == [0]
+    assert start_frames(sequence, 2) == [0, 8]  # the object is absent in 5, 6 and 7
+    assert start_frames(sequence, 4) == [0, 3, 8, 9]
     late = Sequence("late", sequence.path, np.vstack([np.full((3, 4), np.nan), sequence.boxes]))
-    assert starts_of(late, 1) == [3]
+    assert start_frames(late, 1) == [3]
 
 
 def test_processes_give_the_same_runs_as_one(sequence, tmp_path):
@@ -280,7 +282,7 @@ def test_rows_are_means_over_the_starts_with_their_spread(sequence):
 
 def test_the_mean_f_score_is_over_the_sequences_that_have_one(sequence, run):
     whole = Sequence("whole", sequence.path, np.nan_to_num(sequence.boxes, nan=30.0))
-    other = Run("catstream", whole, 0, run.boxes, run.confidence, run.seconds)
+    other = EvaluationRun("catstream", whole, 0, run.boxes, run.confidence, run.seconds)
     rows = rows_of([run, other])
     assert rows[1].f_score is None
     assert mean_of(rows)["catstream"]["f_score"] == rows[0].f_score

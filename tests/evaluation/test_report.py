@@ -13,18 +13,18 @@ from click.testing import CliRunner
 
 from catstream.cli.evaluate import evaluate
 from catstream.errors import CatstreamError, VideoError
-from catstream.evaluation.films import film_of, worst
+from catstream.evaluation.failures import failure_strip, worst_runs
 from catstream.evaluation.report import write_report
-from catstream.evaluation.runs import Run
+from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
 
-def run_of(sequence, boxes, tracker: str = "catstream") -> Run:
-    return Run(tracker, sequence, 0, boxes, np.ones(len(boxes)), np.full(len(boxes), 0.01))
+def run_of(sequence, boxes, tracker: str = "catstream") -> EvaluationRun:
+    return EvaluationRun(tracker, sequence, 0, boxes, np.ones(len(boxes)), np.full(len(boxes), 0.01))
 
 
 @pytest.fixture
-def lost(sequence, found) -> Run:
+def lost(sequence, found) -> EvaluationRun:
     """Lost from frame 3 on."""
     boxes = found.copy()
     boxes[3:, :2] += 60
@@ -32,19 +32,19 @@ def lost(sequence, found) -> Run:
 
 
 def test_a_film_shows_the_frames_around_the_loss(lost):
-    film = film_of(lost)
-    assert film.first == 3
-    assert film.length == 9
-    rows = [row for row, _ in film.pictures]
+    strip = failure_strip(lost)
+    assert strip.first == 3
+    assert strip.length == 9
+    rows = [row for row, _ in strip.pictures]
     assert rows == [0, 3, 8, 11]
-    assert all(jpeg.startswith(b"\xff\xd8") for _, jpeg in film.pictures)
+    assert all(jpeg.startswith(b"\xff\xd8") for _, jpeg in strip.pictures)
 
 
 def test_only_failures_are_shown_and_the_worst_first(sequence, found, lost):
     good = run_of(sequence, np.where(np.isnan(sequence.boxes), np.nan, found))
     half = run_of(sequence, np.where(np.arange(12)[:, None] < 9, good.boxes, lost.boxes))
-    assert worst([good, half, lost], 5) == [lost, half]
-    assert worst([half, lost], 1) == [lost]
+    assert worst_runs([good, half, lost], 5) == [lost, half]
+    assert worst_runs([half, lost], 1) == [lost]
 
 
 def test_the_report_needs_nothing_else(tmp_path, sequence, found, lost):
@@ -60,7 +60,7 @@ def test_the_report_needs_nothing_else(tmp_path, sequence, found, lost):
 
 
 def test_of_each_tracker_the_worst_failures_are_shown_and_more_of_the_first(tmp_path, sequence, lost):
-    def named(tracker: str) -> list[Run]:
+    def named(tracker: str) -> list[EvaluationRun]:
         sequences = [replace(sequence, name=f"{tracker}{number}") for number in range(4)]
         return [replace(lost, tracker=tracker, sequence=other) for other in sequences]
 
