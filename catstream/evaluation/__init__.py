@@ -1,1 +1,1 @@
-"""How well a tracker follows: annotated sequences in, measures and a report out."""
+"""Measures the accuracy of trackers on annotated sequences, and writes reports."""

@@ -1,7 +1,7 @@
-"""Annotated sequences, in the layouts that people have them in.
+"""Reads annotated sequences in the layouts of OTB, TLD, VOT and Princeton.
 
-A sequence is a folder with frames (whatever `catstream.video.source` opens) and
-one of these files:
+A sequence is a folder with frames, in any form that `catstream.video.source`
+opens, and one of these files:
 
     groundtruth_rect.txt   OTB: x,y,w,h (comma, blank or tab); two objects, groundtruth_rect.1.txt and .2.txt, are
                            two sequences
@@ -9,8 +9,9 @@ one of these files:
     groundtruth.txt        VOT: polygons x1,y1,x2,y2 ... (their bounding box is taken), or x,y,w,h
     FOLDER.txt             Princeton: x,y,w,h,occluded, and the frames in rgb/
 
-Each has a line a frame; NaN, or a box without area, says that the object is
-absent. Boxes are taken as published: that OTB counts pixels from 1 stays so.
+Each file has one line for each frame; NaN, or a box without area, means that
+the object is absent. Boxes are used as published; OTB's pixel coordinates,
+which start at 1, are not shifted.
 """
 
 from __future__ import annotations
@@ -26,17 +27,18 @@ from catstream.video.source import natural_order, open_source
 
 __all__ = ["Sequence", "find_sequences"]
 
-#: Sequences of OTB whose truth does not begin with their first image, by name and number of boxes.
+#: First annotated frame of the OTB sequences whose ground truth starts later than their images, by name and number of
+#: boxes.
 _FIRST_FRAMES = {("david", 471): 299}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sequence:
-    """Frames, and where the object is in each.
+    """An annotated sequence.
 
-    name   that of its folder
+    name   name of its folder
     path   the folder
-    boxes  float64 (frames, 4), x, y, w, h in pixels; NaN where the object is absent
+    boxes  ground truth, float64 (frames, 4), x, y, w, h in pixels; NaN if the object is absent
     begin  frame of the source that the first box belongs to
     """
 
@@ -49,12 +51,12 @@ class Sequence:
         return len(self.boxes)
 
     def frames(self, start: int = 0) -> Iterator[np.ndarray]:
-        """Images, uint8 (h, w, 3), of boxes[start:], one a box.
+        """Yield the images of boxes[start:], uint8 (h, w, 3), one for each box.
 
         Raises
         ------
         VideoError
-            Where there are fewer frames than boxes, or they cannot be read.
+            If there are fewer frames than boxes, or a frame cannot be read.
         """
         left = len(self.boxes) - start
         with open_source(self.path, self.begin + start) as source:
@@ -64,18 +66,18 @@ class Sequence:
                 if not left:
                     return
         raise VideoError(
-            f"{str(self.path)!r} has {len(self.boxes)} boxes and {left} frames too few for them: "
-            "each line of the truth needs its frame"
+            f"{str(self.path)!r} has {len(self.boxes)} boxes, but {left} frames too few: "
+            "each line of the ground truth needs a frame"
         )
 
 
 def find_sequences(path: str | Path) -> list[Sequence]:
-    """The sequence in a folder, or those in the folders inside it, in natural order.
+    """Return the sequence in a folder, or the sequences in its subfolders, in natural order.
 
     Raises
     ------
     VideoError
-        Where there is none, or a truth that cannot be read.
+        If there is no sequence, or a ground truth file cannot be read.
     """
     path = Path(path)
     sequences = _sequences(path)
@@ -93,7 +95,7 @@ def find_sequences(path: str | Path) -> list[Sequence]:
 def _sequences(folder: Path) -> list[Sequence]:
     name = folder.resolve().name
     rects = sorted(folder.glob("groundtruth_rect*.txt"), key=natural_order)
-    # One of OTB's own, of two objects, is empty.
+    # One of the two files of an OTB sequence with two objects is empty.
     rects = [file for file in rects if file.stat().st_size] or rects
     if rects:
         ends = [file.stem.removeprefix("groundtruth_rect") if len(rects) > 1 else "" for file in rects]
@@ -112,21 +114,23 @@ def _sequence(name: str, folder: Path, file: Path, reader: Callable[[np.ndarray]
     boxes = reader(_numbers(file))
     boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
     if np.isnan(boxes).all():
-        raise VideoError(f"{str(file)!r} has no box at all: the object must be somewhere")
+        raise VideoError(f"{str(file)!r} has no box: the object must be present in at least one frame")
     return Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
 
 
 def _numbers(file: Path) -> np.ndarray:
-    """The table in a text file, float64 (lines, columns), four columns at least."""
+    """Read the table in a text file, float64 (lines, columns), with at least four columns."""
     rows: list[list[float]] = []
     try:
         lines = file.read_text(encoding="utf-8-sig").rstrip().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise VideoError(f"{str(file)!r} cannot be read ({error}): expected a text file, a line a frame") from None
+        raise VideoError(
+            f"{str(file)!r} cannot be read ({error}): expected a text file with one line for each frame"
+        ) from None
     for number, line in enumerate(lines, start=1):
         fields = line.replace(",", " ").replace(";", " ").split()
-        if not fields:  # to pass it over would move all boxes after it by a frame
-            raise VideoError(f"{str(file)!r}, line {number} is blank: where the object is absent write nan,nan,nan,nan")
+        if not fields:  # skipping the line would shift all later boxes by one frame
+            raise VideoError(f"{str(file)!r}, line {number} is blank: if the object is absent, write nan,nan,nan,nan")
         try:
             row = [float(field) for field in fields]
         except ValueError:
@@ -138,7 +142,7 @@ def _numbers(file: Path) -> np.ndarray:
             )
         rows.append(row)
     if not rows:
-        raise VideoError(f"{str(file)!r} is empty: expected a line a frame")
+        raise VideoError(f"{str(file)!r} is empty: expected one line for each frame")
     return np.array(rows)
 
 

@@ -1,4 +1,4 @@
-"""FailureStrip strips: a few frames around the place where a run went wrong."""
+"""Film strips of failures: a few frames around the longest failure of a run."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from catstream.video.annotate import thumbnail
 
 __all__ = ["FailureStrip", "failure_strip", "worst_runs"]
 
-#: Frames shown, counted from the first bad one; the last bad one is shown too.
+#: The frames shown, relative to the first frame of the failure; its last frame is shown too.
 _AROUND = (-20, -5, 0, 5, 20)
 _WIDTH = 240
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FailureStrip:
-    """What went wrong in a run, for people to look at.
+    """Images of the longest failure of a run, for people to look at.
 
-    run        shown
-    first      row of the run where its longest stretch of bad frames begins
-    length     of that stretch in frames
-    pictures   (row, JPEG bytes) in order; the truth is white, the tracker's box orange
+    run        the run
+    first      first row of its longest failure
+    length     number of consecutive failed frames
+    pictures   (row, JPEG file) in order; the ground truth is white, the tracker's box orange
     """
 
     run: EvaluationRun
@@ -34,14 +34,14 @@ class FailureStrip:
 
 
 def worst_runs(runs: list[EvaluationRun], count: int) -> list[EvaluationRun]:
-    """At most `count` runs with the most bad frames for their length, the worst first; good ones are left out."""
+    """Return at most `count` runs with the largest shares of failed frames, worst first; at least 5 % must fail."""
     shares = [_bad(run).mean() for run in runs]
     order = np.argsort(shares, kind="stable")[::-1][:count]
     return [runs[place] for place in order if shares[place] > 0.05]
 
 
 def failure_strip(run: EvaluationRun) -> FailureStrip:
-    """The film of one run; reads the frames it needs."""
+    """Make the film strip of a run. It reads the frames of the sequence."""
     first, length = _longest(_bad(run))
     last = len(run.boxes) - 1
     wanted = sorted({0, *(min(max(first + step, 0), last) for step in _AROUND), first + length - 1})
@@ -55,14 +55,14 @@ def failure_strip(run: EvaluationRun) -> FailureStrip:
 
 
 def _bad(run: EvaluationRun) -> np.ndarray:
-    """Frames where the overlap is 0.5 or less, or where something is found that is not there, bool (frames,)."""
+    """Return the failed frames, bool (frames,): overlap of at most 0.5, or a box although the object is absent."""
     there = np.isfinite(run.truth).all(axis=1)
     found = np.isfinite(run.boxes).all(axis=1)
     return np.where(there, overlaps(run.boxes, run.truth) <= 0.5, found)
 
 
 def _longest(bad: np.ndarray) -> tuple[int, int]:
-    """First frame and length of the longest stretch of true ones."""
+    """Return the first index and the length of the longest run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(int), [0]])))
     begins, ends = edges[::2], edges[1::2]
     if not len(begins):

@@ -1,16 +1,17 @@
-"""Measures of one-pass evaluation, as the benchmarks define them.
+"""Measures of one-pass evaluation, as the public benchmarks define them.
 
-From the boxes of a run and the truth, a row a frame, NaN where absent:
+They are computed from the boxes of a run and the ground truth, one row for each
+frame, NaN if there is no box:
 
     success plot  share of frames whose overlap exceeds each of 21 thresholds 0, 0.05 ... 1; its mean is the AUC
     success       its value at 0.5
     precision     share of frames whose centre is at most 20 pixels off
     normalised precision  mean of that share over 51 thresholds 0 ... 0.5, distances as parts of the object's size
 
-Frames without the object do not count in these; frames where the tracker finds
-nothing count as missed. They agree with the got10k toolkit. Where the object
-is absent in some frames, the measures of VOT's long-term challenge say whether
-the tracker knows it: see `long_term`.
+Frames without the object do not count; frames in which the tracker reports no
+box count as missed. The values agree with the got10k toolkit. If the object is
+absent in some frames, the measures of VOT's long-term challenge show whether the
+tracker reports its absence: see `long_term`.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class LongTerm:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What one run is worth: shares, 0 to 1; `long_term` is None where the object never leaves."""
+    """The measures of one run, from 0 to 1; `long_term` is None if the object is never absent."""
 
     auc: float
     success: float
@@ -59,7 +60,7 @@ class Score:
 
 
 def overlaps(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Intersection over union of boxes a row, float64 (frames, 4) both; 0 where either is NaN.
+    """Return the intersection over union of each pair of rows, float64 (frames, 4) both; 0 if either is NaN.
 
     >>> overlaps(np.array([[0., 0, 10, 10]]), np.array([[5., 0, 10, 10]]))
     array([0.33333333])
@@ -69,11 +70,14 @@ def overlaps(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
     shared = np.prod(np.maximum(high - low, 0), axis=1)
     union = np.prod(boxes[:, 2:], axis=1) + np.prod(truth[:, 2:], axis=1) - shared
     ratios = np.divide(shared, union, out=np.zeros(len(boxes)), where=union > 0)
-    return np.minimum(np.nan_to_num(ratios), 1.0)  # rounding may go past 1
+    return np.minimum(np.nan_to_num(ratios), 1.0)  # rounding may exceed 1
 
 
 def distances(boxes: np.ndarray, truth: np.ndarray, *, normalised: bool = False) -> np.ndarray:
-    """Between the centres, in pixels or in parts of the true width and height; infinite where either is NaN."""
+    """Return the distances between the centres in pixels; infinite if either box is NaN.
+
+    normalised : divide each coordinate by the width or height of the ground truth box
+    """
     apart = (boxes[:, :2] + boxes[:, 2:] / 2) - (truth[:, :2] + truth[:, 2:] / 2)
     if normalised:
         apart = apart / np.maximum(truth[:, 2:], 1)
@@ -81,27 +85,26 @@ def distances(boxes: np.ndarray, truth: np.ndarray, *, normalised: bool = False)
 
 
 def success_plot(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Share of the frames with the object whose overlap exceeds each of `OVERLAPS`, float64 (21,)."""
+    """Return the share of frames with the object whose overlap exceeds each of `OVERLAPS`, float64 (21,)."""
     return (overlaps(boxes, truth)[_present(truth), None] > OVERLAPS).mean(axis=0)
 
 
 def precision_plot(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Share of the frames with the object whose centre is within each of `PIXELS`, float64 (51,)."""
+    """Return the share of frames with the object whose centre error is at most each of `PIXELS`, float64 (51,)."""
     return (distances(boxes, truth)[_present(truth), None] <= PIXELS).mean(axis=0)
 
 
 def long_term(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray) -> LongTerm:
-    """Precision, recall and F-score of VOT-LT (Lukezic et al. 2020).
+    """Return precision, recall and F-score of VOT-LT (Lukezic et al. 2020).
 
-    A box counts as an answer where the confidence reaches a threshold;
-    precision is the mean overlap over the answers (0 where the object is
-    absent), recall over the frames with the object. Every threshold is tried,
-    the one with the best F-score counts.
+    A box counts as reported if its confidence reaches a threshold. Precision is the mean overlap over the reported
+    boxes (0 if the object is absent), recall the mean overlap over the frames with the object. The threshold with the
+    best F-score is used.
 
     Parameters
     ----------
-    boxes, truth : float64 (frames, 4), NaN where absent
-    confidence : float64 (frames,), of any range; NaN counts as none
+    boxes, truth : float64 (frames, 4), NaN if there is no box
+    confidence : float64 (frames,), in any range; NaN is lower than any number
     """
     answered = np.flatnonzero(_present(boxes))
     answered = answered[np.argsort(-np.nan_to_num(confidence[answered], nan=-np.inf), kind="stable")]
@@ -109,7 +112,7 @@ def long_term(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray) -> L
         return LongTerm(0.0, 0.0, 0.0)
     shared = np.cumsum(overlaps(boxes, truth)[answered])
     confidences = confidence[answered]
-    ends = np.append(confidences[1:] != confidences[:-1], True)  # equal confidences pass a threshold together
+    ends = np.append(confidences[1:] != confidences[:-1], True)  # rows of equal confidence are reported together
     precision = (shared / np.arange(1, len(answered) + 1))[ends]
     recall = (shared / _present(truth).sum())[ends]
     f_score = 2 * precision * recall / np.maximum(precision + recall, np.finfo(float).tiny)
@@ -118,17 +121,17 @@ def long_term(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray) -> L
 
 
 def score(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray | None = None) -> Score:
-    """All measures of one run.
+    """Return all measures of one run.
 
     Parameters
     ----------
-    boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN where absent
-    confidence : float64 (frames,), or None for a tracker that has none
+    boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN if there is no box
+    confidence : float64 (frames,), or None for a tracker without a confidence
 
     Raises
     ------
     ValueError
-        Where the two have different numbers of frames, or the object is never there.
+        If the shapes differ, or the object is absent in all frames.
     """
     if boxes.shape != truth.shape or boxes.shape[1:] != (4,):
         raise ValueError(f"boxes and truth need the same shape (frames, 4), got {boxes.shape} and {truth.shape}")

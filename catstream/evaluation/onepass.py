@@ -1,4 +1,4 @@
-"""One-pass evaluation: each tracker follows each sequence once, from a given box."""
+"""One-pass evaluation: each tracker runs once over each sequence, from the given box, without reinitialisation."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from catstream.tracker import Tracker
 
 __all__ = ["TRACKERS", "evaluate", "follow", "start_frames"]
 
-#: What can be evaluated.
+#: The trackers that can be evaluated.
 TRACKERS = ("catstream", *PEERS)
 
 
 def start_frames(sequence: Sequence, count: int) -> list[int]:
-    """`count` frames to start from, evenly spread; where the object is absent, the next with it.
+    """Return `count` evenly spaced start frames. If the object is absent in one, the next frame with it is used.
 
-    This is temporal robustness (OTB): on a hard clip a single run says little.
+    This is OTB's temporal robustness evaluation (TRE): on a difficult sequence, a single run is not representative.
     """
     present = np.flatnonzero(np.isfinite(sequence.boxes).all(axis=1))
     tasks = np.arange(count) * len(sequence) // count
@@ -53,7 +53,7 @@ def follow(tracker: str, settings: Settings, sequence: Sequence, start: int = 0)
         if box is not None:
             boxes[row] = box
         confidence[row] = worker.track.score if isinstance(worker, Tracker) else float(box is not None)
-    # What is stored and what is measured at once are the same numbers.
+    # Rounded as in the files, so that a stored run has the same measures.
     return EvaluationRun(tracker, sequence, start, boxes.round(4), confidence.round(6), seconds.round(8))
 
 
@@ -69,27 +69,28 @@ def evaluate(
     done: Callable[[EvaluationRun], None] = lambda _: None,
     failed: Callable[[CatstreamError], None] | None = None,
 ) -> list[EvaluationRun]:
-    """All trackers on all sequences.
+    """Run all trackers on all sequences.
 
     Parameters
     ----------
-    sequences, trackers : what to run; names of `TRACKERS`
-    settings : of catstream
-    starts : frames of each sequence to start from
-    jobs : processes at once, one thread each
-    output : where results are kept and found again, or None
-    begin, done : called with the number of frames to come, and with each run when it is there
-    failed : called with what went wrong in each run that cannot be made, and the others are; None, it is raised
+    sequences, trackers : sequences, and names from `TRACKERS`
+    settings : settings of catstream
+    starts : number of start frames in each sequence
+    jobs : number of processes, with one thread each
+    output : folder for results, or None; runs that are complete there are not repeated
+    begin : function that is called with the total number of frames
+    done : function that is called with each finished run
+    failed : function that is called with the error of each run that fails, while the other runs continue; if None, the
+        error is raised
 
     Returns
     -------
-    runs by sequence, tracker and start
+    runs in order of sequence, tracker and start
 
     Raises
     ------
     CatstreamError
-        Where a tracker or a name is not known, two sequences have one name, or
-        `output` holds runs made with other settings.
+        If a tracker is unknown, two sequences have the same name, or `output` has runs with other settings.
     """
     trackers = list(dict.fromkeys(trackers))
     _validate_names(sequences, trackers)
@@ -131,7 +132,7 @@ def _run_all(tasks: list[Any], output: Path | None, jobs: int) -> Iterator[Evalu
     if jobs == 1:
         yield from (_follow_and_save(output, *task) for task in tasks)
         return
-    # Long ones first, so that none is left running alone at the end.
+    # Longest runs first, so that no single long run is left at the end.
     ranked = sorted(tasks, key=lambda task: task[3] - len(task[2]))
     yield from run_tasks(_follow_and_save, [(output, *task) for task in ranked], jobs)
 
@@ -139,7 +140,7 @@ def _run_all(tasks: list[Any], output: Path | None, jobs: int) -> Iterator[Evalu
 def _follow_and_save(
     output: Path | None, tracker: str, settings: Settings, sequence: Sequence, start: int
 ) -> EvaluationRun | CatstreamError:
-    """`follow`, and keep the run. On one core: all trackers have the same conditions, the jobs are the parallelism."""
+    """Run `follow` and save the run. Each tracker gets one thread: the jobs are the parallelism."""
     try:
         with one_thread(opencv=True):
             run = follow(tracker, settings, sequence, start)
@@ -152,13 +153,13 @@ def _follow_and_save(
 
 def _validate_names(sequences: list[Sequence], trackers: list[str]) -> None:
     if not trackers:
-        raise SettingsError(f"no tracker is given: there are {', '.join(TRACKERS)}")
+        raise SettingsError(f"no tracker is given: give one of {', '.join(TRACKERS)}")
     for tracker in trackers:
         if tracker not in TRACKERS:
-            raise SettingsError(f"there is no tracker {tracker!r}: there are {', '.join(TRACKERS)}")
+            raise SettingsError(f"there is no tracker {tracker!r}: give one of {', '.join(TRACKERS)}")
         if tracker in PEERS:
             Peer(tracker)
     names = [sequence.name for sequence in sequences]
     for name in names:
         if names.count(name) > 1:
-            raise VideoError(f"two sequences are called {name!r}, and so would be their results: rename a folder")
+            raise VideoError(f"two sequences are named {name!r}, and so would be their results: rename a folder")

@@ -1,4 +1,4 @@
-"""OpenCV's trackers, to run beside catstream on the same frames.
+"""Adapters for OpenCV's trackers, so that they can be evaluated on the same frames.
 
 MIL comes with every OpenCV; CSRT, KCF and TLD with the contrib modules of
 OpenCV 4: `pip install "catstream[peers]"`.
@@ -18,19 +18,19 @@ from catstream.extras import install_command
 
 __all__ = ["OPENCV", "PEERS", "Peer"]
 
-OPENCV: str = cv2.__version__  #: which OpenCV that is
+OPENCV: str = cv2.__version__  #: version of OpenCV
 
 #: Name on the command line -> class in OpenCV.
 PEERS = {"csrt": "TrackerCSRT", "kcf": "TrackerKCF", "mil": "TrackerMIL", "tld": "TrackerTLD"}
 
 
 class Peer:
-    """One of OpenCV's trackers with the manners of `catstream.tracker.Tracker`.
+    """One of OpenCV's trackers with the interface of `catstream.tracker.Tracker`.
 
     Raises
     ------
     SettingsError
-        Where this OpenCV does not have it; says how to get it.
+        If the installed OpenCV does not have this tracker.
     """
 
     def __init__(self, name: str) -> None:
@@ -38,12 +38,12 @@ class Peer:
         self._tracker: Any = None
 
     def init(self, frame: np.ndarray, box: Sequence[float]) -> None:
-        """Start on x, y, w, h in pixels; OpenCV takes whole ones, and some of its trackers only those in the frame.
+        """Start with a box x, y, w, h in pixels. It is rounded and clipped to the frame, as OpenCV's trackers need it.
 
         Raises
         ------
         BoxError
-            Where OpenCV takes it not even so.
+            If OpenCV does not accept the box.
         """
         height, width = frame.shape[:2]
         left, top, w, h = (round(value) for value in box)
@@ -53,10 +53,10 @@ class Peer:
         try:
             self._tracker.init(frame, (left, top, max(right - left, 1), max(bottom - top, 1)))
         except cv2.error as error:
-            raise BoxError(f"OpenCV does not start on the box {Box(*box)}: {error.err or error}") from None
+            raise BoxError(f"OpenCV does not accept the box {Box(*box)}: {error.err or error}") from None
 
     def update(self, frame: np.ndarray) -> tuple[bool, Box | None]:
-        """Whether it is found, and where. A tracker that fails inside OpenCV has lost it."""
+        """Return whether the object was found, and its box. An error inside OpenCV counts as not found."""
         try:
             found, box = self._tracker.update(frame)
         except cv2.error:

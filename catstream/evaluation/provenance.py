@@ -1,7 +1,6 @@
-"""What figures were made with: the code, the command, the settings and the machine.
+"""The provenance of measured figures: code version, command, settings and machine.
 
-A file of figures carries this, so that it can be read years later beside another one. No host name and no folder of the
-machine is in it.
+It is stored in each file of figures, so that the files can be compared later. It has no host name and no folder name.
 """
 
 from __future__ import annotations
@@ -31,20 +30,20 @@ _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
 
 
 def provenance(settings: Settings, words: Sequence[str] | None = None) -> dict[str, Any]:
-    """What figures are made with, as JSON holds it.
+    """Return the provenance of figures as a JSON object.
 
     Parameters
     ----------
-    settings : those that hold for all of the figures
-    words : the command; None for the one that started this process
+    settings : settings that all figures have in common
+    words : words of the command; None for the command that started this process
 
     Returns
     -------
-    version    of catstream
-    commit     of the checkout that it runs from, with -dirty if that was changed; None if it is installed elsewhere
-    date       of today, UTC
-    command    as it was typed, with the last part only of each absolute path
-    settings   those that differ from their default
+    version    version of catstream
+    commit     commit of the checkout, with -dirty if files were changed; None if catstream runs from elsewhere
+    date       today, UTC
+    command    the command; absolute paths are shortened to their last part
+    settings   settings that differ from the default
     machine    see `machine`
     """
     given = [Path(sys.argv[0]).name, *sys.argv[1:]] if words is None else words
@@ -59,7 +58,7 @@ def provenance(settings: Settings, words: Sequence[str] | None = None) -> dict[s
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores that this process may use, GB of memory, and the versions of what does the arithmetic."""
+    """Return the processor, the cores available to this process, the memory in GB, and versions of the libraries."""
     blas = {
         f"{pool['internal_api']} {pool['version']} {pool.get('architecture', '')}".strip()
         for pool in threadpool_info()
@@ -78,7 +77,7 @@ def machine() -> dict[str, Any]:
 
 
 def _versions() -> dict[str, str]:
-    """Of the libraries that are installed."""
+    """Return the versions of the installed libraries."""
     versions = {}
     for library in _LIBRARIES:
         with suppress(PackageNotFoundError):
@@ -96,7 +95,7 @@ def _processor() -> str:
 
 
 def _commit() -> str | None:
-    """Of the code: measurements that lie in the checkout, and its docs, do not count as changes."""
+    """Return the commit of the checkout. Changes of docs and measurements do not make it dirty."""
     if not (_ROOT / ".git").exists():
         return None
     commit = _git("rev-parse", "--short=10", "HEAD")

@@ -1,4 +1,4 @@
-"""The report: one HTML file with all in it, that opens anywhere and needs nothing else."""
+"""Writes the report of an evaluation as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from catstream.settings import Settings
 
 __all__ = ["write_report"]
 
-_STRIPS = 8  # of the first tracker
-_OTHER_STRIPS = 2  # of each other
+_STRIPS = 8  # film strips for the first tracker
+_OTHER_STRIPS = 2  # and for each other tracker
 
 
 def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> Path:
-    """Write the report of an evaluation; reads frames for the strip strips of the worst runs.
+    """Write the report of an evaluation. It reads frames of the worst runs for their film strips.
 
     Raises
     ------
     VideoError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     rows = rows_of(runs)
     strips: list[FailureStrip] = []
@@ -40,14 +40,14 @@ def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> P
     sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
     changed = escape("\n".join(settings.changed()))
     body = [
-        "<h1>How well it follows</h1>",
+        "<h1>Accuracy</h1>",
         f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
-        "the object do not count, except for F.</p>",
+        "the object count only for F.</p>",
         _plots(runs),
         "<h2>Sequences</h2>",
         _table(rows),
         "<h2>Worst failures</h2>" if strips else "",
-        '<p class="about">White: the truth. Orange: the tracker.</p>' if strips else "",
+        '<p class="about">White: ground truth. Orange: tracker.</p>' if strips else "",
         *map(_strip_html, strips),
         "<h2>Settings that are not the default</h2>",
         f"<pre>{changed or 'none'}</pre>",
@@ -56,13 +56,13 @@ def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> P
 
 
 def _plots(runs: list[EvaluationRun]) -> str:
-    """Success and precision of each tracker, averaged over the sequences."""
+    """Plot success and precision of each tracker, averaged over the sequences."""
 
     def curves(
         places: np.ndarray, measure: Callable[..., np.ndarray], at: Callable[[np.ndarray], float]
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         by_tracker: dict[str, dict[str, list[np.ndarray]]] = {}
-        for run in runs:  # as in the table: first over the starts of a sequence
+        for run in runs:  # as in the table, the mean is taken first over the starts of a sequence
             by_tracker.setdefault(run.tracker, {}).setdefault(run.sequence.name, []).append(
                 measure(run.boxes, run.truth)
             )
@@ -99,7 +99,7 @@ def _table(rows: list[Row]) -> str:
 
 
 def _share(value: float | None) -> str:
-    """A number with its size behind it: darker is better."""
+    """Format a measure; its background is darker for a higher value."""
     if value is None:
         return "<small>-</small>"
     return (

@@ -1,14 +1,14 @@
-"""What one tracker answered on one sequence, and how that is kept.
+"""The output of one tracker on one sequence, and its files.
 
-Results lie where the benchmarks' toolkits look for them:
+The files have the layouts of the benchmarks' toolkits:
 
     TRACKER/NAME.txt, TRACKER/times/NAME_time.txt      got10k's layout for OTB
     TRACKER/longterm/NAME/NAME_001.txt                 that of the VOT toolkit's long-term experiment, with
                           NAME_001_confidence.value    the confidence
                           NAME_001_time.value          and seconds a frame
-    catstream/settings.json                            what the runs of catstream were made with
+    catstream/settings.json                            settings and versions of the runs
 
-A run that starts later than at the first frame is a sequence NAME@FRAME of its own.
+A run that starts after the first frame is stored as a sequence of its own, NAME@FRAME.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ __all__ = ["EvaluationRun", "load", "prepare_folder", "run_name", "save"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EvaluationRun:
-    """What one tracker answered on one sequence from one start.
+    """The output of one tracker on one sequence from one start frame.
 
-    tracker     its name
-    sequence    followed, the whole of it
-    start       row of its boxes that the tracker was given
-    boxes       float64 (frames, 4) from there on; NaN where it found nothing
+    tracker     name of the tracker
+    sequence    the whole sequence
+    start       row of `sequence.boxes` that the tracker was initialised with
+    boxes       float64 (frames, 4) from this row on; NaN if the tracker reported no box
     confidence  float64 (frames,)
-    seconds     float64 (frames,), of the tracker alone, without reading the frame
+    seconds     float64 (frames,), time of the tracker alone, without reading the frame
     """
 
     tracker: str
@@ -51,38 +51,38 @@ class EvaluationRun:
 
     @property
     def name(self) -> str:
-        """Of the sequence, and where it was started if not at the front."""
+        """Name of the sequence, with the start frame if it is not the first."""
         return run_name(self.sequence, self.start)
 
     @property
     def truth(self) -> np.ndarray:
-        """The boxes to compare with, float64 (frames, 4)."""
+        """Ground truth of the frames of this run, float64 (frames, 4)."""
         return self.sequence.boxes[self.start :]
 
     @property
     def fps(self) -> float:
-        """Frames a second, the first one (which sets the tracker up) apart."""
+        """Frames per second without the first frame, which initialises the tracker."""
         return (len(self.seconds) - 1) / max(float(self.seconds[1:].sum()), 1e-9)
 
     def score(self) -> Score:
-        """Its measures."""
+        """Return the measures of this run."""
         return score(self.boxes, self.truth, self.confidence)
 
 
 def run_name(sequence: Sequence, start: int) -> str:
-    """What a run is called."""
+    """Return the name of a run."""
     return f"{sequence.name}@{start}" if start else sequence.name
 
 
 def prepare_folder(output: Path, settings: Settings) -> None:
-    """Make the folder for runs, and see that those in it were made with these settings, and these versions.
+    """Make the folder for runs, and verify that runs in it were made with the same settings and versions.
 
     Raises
     ------
     SettingsError
-        Where they were not: names the settings that differ.
+        If they were not; the message names the settings that differ.
     VideoError
-        Where the folder cannot be written.
+        If the folder cannot be written to.
     """
     file = output / "catstream" / "settings.json"
     values = settings.values() | {"catstream": version("catstream"), "opencv": OPENCV}
@@ -103,18 +103,18 @@ def prepare_folder(output: Path, settings: Settings) -> None:
 
 
 def _files(output: Path, tracker: str, name: str) -> tuple[Path, Path, Path]:
-    """Boxes, confidence and times of a run, in the VOT toolkit's layout."""
+    """Return the paths of boxes, confidence and times of a run in the VOT toolkit's layout."""
     folder, stem = output / tracker / "longterm" / name, f"{name}_001"
     return folder / f"{stem}.txt", folder / f"{stem}_confidence.value", folder / f"{stem}_time.value"
 
 
 def save(output: Path, run: EvaluationRun) -> None:
-    """Write a run; the folder of VOT's layout appears last and whole, so that it says: finished.
+    """Write a run. The folder in VOT's layout is renamed into place last: its existence marks the run as complete.
 
     Raises
     ------
     VideoError
-        Where it cannot be written.
+        If a file cannot be written.
     """
     boxes, confidence, seconds = _files(output, run.tracker, run.name)
     folder, home = boxes.parent, output / run.tracker
@@ -131,16 +131,16 @@ def save(output: Path, run: EvaluationRun) -> None:
         np.savetxt(part / seconds.name, run.seconds, fmt="%.8f")
         part.rename(folder)
     except OSError as error:
-        raise VideoError(f"its result cannot be written to {str(home)!r} ({error.strerror}): make room") from None
+        raise VideoError(f"its result cannot be written to {str(home)!r} ({error.strerror}): free some space") from None
 
 
 def load(output: Path, tracker: str, sequence: Sequence, start: int) -> EvaluationRun | None:
-    """A finished run, or None where there is none, or it began on another box.
+    """Return a complete run, or None if there is none or it started with another box.
 
     Raises
     ------
     CatstreamError
-        Where there is one that cannot be read.
+        If its files cannot be read.
     """
     boxes, confidence, seconds = _files(output, tracker, run_name(sequence, start))
     if not boxes.parent.is_dir():
@@ -155,9 +155,7 @@ def load(output: Path, tracker: str, sequence: Sequence, start: int) -> Evaluati
             np.loadtxt(seconds, ndmin=1),
         )
     except (OSError, ValueError) as error:
-        raise CatstreamError(
-            f"{str(boxes.parent)!r} cannot be read ({error}): remove it, and it is made again"
-        ) from None
+        raise CatstreamError(f"{str(boxes.parent)!r} cannot be read ({error}): remove it to repeat the run") from None
     if not len(sequence) - start == len(run.boxes) == len(run.confidence) == len(run.seconds):
         return None
     return run if np.array_equal(run.boxes[0], run.truth[0].round(4)) else None

@@ -1,4 +1,4 @@
-"""Runs, summed up: a row a sequence and tracker, the mean a tracker, and both as JSON."""
+"""Summaries of runs: a row for each sequence and tracker, the mean of each tracker, and both as JSON."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from catstream.settings import Settings
 
 __all__ = ["MEASURES", "Row", "mean_of", "rows_of", "to_json"]
 
-#: Measures of a row that are averaged, best known first.
+#: The measures of a row that are averaged.
 MEASURES = ("auc", "success", "precision", "normalised_precision", "f_score", "fps")
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One tracker on one sequence: the mean over its starts.
+    """The measures of one tracker on one sequence: means over its starts.
 
-    `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and
-    `normalised_precision` as in `catstream.evaluation.metrics`, 0 to 1;
-    `f_score` and what it is made of are None where the object never leaves.
-    The spreads are standard deviations over the starts.
+    `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and `normalised_precision` are those of
+    `catstream.evaluation.metrics`, from 0 to 1. `f_score` and its two components are None if the object is never
+    absent. The spreads are standard deviations over the starts.
     """
 
     name: str
@@ -45,7 +44,7 @@ class Row:
 
 
 def rows_of(runs: Iterable[EvaluationRun]) -> list[Row]:
-    """A row for each sequence and tracker, in the order in which they come."""
+    """Return a row for each sequence and tracker, in order of first occurrence."""
     groups: dict[tuple[str, str], list[EvaluationRun]] = {}
     for run in runs:
         groups.setdefault((run.sequence.name, run.tracker), []).append(run)
@@ -53,7 +52,7 @@ def rows_of(runs: Iterable[EvaluationRun]) -> list[Row]:
 
 
 def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
-    """Mean of each measure over the sequences, by tracker; of the F-score over those that have one."""
+    """Return the mean of each measure over the sequences, by tracker; that of the F-score over those that have one."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.tracker, []).append(row)
@@ -64,7 +63,7 @@ def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
 
 
 def to_json(rows: list[Row], settings: Settings) -> dict[str, Any]:
-    """What `catstream evaluate --json` writes: the rows, {tracker: {measure: mean}}, and what they were made with."""
+    """Return the JSON of `catstream evaluate --json`: rows, {tracker: {measure: mean}}, and provenance."""
     return {**provenance(settings), "sequences": [dataclasses.asdict(row) for row in rows], "mean": mean_of(rows)}
 
 

@@ -1,6 +1,6 @@
-"""Worker processes that Ctrl-C ends without a word, from their first moment on.
+"""Runs tasks in worker processes that end on Ctrl-C without a traceback.
 
-This module is the first thing that a worker imports: what takes long to import comes afterwards.
+This module is the first one that a worker imports, before those that take long to import.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _CTRL_C = {signal.SIGINT}
 
 
 def run_tasks(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
-    """What `work(*task)` gives for each task, in the order in which they are done; `jobs` processes at once.
+    """Yield the result of `work(*task)` for each task, in order of completion, from `jobs` processes.
 
-    If the caller stops early, as on Ctrl-C, the workers are killed: none is left.
+    If the caller stops early, for example on Ctrl-C, all workers are killed.
 
     Raises
     ------
     ServiceError
-        If a worker was killed by somebody else.
+        If a worker was killed by another process or the kernel.
     """
     others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=_init_worker, initargs=(os.getpid(),)) as pool:
@@ -46,7 +46,7 @@ def run_tasks(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
 
 
 def _submit(pool: ProcessPoolExecutor, work: Any, tasks: list[Any]) -> list[Future[Any]]:
-    """Submit all tasks. The workers, which are started here, inherit a blocked SIGINT until `_init_worker` unblocks it."""
+    """Submit all tasks. The workers are started here, and inherit a blocked SIGINT; `_init_worker` unblocks it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _CTRL_C)
     try:
         return [pool.submit(work, *task) for task in tasks]
@@ -55,7 +55,7 @@ def _submit(pool: ProcessPoolExecutor, work: Any, tasks: list[Any]) -> list[Futu
 
 
 def _init_worker(parent: int) -> None:
-    """Ctrl-C reaches the workers too, and ends them: the parent is the one that speaks, and none outlives it."""
+    """Let Ctrl-C end this worker without output, and end it with its parent."""
     die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _CTRL_C)

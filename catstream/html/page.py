@@ -1,4 +1,4 @@
-"""A page: one HTML file with all in it, that opens anywhere, light or dark, wide or narrow."""
+"""Writes self-contained HTML pages for light and dark, wide and narrow displays."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ pre { background: var(--soft); padding: .8rem; border-radius: 6px; overflow-x: a
 
 
 def table(heads: Iterable[str], rows: Iterable[Iterable[object]], *, texts: int = 1, means: int = 0) -> str:
-    """A table of cells that are HTML already; the first `texts` columns hold text, the last `means` rows stand out."""
+    """Return a table of HTML cells. The first `texts` columns are left-aligned, the last `means` rows are bold."""
 
     def line(kind: str, cells: Iterable[object]) -> str:
         return "".join(
@@ -49,12 +49,12 @@ def table(heads: Iterable[str], rows: Iterable[Iterable[object]], *, texts: int 
 
 
 def write_page(path: Path, title: str, body: Iterable[str]) -> Path:
-    """Write a page of these parts, the empty ones left out.
+    """Write a page with the non-empty parts of `body`.
 
     Raises
     ------
     VideoError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     page = (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>catstream: {escape(title)}</title>\n'

@@ -1,4 +1,4 @@
-"""Line plots as SVG text, to stand inside an HTML page."""
+"""Line plots as SVG elements for HTML pages."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 
 __all__ = ["COLOURS", "DASHES", "SHARES", "Axis", "plot"]
 
-#: Of the curves, in order; distinct for the colour-blind too, on light and on dark.
+#: Colours of the curves, in order; distinguishable for colour-blind people, on light and on dark background.
 COLOURS = ("#f25100", "#2b82d9", "#56bf9c", "#a63700", "#30b2f2", "#3f8c7f", "#1c678c")
 
-#: Of the first four curves, of the next four, and of those after them.
+#: Dash patterns of the first four curves, of the next four, and of the others.
 DASHES = ("none", "7 4", "2 3")
 
 _WIDTH, _HEIGHT = 460, 320
 _LEFT, _TOP, _RIGHT, _BOTTOM = 46, 34, 24, 44
-_LETTER, _ROW = 6.6, 18  # pixels of a letter and of a row of the legend
+_LETTER, _ROW = 6.6, 18  # width of a letter and height of a row of the legend, in pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """From 0 to `high`, with a line and a text at each of the `ticks`."""
+    """An axis from 0 to `high`, with a grid line and a text at each of the `ticks`."""
 
     label: str
     high: float
@@ -33,7 +33,7 @@ class Axis:
 
     @classmethod
     def upto(cls, value: float, label: str = "") -> Self:
-        """Long enough for a value, with round ticks.
+        """Return an axis that includes a value, with round ticks.
 
         >>> [text for _, text in Axis.upto(0.7).ticks]
         ['0', '0.2', '0.4', '0.6', '0.8']
@@ -44,22 +44,22 @@ class Axis:
         return cls(label, count * step, tuple((number * step, f"{number * step:g}") for number in range(count + 1)))
 
 
-#: Of values from 0 to 1.
+#: Axis for values from 0 to 1.
 SHARES = Axis("", 1.0, tuple((tenth / 10, f"{tenth / 10:.1f}") for tenth in range(0, 11, 2)))
 
 
 def plot(title: str, x: Axis, y: Axis, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> str:
-    """One plot.
+    """Draw a line plot.
 
     Parameters
     ----------
-    title : above it
-    x, y : the axes; what lies beyond them is drawn at their ends
-    curves : legend -> places on x and on y, float64 (k,) both; NaN leaves a gap
+    title : title above the plot
+    x, y : axes; values outside their range are clipped
+    curves : label -> x and y values, float64 (k,) both; NaN makes a gap
 
     Returns
     -------
-    an `<svg>` element; axes and text take the page's colour
+    an `<svg>` element; axes and text have the text colour of the page
     """
     legend, rows = _legend(list(curves))
     top, tall = _TOP + _ROW * rows, _HEIGHT - _TOP - _BOTTOM
@@ -95,7 +95,7 @@ def plot(title: str, x: Axis, y: Axis, curves: Mapping[str, tuple[np.ndarray, np
 
 
 def _legend(names: list[str]) -> tuple[list[str], int]:
-    """Of the curves, in rows below the title, where no curve is; and how many rows."""
+    """Return the elements of the legend below the title, and its number of rows."""
     parts, x, row = [], float(_LEFT), 0
     for number, name in enumerate(names):
         width = 40 + _LETTER * len(name)

@@ -130,7 +130,7 @@ def test_a_folder_of_sequences_in_natural_order(tmp_path):
         ("1,2,3\n", "line 1: expected four or more numbers"),
         ("1,2,3,4\n1,2,3,4,5\n", "line 2: expected 4 numbers"),
         ("1,2,3,4\na,b,c,d\n", "line 2"),
-        ("nan,nan,nan,nan\n", "no box at all"),
+        ("nan,nan,nan,nan\n", "has no box"),
         ("1,2,3,4\n\n1,2,3,4\n", "line 2 is blank: .* nan,nan,nan,nan"),
     ],
 )

@@ -176,7 +176,7 @@ def test_begin_and_done_tell_how_far_it_is(sequence):
 def test_unknown_trackers_and_equal_names_are_refused_before_anything_runs(sequence, counted):
     with pytest.raises(SettingsError, match="no tracker 'kfc'"):
         evaluate([sequence], ["catstream", "kfc"], SETTINGS)
-    with pytest.raises(VideoError, match="two sequences are called 'walk'"):
+    with pytest.raises(VideoError, match="two sequences are named 'walk'"):
         evaluate([sequence, sequence], ["catstream"], SETTINGS)
     assert not counted
 
@@ -247,7 +247,7 @@ def test_what_opencv_does_not_start_on_is_one_line(monkeypatch, sequence):
 
     peer = Peer("mil")
     monkeypatch.setattr(peer, "_create", Broken)
-    with pytest.raises(BoxError, match="does not start on the box 1,2,30,40"):
+    with pytest.raises(BoxError, match="does not accept the box 1,2,30,40"):
         peer.init(next(iter(sequence.frames())), (1, 2, 30, 40))
 
 
