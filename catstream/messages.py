@@ -11,6 +11,7 @@ the coreset size, frames count from 0.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import Any, Literal
 
 import numpy as np
@@ -313,7 +314,7 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a pipeline runs with: who keeps its features can learn from them once more, detector -> anyone.
+    """What a pipeline runs with: with it, its features can be learned from again, detector -> anyone.
 
     program   version of catstream
     settings  name -> value of all settings but `run.endpoint` and `run.keys`, each as the text that `--set` takes
@@ -321,6 +322,11 @@ class Run:
 
     program: str
     settings: dict[str, str]
+
+    @classmethod
+    def of(cls, settings: dict[str, str]) -> Run:
+        """A run of this version of catstream, with what `Settings.portable` returned."""
+        return cls(version("catstream"), settings)
 
 
 @dataclass(frozen=True, slots=True)

@@ -486,6 +486,12 @@ class Settings:
         values = self.values().items()
         return {name: value if isinstance(value, str) else json.dumps(value) for name, value in values}
 
+    def portable(self) -> dict[str, str]:
+        """The texts of all settings but those that have a meaning on this machine only."""
+        return {name: text for name, text in self.texts().items() if name not in _LOCAL}
+
+
+_LOCAL = ("run.endpoint", "run.keys")
 
 _PAPER = {
     "teaching.classifier": "one-class",

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 from catstream.errors import CatstreamError, SetBackError
 from catstream.messages import Health, Run
-from catstream.recording.file import run_of
 from catstream.services.watchdog import PATIENCE, Watchdog
 from catstream.settings import Settings
 from catstream.wire.endpoint import Endpoint
@@ -75,7 +74,7 @@ class Process:
     @property
     def run(self) -> Run:
         """What this pipeline runs with, for those who want to learn from its features once more."""
-        return run_of(self.settings)
+        return Run.of(self.settings.portable())
 
     def ended_for(self, seconds: float) -> bool:
         """Whether it was asked to end, at least so long ago."""

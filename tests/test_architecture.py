@@ -53,6 +53,7 @@ HOMES = {
     "supervision": ["catstream/adapters.py"],
     "av": ["catstream/video"],
     "zmq": ["catstream/wire/sockets.py", "catstream/wire/gate.py", "catstream/wire/keys.py"],
+    "mcap": ["catstream/recording/container.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
     "threadpoolctl": ["catstream/threads.py", "catstream/evaluation/provenance.py"],

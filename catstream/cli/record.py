@@ -41,8 +41,8 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
 
     \b
     EXAMPLES
-      catstream record --output walk.rec
-      catstream record --output walk.rec --endpoint run
+      catstream record --output walk.mcap
+      catstream record --output walk.mcap --endpoint run
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     place = find(endpoint, keys)

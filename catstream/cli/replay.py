@@ -13,8 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from catstream.errors import RecordingError
-from catstream.messages import Features, Model, Track
-from catstream.recording.file import Recording, RecordingWriter, run_of
+from catstream.messages import Features, Model, Run, Track
+from catstream.recording.file import Recording, RecordingWriter
 from catstream.recording.learning import Lesson, Marks, check, learn, marks_of
 from catstream.recording.player import Player
 from catstream.wire.endpoint import Endpoint, meeting_place, private_folder
@@ -70,10 +70,10 @@ def replay(
 
     \b
     EXAMPLES
-      catstream replay walk.rec --wait
-      catstream replay walk.rec --endpoint run --fast
-      catstream replay walk.rec --learn
-      catstream replay walk.rec --learn --set coreset.size=128 --output larger.rec
+      catstream replay walk.mcap --wait
+      catstream replay walk.mcap --endpoint run --fast
+      catstream replay walk.mcap --learn
+      catstream replay walk.mcap --learn --set coreset.size=128 --output larger.mcap
     """
     if not learns and (pairs or output or incomplete):
         raise click.UsageError("--set, --output and --incomplete go with --learn")
@@ -116,7 +116,7 @@ def _learn(
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn())
     with ExitStack() as stack:
         progress = stack.enter_context(Progress(*columns, console=console, transient=True))
-        writer = stack.enter_context(RecordingWriter(output, run_of(trials[newest]))) if output else None
+        writer = stack.enter_context(RecordingWriter(output, Run.of(trials[newest].portable()))) if output else None
         for name, settings in trials.items():
             task = progress.add_task(name, total=total)
             lesson = learn(

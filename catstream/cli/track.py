@@ -129,7 +129,7 @@ def track(
       catstream track walk.mp4 --box 120,80,64,48 --save-model walker.safetensors
       catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
       catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
-      catstream track walk.mp4 --box 120,80,64,48 --record walk.rec
+      catstream track walk.mp4 --box 120,80,64,48 --record walk.mcap
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
       catstream track 0 --view

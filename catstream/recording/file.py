@@ -1,99 +1,94 @@
-"""The file of a recording: messages one after the other, each readable though others are damaged or cut off.
+"""Recordings: an MCAP file of all messages of a run, each readable even if others are damaged or cut off.
 
-    head      b"catrec", the version of the format (1 byte), a zero byte
-    records   length of the message (uint32), CRC-32 of all that follows (uint32), the moment it was
-              recorded (float64, seconds since 1970), its `seq` or `version` or 0 (uint64), the message as on the wire
+A topic for each kind of message. Messages without arrays are JSON objects of their fields, which Foxglove and other
+programs show as they are; features and models are msgpack, as on the wire. The first message is the `Run`.
 
-Everything is little-endian. The first message is the `Run`. Records are appended with one write each, so
-that a process that is killed leaves at most one torn record, at the end. A reader that meets a damaged record
-goes on at the next whole one.
-
-Where `seq` of `Features` goes back, a restarted compressor went on from its checkpoint: they take the
-place of those that it had taken after that, and of what was learned from them.
+If `seq` of `Features` goes back, a restarted compressor has continued from its checkpoint: the later features replace
+those from the same `seq` on, and the models that were trained on them.
 """
 
 from __future__ import annotations
 
-import fcntl
-import mmap
 import os
-import re
-import struct
 import time
-import zlib
 from collections import Counter
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 from catstream.errors import RecordingError
 from catstream.messages import End, Features, Health, Model, Run, Track
+from catstream.recording.container import MAGIC, Entry, Index, Topic, end_of_data, entries, entry_at, opening, pack
+from catstream.recording.container import summary as summary_of
 from catstream.settings import Settings
-from catstream.wire.codec import decode, encode, opening
+from catstream.storage import lock
+from catstream.wire.codec import decode, decode_json, encode, encode_json
 
-__all__ = ["KINDS", "Recording", "RecordingWriter", "run_of"]
+__all__ = ["TOPICS", "Recording", "RecordingWriter"]
 
-#: What is recorded.
-KINDS = (Run, Features, Model, Track, Health, End)
+_ENVELOPE = "msgpack, [version, kind, fields]; an array in fields is {dtype, shape, data: bytes row by row}"
 
-_HEAD = b"catrec\x01\x00"
-_LENGTHS = struct.Struct("<II")
-_FACTS = struct.Struct("<dQ")
-_LARGEST = 64 << 20  # bytes of a message, as of `Features` on the wire
-_WORDS = {Features: "features", Model: "models", Track: "tracks", Health: "reports of health"}
-_OPENINGS = {opening(kind): kind for kind in KINDS}
-_ANY_OPENING = re.compile(b"|".join(map(re.escape, _OPENINGS)))
+#: Kind of message -> its topic. Topics are numbered from 1 in this order: a new one comes last.
+TOPICS: dict[type, Topic] = {
+    Run: Topic("run", "json"),
+    Features: Topic("features", "msgpack", f"{_ENVELOPE}\n\n{Features.__doc__}"),
+    Model: Topic("models", "msgpack", f"{_ENVELOPE}\n\n{Model.__doc__}"),
+    Track: Topic("tracks", "json"),
+    Health: Topic("health", "json"),
+    End: Topic("end", "json"),
+}
+_TOPICS = list(TOPICS.values())
+_NUMBERS = {kind: number for number, kind in enumerate(TOPICS, 1)}
+_KINDS = {number: kind for kind, number in _NUMBERS.items()}
 
-
-def run_of(settings: Settings) -> Run:
-    """What a pipeline of this catstream runs with."""
-    own = ("run.endpoint", "run.keys")  # of one machine, and of no meaning to others
-    return Run(version("catstream"), {name: text for name, text in settings.texts().items() if name not in own})
+_NOUNS = {Features: "features", Model: "models", Track: "tracks", Health: "reports of health"}
 
 
 class RecordingWriter:
-    """Writes a recording, or goes on with one; a context manager.
+    """Writes a recording, or continues one; a context manager.
 
-    What `write` returned from is safe from a crash of this process, though not from one of the machine.
+    When `write` returns, the message survives a crash of this process, though not one of the machine. `close` adds the
+    index that other programs need.
 
     Parameters
     ----------
     path : of the file
     run : what the pipeline runs with
-    resume : go on with the file where it is there, after its last whole record
+    resume : continue the file after its last whole message, if it exists
+
+    Attributes
+    ----------
+    written : number of messages written by this object
 
     Raises
     ------
     RecordingError
-        Where the file is there already, cannot be written, or is of a pipeline with other settings.
+        If the file exists already, cannot be written, or was recorded with other settings.
     """
 
     def __init__(self, path: str | os.PathLike[str], run: Run, *, resume: bool = False) -> None:
         self.path = Path(path)
-        self.written = 0  #: messages
-        begun = resume and self.path.exists() and self.path.stat().st_size > 0
-        earlier = Recording(path) if begun else None
+        self.written = 0
+        continued = resume and self.path.exists() and self.path.stat().st_size > 0
+        earlier = Recording(path) if continued else None
         if earlier is not None and earlier.run != run:
-            raise RecordingError(f"{path} records a pipeline with other settings: give another file")
+            raise RecordingError(f"{path} was recorded with other settings: give another file")
         try:
-            self._file = self.path.open("r+b" if begun else "wb" if resume else "xb", buffering=0)
+            self._file = self.path.open("r+b" if continued else "wb" if resume else "xb", buffering=0)
         except FileExistsError:
             raise RecordingError(f"{path} is there already: give another name, or remove it") from None
         except OSError as error:
             raise RecordingError(
-                f"cannot record to {str(path)!r} ({error.strerror}): give a place that you may write to"
+                f"cannot record to {str(path)!r} ({error.strerror}): give a path that you may write to"
             ) from None
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not lock(self._file.fileno()):
             self._file.close()
-            raise RecordingError(f"somebody else records to {path}: give another name") from None
+            raise RecordingError(f"another process records to {path}: give another name")
+        self._index, self._size = (earlier.index, earlier.size) if earlier is not None else (Index(), 0)
         if earlier is None:
-            self._append(_HEAD + _record(run))
+            self._add(run, opening(_TOPICS))
         else:
-            self._file.truncate(earlier.size)
-            self._file.seek(earlier.size)
+            self._cut()
 
     def write(self, message: Any) -> None:
         """Append a message.
@@ -101,24 +96,46 @@ class RecordingWriter:
         Raises
         ------
         RecordingError
-            Where the disk takes no more; the file is then whole up to the message before.
+            If the disk is full or fails; the file then ends with the message before.
         """
-        self._append(_record(message))
+        self._add(message)
         self.written += 1
 
-    def _append(self, record: bytes) -> None:
-        start, rest = self._file.tell(), memoryview(record)
+    def close(self) -> None:
+        """Write the index, unless the disk is full, and close the file."""
+        if self._file.closed:
+            return
+        size = self._size
         try:
-            while rest:  # a full disk takes a part, and then nothing
+            for block in summary_of(_TOPICS, self._index, size):
+                self._append(block)
+        except RecordingError:  # the index can be made from the messages
+            self._size = size
+            self._cut()
+        self._file.close()
+
+    def _add(self, message: Any, before: bytes = b"") -> None:
+        number, now = _NUMBERS[type(message)], time.time_ns()
+        sequence = getattr(message, "seq", getattr(message, "version", 0))
+        entry = pack(number, sequence, now, _encode(message))
+        place = self._size + len(before)
+        self._append(before + entry)
+        self._index.add(place, len(entry), number, now)
+
+    def _append(self, data: bytes) -> None:
+        rest = memoryview(data)
+        try:
+            while rest:  # a disk that becomes full takes a part, and then nothing
                 rest = rest[self._file.write(rest) :]
         except OSError as error:
-            self._file.truncate(start)
-            self._file.seek(start)
+            self._cut()
             raise RecordingError(f"cannot record to {str(self.path)!r} any more: {error.strerror}") from None
+        self._size += len(data)
 
-    def close(self) -> None:
-        """Close the file; what was written stays."""
-        self._file.close()
+    def _cut(self) -> None:
+        """Remove all bytes after those that were written whole."""
+        self._file.truncate(self._size)
+        self._file.seek(self._size)
 
     def __enter__(self) -> Self:
         return self
@@ -128,158 +145,148 @@ class RecordingWriter:
 
 
 class Recording:
-    """A recording, looked through once and checked; it holds no file open.
+    """A recording that was read and checked once from start to end; it keeps no file open.
 
     Attributes
     ----------
     run : what the pipeline ran with
-    counts : messages by kind, `counts[Features]` ...; of features and models those that `features` and `models` give
-    missing : features and tracks that should be there and are not, as `seq` tells; also before the first and after
-        the last, where the end is there
-    end : the pipeline's `End`, None where the recording ended before it
-    damaged : bytes between whole records that are none, and are left out
-    torn : bytes at the end that are no whole record, and are left out
-    size : bytes up to the end of the last whole record
+    counts : messages by kind, `counts[Features]` ...; of features and models those that `features` and `models` yield
+    missing : features and tracks that are missing, judged by gaps in `seq`; also before the first and, if the end was
+        recorded, after the last
+    end : the pipeline's `End`, None if the recording ended before it
+    damaged : bytes between whole messages that are skipped
+    torn : bytes after the last whole message that are skipped
+    size : bytes up to the end of the last whole message
+    index : places of all whole messages
 
     Raises
     ------
     RecordingError
-        Where it cannot be read, or is no recording.
+        If the file cannot be read, or is not a recording.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.counts: Counter[type] = Counter()
         self.end: End | None = None
-        tracks: set[int] = set()
-        self._taken: list[tuple[int, int]] = []  # seq and place of the features that the trees hold
-        self._models: list[tuple[int, int]] = []  # seq of the last features it learned from, and place
-        self.size, self.damaged = len(_HEAD), 0
+        self.index = Index()
+        self.size = self.damaged = 0
+        self._tracks: set[int] = set()
+        self._features: list[tuple[int, int]] = []  # seq and place of the features that the trees hold
+        self._models: list[tuple[int, int]] = []  # number of features that each was trained on, and its place
         with self._open() as file:
-            for place, _, number, data in self._records(file):
-                self.damaged += place - self.size
-                kind = _kind(data)
-                if kind is Features:
-                    _go_back(self._taken, number)
-                    _go_back(self._models, number)
-                    self._taken.append((number, place))
-                elif kind is Model:  # a restarted compressor may have it made once more
-                    learned = decode(data, Model).frame + 1
-                    _go_back(self._models, learned)
-                    self._models.append((learned, place))
-                elif kind is Track:
-                    tracks.add(number)
-                elif kind is End:
-                    self.end = decode(data, End)
-                if kind is not None:
-                    self.counts[kind] += 1
-                self.size = file.tell()
-            self.torn = file.seek(0, os.SEEK_END) - self.size
-        self.counts[Features], self.counts[Model] = len(self._taken), len(self._models)
-        seqs = {Features: {seq for seq, _ in self._taken}, Track: tracks}
-        last = {kind: self.end.seq - 1 if self.end else max(own, default=0) for kind, own in seqs.items()}
-        self.missing = {kind: last[kind] - len(own) for kind, own in seqs.items()}
-        first = next(self.messages(), (0.0, None))[1]
+            for entry in entries(file):
+                self.damaged += entry.place - (self.size or entry.place)
+                self.size = entry.place + entry.size
+                self.index.add(entry.place, entry.size, entry.channel, entry.time)
+                self._count(entry)
+            self._measure_tail(file)
+        _, first = next(self.messages(), (0.0, None))
         if not isinstance(first, Run):
-            raise RecordingError(f"{path} does not say what it is a recording of: it was torn before it began")
+            raise RecordingError(f"{path} holds no settings of a run: it was cut off or damaged at its start")
         self.run = first
+        self.counts[Features], self.counts[Model] = len(self._features), len(self._models)
+        self.missing = {
+            Features: self._missing({seq for seq, _ in self._features}),
+            Track: self._missing(self._tracks),
+        }
 
     def __str__(self) -> str:
-        """What is in it and what is not, for a person."""
-        counts = ", ".join(f"{self.counts[kind]} {word}" for kind, word in _WORDS.items())
-        lost = [f"{number} {_WORDS[kind]}" for kind, number in self.missing.items() if number]
-        damaged = f"; {self.damaged} damaged bytes are left out" * bool(self.damaged)
-        torn = f"; {self.torn} torn bytes at its end are left out" * bool(self.torn)
+        """A summary for a person."""
+        counts = ", ".join(f"{self.counts[kind]} {noun}" for kind, noun in _NOUNS.items())
+        lost = [f"{number} {_NOUNS[kind]}" for kind, number in self.missing.items() if number]
+        damaged = f"; {self.damaged} damaged bytes are skipped" * bool(self.damaged)
+        torn = f"; {self.torn} torn bytes at its end are skipped" * bool(self.torn)
         return f"{counts}, {self.size / 1e6:.0f} MB; {' and '.join(lost) or 'none'} missing{damaged}{torn}"
 
     @property
     def settings(self) -> Settings:
-        """Those of the pipeline.
+        """The settings of the pipeline.
 
         Raises
         ------
         SettingsError
-            Where this catstream does not know one of them.
+            If this version of catstream does not know one of them.
         """
         return Settings.of(self.run.settings)
 
     def messages(self) -> Iterator[tuple[float, Any]]:
-        """Every message as it was recorded, with the moment in seconds since 1970."""
+        """Each message in the order of recording, with its time in seconds since 1970."""
         with self._open() as file:
-            for _, moment, _, data in self._records(file):
-                if (kind := _kind(data)) is not None:
-                    yield moment, decode(data, kind)
-                if file.tell() >= self.size:
+            for entry in entries(file):
+                if entry.channel in _KINDS:
+                    yield entry.time / 1e9, _decode(entry)
+                if entry.place + entry.size >= self.size:  # the file may have grown since it was checked
                     return
 
     def features(self) -> Iterator[Features]:
-        """What the coreset trees hold: the features in order of `seq`, each once."""
-        return self._at(self._taken, Features)
+        """The features that the coreset trees hold, in order of `seq`, each once."""
+        return self._at(self._features)
 
     def models(self) -> Iterator[Model]:
-        """What was learned from these features."""
-        return self._at(self._models, Model)
+        """The models that were trained on these features."""
+        return self._at(self._models)
 
-    def _at(self, places: list[tuple[int, int]], kind: type) -> Iterator[Any]:
+    def _at(self, places: list[tuple[int, int]]) -> Iterator[Any]:
         with self._open() as file:
             for _, place in places:
-                file.seek(place)
-                _, _, _, data = next(self._records(file))
-                yield decode(data, kind)
+                entry = entry_at(file, place)
+                if entry is None:
+                    raise RecordingError(f"{self.path} has changed since it was checked: read it again")
+                yield _decode(entry)
 
     def _open(self) -> BinaryIO:
         try:
             file = self.path.open("rb")
         except OSError as error:
             raise RecordingError(f"cannot read the recording {self.path}: {error.strerror}") from None
-        if file.read(len(_HEAD)) != _HEAD:
+        if file.read(len(MAGIC)) != MAGIC:
             file.close()
             raise RecordingError(f"{self.path} is no recording of this catstream: `catstream record` makes one")
         return file
 
-    @staticmethod
-    def _records(file: BinaryIO) -> Iterator[tuple[int, float, int, bytes]]:
-        """Place, moment, number and bytes of each whole record, from where the file is."""
-        place: int | None = file.tell()
-        while place is not None:
-            file.seek(place)
-            head = file.read(_LENGTHS.size + _FACTS.size)
-            if len(head) < _LENGTHS.size + _FACTS.size:
-                return
-            length, check = _LENGTHS.unpack_from(head)
-            data = file.read(length) if length <= _LARGEST else b""
-            if len(data) == length and zlib.crc32(data, zlib.crc32(head[_LENGTHS.size :])) == check:
-                yield place, *_FACTS.unpack_from(head, _LENGTHS.size), data
-                place += len(head) + length
-            else:
-                place = _next_whole(file, place)
+    def _count(self, entry: Entry) -> None:
+        """Take in an entry while the file is checked."""
+        kind = _KINDS.get(entry.channel)
+        if kind is None:  # of a later version
+            return
+        self.counts[kind] += 1
+        if kind is Features:
+            _drop_from(self._features, entry.sequence)
+            _drop_from(self._models, entry.sequence)
+            self._features.append((entry.sequence, entry.place))
+        elif kind is Model:  # a restarted compressor may have it trained again
+            trained = _decode(entry).frame + 1
+            _drop_from(self._models, trained)
+            self._models.append((trained, entry.place))
+        elif kind is Track:
+            self._tracks.add(entry.sequence)
+        elif kind is End:
+            self.end = _decode(entry)
+
+    def _measure_tail(self, file: BinaryIO) -> None:
+        """Count the bytes after the last whole message that are not the index."""
+        end = end_of_data(file)
+        if end is not None and end >= self.size:
+            self.damaged, self.torn = self.damaged + end - self.size, 0
+        else:
+            self.torn = file.seek(0, os.SEEK_END) - self.size
+
+    def _missing(self, seqs: set[int]) -> int:
+        last = self.end.seq - 1 if self.end else max(seqs, default=0)
+        return last - len(seqs)
 
 
-def _next_whole(file: BinaryIO, damaged: int) -> int | None:
-    """Place of the first whole record after a damaged one, None if there is none: found by how messages begin."""
-    head = _LENGTHS.size + _FACTS.size
-    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for found in _ANY_OPENING.finditer(data, damaged + 1 + head):
-            place = found.start() - head
-            length, check = _LENGTHS.unpack_from(data, place)
-            end = found.start() + length
-            if length <= _LARGEST and end <= len(data) and zlib.crc32(data[place + _LENGTHS.size : end]) == check:
-                return place
-    return None
-
-
-def _go_back(places: list[tuple[int, int]], seq: int) -> None:
-    """Forget those from a `seq` on."""
+def _drop_from(places: list[tuple[int, int]], seq: int) -> None:
+    """Remove the places of a `seq` and of all later ones."""
     while places and places[-1][0] >= seq:
         places.pop()
 
 
-def _record(message: Any) -> bytes:
-    data = encode(message)
-    facts = _FACTS.pack(time.time(), getattr(message, "seq", getattr(message, "version", 0)))
-    return _LENGTHS.pack(len(data), zlib.crc32(data, zlib.crc32(facts))) + facts + data
+def _encode(message: Any) -> bytes:
+    return encode_json(message) if TOPICS[type(message)].encoding == "json" else encode(message)
 
 
-def _kind(data: bytes) -> type | None:
-    """Which message it is, None of a kind that this version does not record."""
-    return next((kind for start, kind in _OPENINGS.items() if data.startswith(start)), None)
+def _decode(entry: Entry) -> Any:
+    kind = _KINDS[entry.channel]
+    return decode_json(entry.data, kind) if TOPICS[kind].encoding == "json" else decode(entry.data, kind)

@@ -42,7 +42,7 @@ from catstream.messages import (
     Track,
 )
 
-__all__ = ["KINDS", "VERSION", "check", "decode", "encode", "opening"]
+__all__ = ["KINDS", "VERSION", "check", "decode", "decode_json", "encode", "encode_json", "opening"]
 
 #: Of the envelope and of what the fields mean.
 VERSION = 1
@@ -96,11 +96,6 @@ def encode(message: Any) -> bytes:
     return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
 
 
-def opening(kind: type) -> bytes:
-    """What the bytes of every message of a kind begin with."""
-    return _ENCODER.encode((VERSION, kind.__name__.lower(), None))[:-1]  # nil is one byte
-
-
 def decode(data: bytes | memoryview, *kinds: type) -> Any:
     """The message in `data`, one of `kinds`. Arrays come read-only.
 
@@ -140,6 +135,41 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
         message: Any = msgspec.convert(fields, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
         raise ProtocolError(f"{name}: {error}", "type") from None
+    check(message)
+    return message
+
+
+def opening(kind: type) -> bytes:
+    """What the bytes of every message of a kind begin with."""
+    return _ENCODER.encode((VERSION, kind.__name__.lower(), None))[:-1]  # nil is one byte
+
+
+def encode_json(message: Any) -> bytes:
+    """A message without arrays as a JSON object of its fields, for recordings.
+
+    Raises
+    ------
+    ProtocolError
+        If a field is outside of its limits.
+    """
+    check(message)
+    return msgspec.json.encode(message)
+
+
+def decode_json(data: bytes, kind: type) -> Any:
+    """The message that `encode_json` wrote.
+
+    Raises
+    ------
+    ProtocolError
+        If it is not JSON, or not the fields of a message of this kind within their limits.
+    """
+    try:
+        message: Any = msgspec.json.decode(data, type=kind)
+    except msgspec.DecodeError as error:
+        raise ProtocolError(
+            f"expected {kind.__name__.lower()} in JSON, got {len(data)} bytes: {error}", "json"
+        ) from None
     check(message)
     return message
 

@@ -9,9 +9,8 @@ import sqlite3
 import time
 from contextlib import closing
 
-from catstream.messages import Health, Track
+from catstream.messages import Health, Run, Track
 from catstream.pipeline import Pipeline
-from catstream.recording.file import run_of
 from catstream.settings import Settings
 from catstream.video.source import open_source
 from catstream.wire.endpoint import Endpoint
@@ -70,7 +69,7 @@ def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the
     with (
         Publisher("health", endpoint, "detector") as health,
         Publisher("tracks", endpoint) as tracks,
-        Publisher("lessons", endpoint, greeting=run_of(Settings(run={"unstored_frames": 100}))) as lessons,
+        Publisher("lessons", endpoint, greeting=Run.of(Settings(run={"unstored_frames": 100}).portable())) as lessons,
     ):
         sink = catstream("sink", file, "--endpoint", folder)
         until(file.exists, lambda: health.send(Health("detector", time.time())))

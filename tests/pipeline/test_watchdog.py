@@ -9,7 +9,7 @@ import pytest
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.recording.file import run_of
+from catstream.messages import Run
 from catstream.services import compressor, detector
 from catstream.services.watchdog import PATIENCE, Watchdog
 from catstream.settings import Settings
@@ -67,7 +67,9 @@ def test_where_each_turn_is_longer_each_has_its_time(watchdog):
 @pytest.fixture
 def allowed(folder):
     """Stands for a process, and only notes the seconds that it asks for."""
-    process = SimpleNamespace(settings=Settings(), run=run_of(Settings()), endpoint=Endpoint.parse(str(folder)))
+    process = SimpleNamespace(
+        settings=Settings(), run=Run.of(Settings().portable()), endpoint=Endpoint.parse(str(folder))
+    )
     process.seconds, process.each = [], []
     process.allow, process.allow_each = process.seconds.append, process.each.append
     return process

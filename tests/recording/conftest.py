@@ -7,7 +7,8 @@ import pytest
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
-from catstream.recording.file import RecordingWriter, run_of
+from catstream.messages import Run
+from catstream.recording.file import RecordingWriter
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 from catstream.video.source import open_source
@@ -38,7 +39,7 @@ def written(tmp_path):
     """Writes messages to a file, and says where that is."""
 
     def record(messages, settings=SETTINGS, **options):
-        with RecordingWriter(tmp_path / "run.rec", run_of(settings), **options) as writer:
+        with RecordingWriter(tmp_path / "run.rec", Run.of(settings.portable()), **options) as writer:
             for message in messages:
                 writer.write(message)
         return tmp_path / "run.rec"

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import json
+import re
 import resource
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 
 from catstream.box import Box
 from catstream.errors import RecordingError
-from catstream.messages import End, Features, Health, Model, Track
-from catstream.recording.file import Recording, RecordingWriter, run_of
+from catstream.messages import End, Features, Health, Model, Run, Track
+from catstream.recording.container import MAGIC
+from catstream.recording.file import Recording, RecordingWriter
 from catstream.settings import Settings
-from catstream.wire.codec import encode
+from catstream.wire.codec import decode, encode
 
 
 def features(seq, value=0.5):
@@ -46,26 +53,29 @@ def test_what_was_written_is_read_with_the_settings(written):
     assert recording.torn == 0
 
 
-def test_a_crash_at_any_byte_leaves_all_records_before_it(written, tmp_path):
-    messages = [track(1), features(1), model(1, 0), track(2), features(2)]
+def test_a_crash_at_any_byte_leaves_all_messages_before_it(written, tmp_path):
+    messages = [track(1), features(1), model(1, 0)]
     path = written([])
-    ends = [path.stat().st_size]
+    ends = [Recording(path).size]
     for message in messages:
         written([message], resume=True)
-        ends.append(path.stat().st_size)
+        ends.append(Recording(path).size)
     whole, cut = path.read_bytes(), tmp_path / "cut.rec"
-    for size in range(ends[0], ends[-1] + 1):
+    for size in [*range(ends[0], ends[-1]), *range(ends[-1], len(whole), 50)]:
         cut.write_bytes(whole[:size])
         kept = sum(end <= size for end in ends[1:])
-        assert [type(message) for message in read(cut)[1:]] == [type(message) for message in messages[:kept]]
-        assert Recording(cut).torn == size - ends[kept]
-        assert not any(Recording(cut).missing.values())
+        recording = Recording(cut)
+        kinds = [type(message) for _, message in recording.messages()]
+        assert kinds == [Run, *map(type, messages[:kept])]
+        assert recording.torn == size - ends[kept]
+        assert not any(recording.missing.values())
+    assert Recording(path).torn == 0
 
 
-@pytest.mark.parametrize("size", [0, 5, 8, 60, 500])
-def test_what_was_torn_before_the_settings_is_no_recording(written, size):
+@pytest.mark.parametrize("size", [0, 5, 8, 60, 500, -1])
+def test_a_file_that_was_cut_before_the_end_of_its_settings_is_no_recording(written, size):
     path = written([])
-    path.write_bytes(path.read_bytes()[:size])
+    path.write_bytes(path.read_bytes()[: size if size >= 0 else Recording(path).size - 1])
     with pytest.raises(RecordingError):
         Recording(path)
 
@@ -73,24 +83,74 @@ def test_what_was_torn_before_the_settings_is_no_recording(written, size):
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_changed_bit_costs_its_own_message_and_no_other(tmp_path_factory, share, bit):
     path = tmp_path_factory.mktemp("changed") / "run.rec"
-    with RecordingWriter(path, run_of(Settings())) as writer:
-        begin = path.stat().st_size
+    with RecordingWriter(path, Run.of(Settings().portable())) as writer:
         for seq in range(1, 10):
             writer.write(track(seq))
-    content = bytearray(path.read_bytes())
-    size = (len(content) - begin) // 9
-    place = int(share * 9 * size)
-    content[begin + place] ^= 1 << bit
+    content, (run, *places) = bytearray(path.read_bytes()), [row[:2] for row in Recording(path).index]
+    changed = len(MAGIC) + int(share * (len(content) - len(MAGIC) - run[1]))
+    changed += run[1] * (changed >= run[0])  # without the settings it is no recording
+    content[changed] ^= 1 << bit
     path.write_bytes(content)
-    recording, changed = Recording(path), place // size + 1
-    assert read(path)[1:] == [track(seq) for seq in range(1, 10) if seq != changed]
-    assert (recording.damaged, recording.torn) == ((0, size) if changed == 9 else (size, 0))
-    assert f"{size} {'torn' if changed == 9 else 'damaged'} bytes" in str(recording)
+    recording = Recording(path)
+    kept = [not place <= changed < place + size for place, size in places]
+    assert read(path)[1:] == [track(seq) for seq, whole in enumerate(kept, 1) if whole]
+    if not all(kept):
+        size = places[kept.index(False)][1]
+        assert (recording.damaged, recording.torn) == (size, 0)
+        assert f"{size} damaged bytes are skipped" in str(recording)
 
 
-def test_it_goes_on_after_the_last_whole_record(written):
+def test_a_hole_costs_the_messages_that_lie_in_it(written):
+    path = written([track(seq) for seq in range(1, 10)])
+    content, (_, *places) = bytearray(path.read_bytes()), [place for place, *_ in Recording(path).index]
+    content[places[3] + 7 : places[5] + 7] = bytes(places[5] - places[3])
+    path.write_bytes(content)
+    recording = Recording(path)
+    assert [message.seq for message in read(path)[1:]] == [1, 2, 3, 7, 8, 9]
+    assert recording.damaged == places[6] - places[3]
+    assert recording.missing[Track] == 3
+
+
+def test_another_program_reads_it_by_topic_and_time(written):
+    path = written([track(1), features(1), model(1, 0)])
+    written([track(2), Health("trainer", 2.0, {"trained": 1.0}), End(3, "its end")], resume=True)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        names = {number: channel.topic for number, channel in summary.channels.items()}
+        counts = {names[number]: count for number, count in summary.statistics.channel_message_counts.items()}
+        assert counts == {"run": 1, "tracks": 2, "features": 1, "models": 1, "health": 1, "end": 1}
+        assert {schema.name for schema in summary.schemas.values()} == {"features", "models"}
+        tracks = [message for _, _, message in reader.iter_messages("tracks")]
+        assert [json.loads(message.data) for message in tracks] == [track(seq).to_dict() for seq in (1, 2)]
+        assert [message.sequence for message in tracks] == [1, 2]
+        (later,) = reader.iter_messages("tracks", starting_after=tracks[0].log_time)
+        assert later[2].sequence == 2
+        ((_, channel, message),) = reader.iter_messages("features")
+        assert channel.message_encoding == "msgpack"
+        assert decode(message.data, Features).seq == 1
+
+
+def test_the_example_of_the_docs_prints_the_boxes(written, monkeypatch, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "record.md").read_text()
+    (example,) = re.findall(r"```python\n(import json.*?)```", page, re.DOTALL)
+    path = written([track(1), track(2)])
+    path.rename(path.with_name("walk.mcap"))
+    monkeypatch.chdir(path.parent)
+    exec(compile(example, "docs/how-to/record.md", "exec"), {})
+    assert capsys.readouterr().out == "[1.0, 2.0, 3.0, 4.0]\n" * 2
+
+
+def test_another_program_reads_it_from_start_to_end(written):
+    path = written([features(seq) for seq in range(1, 4)])
+    with path.open("rb") as file:
+        records = list(StreamReader(file, validate_crcs=True).records)
+    assert [record.sequence for record in records if isinstance(record, Message)] == [0, 1, 2, 3]
+
+
+def test_it_continues_after_the_last_whole_message(written):
     path = written([features(1), features(2)])
-    path.write_bytes(path.read_bytes()[:-7])
+    path.write_bytes(path.read_bytes()[: Recording(path).size - 7])
     written([features(2), features(3)], resume=True)
     recording = Recording(path)
     assert [message.seq for message in recording.features()] == [1, 2, 3]
@@ -131,7 +191,7 @@ def test_what_is_missing_is_counted_at_the_begin_between_and_at_the_end(written)
 
 def test_a_full_disk_is_an_error_and_leaves_the_file_whole(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with RecordingWriter(tmp_path / "full.rec", run_of(Settings())) as writer:
+    with RecordingWriter(tmp_path / "full.rec", Run.of(Settings().portable())) as writer:
         size = writer.path.stat().st_size
         resource.setrlimit(resource.RLIMIT_FSIZE, (size + 100, hard))
         try:
@@ -151,7 +211,7 @@ def test_a_file_that_is_there_is_kept(written):
         written([], Settings(coreset={"size": 99}), resume=True)
     with (
         RecordingWriter(path, Recording(path).run, resume=True),
-        pytest.raises(RecordingError, match="somebody else records"),
+        pytest.raises(RecordingError, match="another process records"),
     ):
         written([], resume=True)
     assert len(read(path)) == 2
@@ -163,5 +223,5 @@ def test_what_is_no_recording_is_refused(tmp_path):
         Recording(tmp_path / "video.mp4")
     with pytest.raises(RecordingError, match="No such file"):
         Recording(tmp_path / "none.rec")
-    with pytest.raises(RecordingError, match="give a place that you may write to"):
-        RecordingWriter(tmp_path / "none" / "run.rec", run_of(Settings()))
+    with pytest.raises(RecordingError, match="give a path that you may write to"):
+        RecordingWriter(tmp_path / "none" / "run.rec", Run.of(Settings().portable()))

@@ -65,7 +65,7 @@ def test_it_is_not_played_faster_than_wanted(written, endpoint, monkeypatch):
     moments = iter([99.0, 100.0, 101.0, 104.0])
     track = Track(1, 0, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 0)
     with monkeypatch.context() as clock:
-        clock.setattr("catstream.recording.file.time.time", lambda: next(moments))
+        clock.setattr("catstream.recording.file.time.time_ns", lambda: int(1e9 * next(moments)))
         path = written([track, Health("trainer", 101.0), Health("detector", 104.0)])
     with Player(Recording(path), endpoint) as player:
         started = time.monotonic()
