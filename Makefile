@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 TOOLS := $(VENV)/.tools
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo test test-slow lint format docs pythons picture settings bench results lock clean fuzz audit
+.PHONY: help setup develop demo test test-slow lint format docs pythons picture settings protocol bench results lock clean fuzz audit
 
 help:  ## say what there is
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -64,6 +64,9 @@ picture: $(READY)  ## make the animated picture of README.md anew
 
 settings: $(TOOLS)  ## write the table of docs/settings.md anew
 	$(BIN)/python tests/test_docs.py
+
+protocol: $(TOOLS)  ## write the tables of docs/protocol.md anew
+	$(BIN)/python tests/wire/test_protocol_page.py
 
 bench: $(TOOLS)  ## measure speed, memory and growth on a quiet machine, into benchmarks/results: 20 minutes
 	PYTHON=$${PYTHON_OF_PEERS:-$(BIN)/python} benchmarks/measure.sh

@@ -15,8 +15,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 from unittest.mock import patch
 
 import atheris
@@ -28,25 +29,11 @@ with atheris.instrument_imports(include=["catstream"]):
     from catstream.box import Box
     from catstream.compression.compressor import Compressor
     from catstream.errors import CatstreamError, ProtocolError, RecordingError, ServiceError, SettingsError
+    from catstream.heads import GROUPS
     from catstream.learned import Learned
-    from catstream.messages import (
-        Answer,
-        Command,
-        DetectorState,
-        End,
-        Features,
-        Health,
-        Model,
-        Motion,
-        Position,
-        Preview,
-        Run,
-        Sample,
-        Stored,
-        Summary,
-        Track,
-    )
+    from catstream.messages import End, Features, Model, Run, Track, TrainingRows
     from catstream.recording.file import Recording, RecordingWriter
+    from catstream.schema import Array, Bytes, Field, Named, OnlyWith, fields
     from catstream.settings import Settings
     from catstream.wire.codec import KINDS, decode, encode
     from catstream.wire.keys import Keys, create
@@ -71,41 +58,40 @@ class Decoder:
         self.take, self.error, self.seeds = take, error, seeds
 
 
-def messages() -> dict[str, tuple[Any, ...]]:
-    """Good messages of each kind."""
+def message(kind: type, full: bool, d: int = 5) -> Any:
+    """A good message of a kind, made from its schema.
 
-    def array(*shape: int, dtype: str = "<f4") -> np.ndarray:
-        return np.linspace(0.1, 0.9, int(np.prod(shape)), dtype=dtype).reshape(shape)
+    Parameters
+    ----------
+    full : with everything that may be missing, or without
+    d : columns of its rows
+    """
+    values: dict[str, Any] = {}
+    for field in fields(kind):
+        rule = field.limit(OnlyWith)
+        given = full if rule is None else values.get(rule.field) == rule.value
+        values[field.name] = value(field, full, d) if given or not field.optional else None
+    return kind(**values)
 
-    def summary(columns: int) -> Summary:
-        return Summary(array(4, columns), array(columns), 40, (3, 1, 0))
 
-    box = Box(4.5, 3.0, 20.0, 10.0)
-    motion = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
-    detector = DetectorState(
-        "present", box, box, box, 0.9, False, motion, array(5, 4, dtype="<f8"), array(6, dtype="<f8")
-    )
-    none = np.empty((0, 5), "<f4")
-    return {
-        "answer": (Answer("7f", True, "followed from frame 9 on", 9, box, 4),),
-        "command": (Command("7f", "set-box", box, True), Command("80", "stop")),
-        "end": (End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),),
-        "features": (
-            Features(3, 2, 0.08, box, array(3, 5), array(3), array(3), array(1, 5), array(1), detector),
-            Features(4, 3, 0.12, None, none, array(0), array(0), none, array(0)),
-        ),
-        "health": (Health("trainer", 1.7e9, {"version": 4.0}),),
-        "model": (Model(4, 20, array(5), -0.25, motion, array(5)), Model(1, 0, array(5), 0.0, None)),
-        "position": (Position(5, 4, box, 2, detector), Position()),
-        "preview": (Preview(2, 1280, 720, box, b"\xff\xd8\xff\xe0"),),
-        "run": (Run("0.1.0", {"coreset.size": "64", "teaching.classifier": "joint"}),),
-        "sample": (Sample(4, 20, summary(5), summary(5), summary(7), summary(7), array(2, 2, dtype="<f8")),),
-        "stored": (Stored(5, 7, 2),),
-        "track": (
-            Track(3, 2, 0.08, "present", box, 0.75, 4, 1234.5),
-            Track(1, 0, 0.0, "absent", None, 0.0, 0),
-        ),
-    }
+def value(field: Field, full: bool, d: int) -> Any:
+    """A good value of a field."""
+    if field.values is not None:
+        named = field.limit(Named) or Named({"sent": 0, "stored": 0})
+        names = [name for name in named.columns if full or name in named.required]
+        return {name: value(field.values, full, d + named.columns[name]) for name in names}
+    if is_dataclass(field.type):
+        return message(field.type, full, d)
+    if array := field.limit(Array):
+        shape = [side if isinstance(side, int) else d if side == "d" else 3 * full for side in array.shape]
+        return np.linspace(0.1, 0.9, int(np.prod(shape)), dtype=array.dtype).reshape(shape)
+    if limits := field.limit(Bytes):
+        return limits.begin
+    if get_origin(field.type) is Literal:
+        return get_args(field.type)[0 if full else -1]
+    if get_origin(field.type) is tuple:
+        return (3, 1, 0)
+    return {bool: full, int: 4, float: 0.75, str: "7f", Box: Box(4.5, 3.0, 20.0, 10.0)}[field.type]
 
 
 def decoders(folder: Path) -> dict[str, Decoder]:
@@ -115,7 +101,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
     ----------
     folder : for the files
     """
-    seeds = messages()
+    seeds = {name: [message(kind, full=full) for full in (True, False)] for name, kind in KINDS.items()}
     found = {
         name: Decoder(lambda data, kind=kind: encode(decode(data, kind)), ProtocolError, *map(encode, seeds[name]))
         for name, kind in KINDS.items()
@@ -123,8 +109,9 @@ def decoders(folder: Path) -> dict[str, Decoder]:
     compressor = Compressor(SETTINGS)
     for seq in range(1, 12):
         rows = np.random.default_rng(seq).normal(size=(4, 6)).astype("f4")
-        labels, weights = np.array([1, 0, 1, 0], "f4"), np.ones(4, "f4")
-        compressor.take(Features(seq, seq, 0.0, Box(1.0, 2.0, 9.0, 9.0), rows, labels, weights, rows[:2], labels[:2]))
+        labels = [1, 0, 1, 0]
+        training = dict.fromkeys(GROUPS, TrainingRows.of(rows, labels))
+        compressor.take(Features(seq, seq, 0.0, Box(1.0, 2.0, 9.0, 9.0), training))
     compressor.save(folder / "checkpoint")
     Learned(seeds["model"][0], seeds["sample"][0], Box(1.0, 2.0, 9.0, 9.0)).save(folder / "learned")
     with RecordingWriter(folder / "recording", Run("0.1.0", {})) as writer:

@@ -59,7 +59,7 @@ def learning(sequence: Sequence, sizes: Iterable[int]) -> Iterator[tuple[str, Ca
     """From what was learned of a whole video, at each coreset size."""
     for n in sizes:
         sample = sample_of(sequence, n)
-        rows = np.vstack([sample.object.rows, sample.background.rows])[: 2 * n]
+        rows = np.vstack([sample.trees["object"].rows, sample.trees["background"].rows])[: 2 * n]
         yield f"reduce {len(rows)} rows to n = {n}", lambda rows=rows, n=n: reduce(rows, n)
         for classifier in ("joint", "least-squares", "one-class"):
             trainer = Trainer(Settings(coreset={"size": n}, teaching={"classifier": classifier}))

@@ -26,7 +26,8 @@ from catstream.compression.tree import CoresetTree
 from catstream.detection.detector import Detector
 from catstream.errors import ServiceError
 from catstream.evaluation.datasets import Sequence
-from catstream.messages import End, Features
+from catstream.heads import APPEARANCE, EXTENT
+from catstream.messages import End, Features, TrainingRows
 from catstream.services.start import service_command
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
@@ -67,22 +68,26 @@ class Stream:
 
     def __init__(self, sequence: Sequence, frames: int, settings: Settings) -> None:
         lessons = list(cut(sequence, frames, settings))
-        rows, labels = np.vstack([one.rows for one in lessons]), np.concatenate([one.labels for one in lessons])
-        self._object, self._background = rows[labels == 1], rows[labels == 0]
-        self._extents = np.vstack([one.extents for one in lessons])
-        self._fits = np.concatenate([one.fits for one in lessons])
+        seen = _all(lessons, APPEARANCE)
+        self._object, self._background = seen.rows[seen.labels == 1], seen.rows[seen.labels == 0]
+        self._extents = _all(lessons, EXTENT)
         self._box, self._random = lessons[-1].box, np.random.default_rng(settings.run.seed)
 
     def message(self, seq: int) -> Features:
         """A row of the object, one of the background and two of its extent."""
         random = self._random
         gains = random.normal(1, GAIN, (4, 1)).astype(np.float32)
-        pair = random.integers(len(self._fits), size=2)
+        pair = random.integers(len(self._extents), size=2)
         rows = np.stack([part[random.integers(len(part))] for part in (self._object, self._background)]) * gains[:2]
-        return Features(
-            seq, seq - 1, (seq - 1) / 25, self._box, rows, np.float32([1, 0]), np.ones(2, np.float32),
-            self._extents[pair] * gains[2:], self._fits[pair],
-        )  # fmt: skip
+        extents = TrainingRows.of(self._extents.rows[pair] * gains[2:], self._extents.labels[pair])
+        training = {APPEARANCE: TrainingRows.of(rows, [1, 0]), EXTENT: extents}
+        return Features(seq, seq - 1, (seq - 1) / 25, self._box, training)
+
+
+def _all(lessons: list[Features], group: str) -> TrainingRows:
+    """The training rows of a group of all frames."""
+    found = [features.training[group] for features in lessons if group in features.training]
+    return sum(found[1:], start=found[0])
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:

@@ -26,12 +26,13 @@ WINDOW = Settings().run.unstored_frames
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     features, messages = lesson(), 50 if options.quick else options.messages
-    megabytes = features.rows.nbytes / 1e6
+    count = sum(map(len, features.training.values()))
+    megabytes = sum(training.rows.nbytes for training in features.training.values()) / 1e6
     rows = []
     for kind, place in (("ipc", folder), ("tcp", loopback)):
         with place() as endpoint:
             rate = messages / delivered(endpoint, features, messages)
-        rows.append((kind, len(features.rows), megabytes, rate, rate * len(features.rows), rate * megabytes))
+        rows.append((kind, count, megabytes, rate, rate * count, rate * megabytes))
     columns = ("over", "rows a message", "MB a message", "messages/s", "rows/s", "MB/s")
     note = f"a frame is a message; each is acknowledged, at most {WINDOW} are on the way"
     yield Table("Features, sent and acknowledged", columns, rows, note)

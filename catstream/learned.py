@@ -17,7 +17,7 @@ from catstream.box import Box
 from catstream.compression import checkpoint
 from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import Model, Sample
-from catstream.wire.codec import check
+from catstream.wire.checks import check
 
 __all__ = ["Learned"]
 

@@ -4,19 +4,25 @@ Each message is a noun, frozen, and complete by itself. In one process the
 stages hand them over as they are; between processes `catstream.wire` turns
 them into msgpack and back, and checks every field on arrival.
 
+The annotations are the schema (see `catstream.schema`), and the docstrings say what the fields mean: the checks of
+the codec, the tables of `docs/protocol.md` and the fuzzers are derived from both.
+
 `d` is the length of a feature row (`catstream.features.cells.row_length`), `n`
 the coreset size, frames count from 0.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
 from catstream.box import Box
+from catstream.heads import GROUPS, HEADS
+from catstream.schema import Array, Bytes, Named, OnlyWith, Whole
 
 __all__ = [
     "Answer",
@@ -35,6 +41,7 @@ __all__ = [
     "Stored",
     "Summary",
     "Track",
+    "TrainingRows",
     "Verb",
 ]
 
@@ -42,17 +49,21 @@ State = Literal["bootstrapping", "present", "absent"]
 
 Verb = Literal["set-box", "pause", "resume", "save", "stop"]
 
+_COLUMNS = {name: head.more_columns for name, head in HEADS.items()}
+_REQUIRED = frozenset(name for name, head in HEADS.items() if head.adds_to_score)
+_BESIDE = {name: 0 for name in HEADS if name not in _REQUIRED}
+
 
 @dataclass(frozen=True, slots=True)
 class Motion:
     """Parameters of the Kalman filter of the centre, found by EM (paper, section "Classification").
 
-    process      float64 (4, 4), covariance of what the constant-velocity model misses a frame
-    observation  float64 (2, 2), covariance of a measured centre, pixels squared
+    process      covariance of what the constant-velocity model misses in a frame; of x, y, then their speeds
+    observation  covariance of a measured centre, pixels squared
     """
 
-    process: np.ndarray
-    observation: np.ndarray
+    process: Annotated[np.ndarray, Array("float64", (4, 4))]
+    observation: Annotated[np.ndarray, Array("float64", (2, 2))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +77,8 @@ class DetectorState:
     usual      score that the object usually has
     elsewhere  whether it was found by a search of the whole frame, and is not trusted yet
     motion     the Kalman filter's parameters, None before it has any
-    centre     float64 (5, 4), the filter's mean (x, y, and their speeds) above its covariance; None before it has any
-    balance    float64 (6,), where the object's colours lie in its window: frames taken in, contrast, the first
+    centre     the filter's mean (x, y, and their speeds) above its covariance; None before it has any
+    balance    where the object's colours lie in its window: frames taken in, contrast, the first
                centre's x and y, the present one's; None where nothing is known of it
     sightings  frames in a row in which an object that is not found yet was seen at one place
     """
@@ -79,9 +90,40 @@ class DetectorState:
     usual: float
     elsewhere: bool
     motion: Motion | None = None
-    centre: np.ndarray | None = None
-    balance: np.ndarray | None = None
+    centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None
+    balance: Annotated[np.ndarray, Array("float64", (6,))] | None = None
     sightings: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingRows:
+    """Feature rows of windows of a frame, with the label that each should get.
+
+    rows     features of the windows
+    labels   of group "appearance" 1 the object, 0 background, between them a near miss; of group "extent" how well
+             the cut fits: 1 the right size and aspect, towards 0 far from them
+    weights  how many ordinary rows each counts for
+    """
+
+    rows: Annotated[np.ndarray, Array("float32", ("k", "d"))]
+    labels: Annotated[np.ndarray, Array("float32", ("k",), low=0, high=1)]
+    weights: Annotated[np.ndarray, Array("float32", ("k",), above=0)]
+
+    @classmethod
+    def of(cls, rows: Sequence[np.ndarray], label: float | Sequence[float], weight: float = 1.0) -> Self:
+        """Rows of one weight, with one label or each its own."""
+        k = len(rows)
+        return cls(np.array(rows, np.float32), np.full(k, label, np.float32), np.full(k, weight, np.float32))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __add__(self, other: TrainingRows) -> TrainingRows:
+        return TrainingRows(
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.labels, other.labels]),
+            np.concatenate([self.weights, other.weights]),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +134,7 @@ class Features:
     frame     the frame the rows were cut from
     time      seconds since the start of the source, of a live one since that of the run
     box       where the object was found, or None
-    rows      float32 (k, d); k is 0 where the frame teaches nothing
-    labels    float32 (k,): 1 the object, 0 background, between them a near miss
-    weights   float32 (k,): how many ordinary rows each counts for, above 0
-    extents   float32 (s, d): the object cut as it is, too small, too large, too wide and too narrow; s may be 0
-    fits      float32 (s,): how well each of those fits, 1 as it is, towards 0 far from it
+    training  by group, see `catstream.heads`; a group without rows is left out
     detector  from where a restarted detector goes on; None where the sender has none
     begins    whether another object begins here: what was learned before is forgotten
     """
@@ -105,11 +143,7 @@ class Features:
     frame: int
     time: float
     box: Box | None
-    rows: np.ndarray
-    labels: np.ndarray
-    weights: np.ndarray
-    extents: np.ndarray
-    fits: np.ndarray
+    training: Annotated[dict[str, TrainingRows], Named(dict.fromkeys(GROUPS, 0))] = field(default_factory=dict)
     detector: DetectorState | None = None
     begins: bool = False
 
@@ -154,14 +188,14 @@ class Position:
 class Summary:
     """A hierarchical sample of one coreset tree (paper, section "Coreset Appearance Model").
 
-    rows    float32 (r, d'), r <= 2n, spread and rescaled: a row weighs one original row
-    mean    float32 (d',), the exact mean of all rows ever inserted
+    rows    at most 2n, spread and rescaled: each weighs one original row
+    mean    exact mean of all rows ever inserted
     count   how many rows that was
     levels  level of each node in memory, oldest first, strictly falling
     """
 
-    rows: np.ndarray
-    mean: np.ndarray
+    rows: Annotated[np.ndarray, Array("float32", ("r", "d"))]
+    mean: Annotated[np.ndarray, Array("float32", ("d",))]
     count: int
     levels: tuple[int, ...]
 
@@ -170,22 +204,16 @@ class Summary:
 class Sample:
     """What the trainer learns from, compressor -> trainer; only the newest counts.
 
-    version     1, 2, 3 ... in order of making
-    frame       newest frame that it summarises
-    object      rows of the object (d columns)
-    background  rows of everything else (d columns)
-    loss        rows [x, 1, y] times the root of their weight (d + 2 columns)
-    extent      rows [x, 1, y] of the object cut well and badly, None before a leaf of them (d + 2 columns)
-    centres     float64 (m, 2), object's centre in the last whole block of frames, pixels, NaN where absent
+    version  1, 2, 3 ... in order of making
+    frame    newest frame that it summarises
+    trees    by head, see `catstream.heads`; a tree without a leaf is left out
+    centres  centre of the object in each frame of the last whole block of frames, pixels; NaN while absent
     """
 
     version: int
     frame: int
-    object: Summary
-    background: Summary
-    loss: Summary
-    extent: Summary | None
-    centres: np.ndarray
+    trees: Annotated[dict[str, Summary], Named(_COLUMNS, _REQUIRED)]
+    centres: Annotated[np.ndarray, Array("float64", ("m", 2), may_be_nan=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,19 +222,21 @@ class Model:
 
     version  that of the Sample it was learned from
     frame    newest frame that the sample summarises
-    weights  float32 (d,)
-    bias     score of a window = weights @ row + bias; 0 at the background's mean, 1 at the object's
+    weights  score of a window = weights @ row + bias
+    bias     so that the score is 0 at the background's mean and 1 at the object's
     motion   parameters of the Kalman filter, or None before EM had enough centres
-    extent   float32 (d,): of windows around one place, the one that fits the object best has the
-             largest extent @ row; None before there was enough to learn it from
+    heads    vectors of the heads that do not add to the score, as far as they are trained: of windows around one
+             place, the one that fits the object best has the largest (weights + heads["extent"]) @ row
     """
 
     version: int
     frame: int
-    weights: np.ndarray
+    weights: Annotated[np.ndarray, Array("float32", ("d",))]
     bias: float
     motion: Motion | None = None
-    extent: np.ndarray | None = None
+    heads: Annotated[dict[str, Annotated[np.ndarray, Array("float32", ("d",))]], Named(_BESIDE)] = field(
+        default_factory=dict
+    )
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -288,10 +318,10 @@ class Preview:
     """
 
     frame: int
-    width: int
-    height: int
+    width: Annotated[int, Whole(low=1)]
+    height: Annotated[int, Whole(low=1)]
     box: Box | None
-    jpeg: bytes
+    jpeg: Annotated[bytes, Bytes("a JPEG", longest=1 << 19, begin=b"\xff\xd8\xff")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,7 +387,7 @@ class Command:
 
     id: str
     verb: Verb
-    box: Box | None = None
+    box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
     keep: bool = False
 
 

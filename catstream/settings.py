@@ -229,9 +229,6 @@ class TeachingSettings(_Group):
             "tree (joint), the former alone (least-squares), or the paper's one-class linear SVM (one-class)."
         ),
     ] = "joint"
-    ridge: Annotated[float, _about("Lambda of the least squares of the two trees.", gt=0)] = 1.0
-    loss_ridge: Annotated[float, _about("Lambda of the least squares of the loss tree.", gt=0)] = 0.1
-    extent_ridge: Annotated[float, _about("Lambda of the least squares of the extent tree.", gt=0)] = 0.1
     colours: Annotated[bool, _about("Use the histogram of the window's colours as a feature.")] = True
     copies: Annotated[
         int, _about("Affine copies of the object in each frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)

@@ -28,7 +28,7 @@ from catstream.messages import Features, Track
 from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
-from catstream.wire.codec import check
+from catstream.wire.checks import check
 
 __all__ = ["Tracker"]
 

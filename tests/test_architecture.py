@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 #: From the ground up. A module imports from the floors below its own, and from its own folder.
 FLOORS = [
     {"errors", "threads"},
-    {"box", "image", "storage", "extras"},
+    {"box", "heads", "image", "schema", "storage", "extras"},
     {"messages", "settings", "ridge", "kalman", "html"},
     {"features"},
     {"paper"},

@@ -11,8 +11,9 @@ from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, ServiceError
+from catstream.heads import APPEARANCE, EXTENT
 from catstream.learned import Learned
-from catstream.messages import Features, Model, Motion
+from catstream.messages import Features, Model, Motion, TrainingRows
 from catstream.settings import Settings
 
 SIZE, WIDTH = 8, 20
@@ -22,11 +23,9 @@ def features(rng, seq, begins=False):
     """What a frame teaches: rows of an object around 1, and of a background around -1."""
     labels = np.repeat(np.float32([1, 0]), 4)
     rows = rng.normal(scale=0.2, size=(8, WIDTH)).astype(np.float32) + np.where(labels[:, None], 1, -1)
-    ones = np.ones(8, np.float32)
     box = Box(1.0, 2.0, 30.0, 40.0)
-    return Features(
-        seq, seq - 1, seq / 25, box, rows.astype(np.float32), labels, ones, rows[:4], ones[:4], None, begins
-    )
+    training = {APPEARANCE: TrainingRows.of(rows, labels), EXTENT: TrainingRows.of(rows[:4], 1)}
+    return Features(seq, seq - 1, seq / 25, box, training, None, begins)
 
 
 @pytest.fixture
@@ -44,7 +43,9 @@ def learned(compressor, rng):
     motion = Motion(np.eye(4), np.eye(2))
     weights = rng.normal(size=WIDTH).astype(np.float32)
     return Learned(
-        Model(sample.version, sample.frame, weights, -0.25, motion, weights), sample, Box(1.0, 2.0, 30.0, 40.0)
+        Model(sample.version, sample.frame, weights, -0.25, motion, {EXTENT: weights}),
+        sample,
+        Box(1.0, 2.0, 30.0, 40.0),
     )
 
 
@@ -98,7 +99,7 @@ def test_a_compressor_goes_on_from_a_sample_with_its_version_and_its_weight(lear
     assert compressor.sampled == learned.sample.version
     samples = [sample for seq in range(1, 30) if (sample := compressor.take(features(rng, seq)))]
     assert [sample.version for sample in samples] == [learned.sample.version + 1 + i for i in range(len(samples))]
-    assert samples[-1].object.count > learned.sample.object.count / 2
+    assert samples[-1].trees["object"].count > learned.sample.trees["object"].count / 2
 
 
 def test_where_another_object_begins_nothing_of_the_one_before_is_left_but_the_versions(compressor, rng):

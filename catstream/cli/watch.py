@@ -20,6 +20,7 @@ from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
+from catstream.heads import APPEARANCE, GROUPS, HEADS
 from catstream.messages import Features, Health, Model, Preview, Sample, Track
 from catstream.subscription import Subscription, subscribe
 
@@ -53,30 +54,30 @@ def _model(message: Model) -> dict[str, str]:
         "|weights|": f"{np.linalg.norm(message.weights):.3f}",
         "bias": f"{message.bias:+.3f}",
         "motion": "no" if message.motion is None else "yes",
-        "extent": "no" if message.extent is None else "yes",
+        "heads": " ".join(message.heads) or "-",
     }
 
 
 def _sample(message: Sample) -> dict[str, str]:
-    trees = {"object": message.object, "background": message.background, "loss": message.loss, "extent": message.extent}
+    trees = {name: message.trees.get(name) for name in HEADS}
     return {
         "version": f"{message.version}",
         "frame": f"{message.frame}",
-        "levels": " ".join(map(str, message.object.levels)),
+        "levels": " ".join(map(str, message.trees["object"].levels)),
         **{name: "-" if tree is None else f"{len(tree.rows)} of {tree.count}" for name, tree in trees.items()},
     }
 
 
 def _features(message: Features) -> dict[str, str]:
-    objects, background = int((message.labels == 1).sum()), int((message.labels == 0).sum())
+    labels = message.training[APPEARANCE].labels if APPEARANCE in message.training else np.empty(0)
+    objects, background = int((labels == 1).sum()), int((labels == 0).sum())
     return {
         "frame": f"{message.frame}",
         "box": _sides(message.box),
-        "rows": f"{len(message.rows)}",
         "object": f"{objects}",
         "background": f"{background}",
-        "near": f"{len(message.rows) - objects - background}",
-        "extents": f"{len(message.extents)}",
+        "near misses": f"{len(labels) - objects - background}",
+        **{name: f"{len(message.training.get(name, ()))}" for name in GROUPS},
     }
 
 

@@ -24,11 +24,9 @@ def sample_state(sample: Sample | None) -> State:
         return {}, None
     arrays: dict[str, np.ndarray] = {"sample.centres": sample.centres}
     trees: dict[str, Any] = {}
-    for name in ("object", "background", "loss", "extent"):
-        summary: Summary | None = getattr(sample, name)
-        if summary is not None:
-            arrays |= {f"sample.{name}.rows": summary.rows, f"sample.{name}.mean": summary.mean}
-            trees[name] = [summary.count, summary.levels]
+    for name, summary in sample.trees.items():
+        arrays |= {f"sample.{name}.rows": summary.rows, f"sample.{name}.mean": summary.mean}
+        trees[name] = [summary.count, summary.levels]
     return arrays, {"version": sample.version, "frame": sample.frame, "trees": trees}
 
 
@@ -36,18 +34,17 @@ def sample_of(arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> Sa
     """The sample, bit for bit; KeyError, TypeError or ValueError where it is none."""
     if facts is None:
         return None
-    summaries: dict[str, Any] = {"extent": None}
+    trees: dict[str, Summary] = {}
     for name, (count, levels) in facts["trees"].items():
         rows, mean = arrays[f"sample.{name}.rows"], arrays[f"sample.{name}.mean"]
-        summaries[name] = Summary(rows, mean, int(count), tuple(levels))
-    return Sample(int(facts["version"]), int(facts["frame"]), centres=arrays["sample.centres"], **summaries)
+        trees[name] = Summary(rows, mean, int(count), tuple(levels))
+    return Sample(int(facts["version"]), int(facts["frame"]), trees, arrays["sample.centres"])
 
 
 def model_state(model: Model) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and facts that `model_of` makes this model of again."""
     arrays = {"weights": model.weights}
-    if model.extent is not None:
-        arrays["extent"] = model.extent
+    arrays |= {f"heads.{name}": vector for name, vector in model.heads.items()}
     if model.motion is not None:
         arrays |= {"process": model.motion.process, "observation": model.motion.observation}
     return arrays, {"version": model.version, "frame": model.frame, "bias": model.bias}
@@ -56,8 +53,9 @@ def model_state(model: Model) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 def model_of(arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Model:
     """The model, bit for bit; KeyError, TypeError or ValueError if it is none."""
     motion = Motion(arrays["process"], arrays["observation"]) if "process" in arrays else None
+    heads = {name.removeprefix("heads."): array for name, array in arrays.items() if name.startswith("heads.")}
     version, frame = int(facts["version"]), int(facts["frame"])
-    return Model(version, frame, arrays["weights"], float(facts["bias"]), motion, arrays.get("extent"))
+    return Model(version, frame, arrays["weights"], float(facts["bias"]), motion, heads)
 
 
 def detector_facts(detector: DetectorState | None) -> State:

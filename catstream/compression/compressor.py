@@ -1,9 +1,6 @@
 """The compressor: every frame's features in, now and then a sample to learn from out.
 
-It is the only owner of the coreset trees: one for the object (the paper's), one
-for the background, and two for losses, whose rows [x, 1, y] times the root of
-their weight make `||A [w; b; -1]||^2` the squared error of any linear model:
-of what is the object, and of which size it has.
+It is the only owner of the coreset trees: one for each head of `catstream.heads`.
 """
 
 from __future__ import annotations
@@ -18,13 +15,13 @@ from catstream.box import Box
 from catstream.compression import checkpoint
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, SettingsError
-from catstream.messages import DetectorState, Features, Position, Sample
+from catstream.heads import HEADS, Head
+from catstream.messages import DetectorState, Features, Position, Sample, TrainingRows
 from catstream.settings import Settings
 
 __all__ = ["Compressor"]
 
 _GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between
-_TREES = ("object", "background", "loss", "extent")
 
 
 class Compressor:
@@ -58,7 +55,7 @@ class Compressor:
 
     def _forget(self) -> None:
         """All but the stream of messages and the versions of samples, which go on."""
-        self.trees = {name: self._tree(self.settings.coreset.size) for name in _TREES}
+        self.trees = {name: self._tree(self.settings.coreset.size) for name in HEADS}
         self.centres = np.empty((0, 2))
         self._path: list[tuple[float, float]] = []
         self.box: Box | None = None
@@ -69,21 +66,22 @@ class Compressor:
     def of(cls, sample: Sample, settings: Settings) -> Compressor:
         """Go on with what a sample of an earlier stream summarises, in trees of one node each; versions go on."""
         self = cls(settings)
-        for name in _TREES:
-            if (summary := getattr(sample, name)) is not None:
-                self.trees[name] = CoresetTree.of(summary, settings.coreset.size)
+        for name, summary in sample.trees.items():
+            self.trees[name] = CoresetTree.of(summary, settings.coreset.size)
         self.last_sample, self.centres, self._sampled_leaves = sample, sample.centres, self.leaves
         return self
 
     def check(self, features: Features) -> None:
         """Raise ProtocolError where rows have another length than those before: they are of another stream."""
-        width = max(self.trees["loss"].width, self.trees["extent"].width) - 2
-        if width > 0 and len(features.rows) + len(features.extents) and features.rows.shape[1] != width:
-            raise ProtocolError(
-                f"features rows have length {features.rows.shape[1]}, those before {width}: "
-                "start all processes with the same catstream",
-                "width",
-            )
+        before = {self.trees[name].width - head.more_columns for name, head in HEADS.items() if self.trees[name].width}
+        width = max(before, default=0)
+        for training in features.training.values():
+            if width and training.rows.shape[1] != width:
+                raise ProtocolError(
+                    f"features rows have length {training.rows.shape[1]}, those before {width}: "
+                    "start all processes with the same catstream and the same settings",
+                    "width",
+                )
 
     def take(self, features: Features) -> Sample | None:
         """Store one frame's features; a sample where the trees have grown enough since the last.
@@ -106,14 +104,10 @@ class Compressor:
             )
         if features.begins:
             self._forget()
-        rows, labels = features.rows, features.labels
-        if len(rows):
-            # Only rows of the right length get as far as the first tree, so that all hold the same frames.
-            self.trees["loss"].insert(_loss_rows(rows, labels, features.weights))
-            self.trees["object"].insert(rows[labels == 1])
-            self.trees["background"].insert(rows[labels == 0])
-        if extents := len(features.extents):
-            self.trees["extent"].insert(_loss_rows(features.extents, features.fits, np.ones(extents)))
+        self.check(features)  # before the first tree takes its rows, so that all trees hold the same frames
+        for name, head in HEADS.items():
+            if (training := features.training.get(head.group)) is not None:
+                self.trees[name].insert(_rows_of(head, training))
         self.seq, self.frame, self.detector = features.seq, features.frame, features.detector
         if features.box is not None:
             self.box = features.box
@@ -190,7 +184,7 @@ class Compressor:
         try:
             self = cls.from_state(arrays, facts, settings)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ProtocolError(f"{path} is not a compressor's state ({error!r}): take an older copy") from None
+            raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
         if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset.size}:
             raise SettingsError(
                 f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset.size}: "
@@ -226,7 +220,7 @@ class Compressor:
 
     def _due(self) -> bool:
         """Trees that can teach, and a leaf more than last time: at once while they are small, else not too soon."""
-        if not (self.trees["object"].nodes and self.trees["background"].nodes and self.trees["loss"].nodes):
+        if not all(self.trees[name].nodes for name, head in HEADS.items() if head.adds_to_score):
             return False
         leaves, last = self.leaves, self.last_sample
         waited = last is not None and self.frame - last.frame >= self.settings.coreset.sample_interval
@@ -234,13 +228,16 @@ class Compressor:
 
     def _sample(self) -> Sample:
         self._sampled_leaves = self.leaves
-        summaries = {name: tree.sample() if tree.nodes else None for name, tree in self.trees.items()}
-        self.last_sample = Sample(self.version + 1, self.frame, centres=self.centres, **summaries)  # type: ignore[arg-type]
+        summaries = {name: tree.sample() for name, tree in self.trees.items() if tree.nodes}
+        self.last_sample = Sample(self.version + 1, self.frame, summaries, self.centres)
         return self.last_sample
 
 
-def _loss_rows(rows: np.ndarray, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Rows [x, 1, y] times the root of their weight, float32 (k, d + 2)."""
+def _rows_of(head: Head, training: TrainingRows) -> np.ndarray:
+    """The rows that the tree of a head takes."""
+    rows = training.rows
+    if head.label is not None:
+        return rows[training.labels == head.label]
     wide = np.empty((len(rows), rows.shape[1] + 2), np.float32)
-    wide[:, :-2], wide[:, -2], wide[:, -1] = rows, 1, labels
-    return wide * np.sqrt(weights, dtype=np.float32)[:, None]
+    wide[:, :-2], wide[:, -2], wide[:, -1] = rows, 1, training.labels
+    return wide * np.sqrt(training.weights, dtype=np.float32)[:, None]

@@ -190,9 +190,7 @@ class CoresetTree:
             tree.pending = arrays["pending"]
             tree._check()
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ProtocolError(
-                f"not the state of a coreset tree ({error!r}): take an older copy of the file"
-            ) from None
+            raise ProtocolError(f"not the state of a coreset tree ({error!r}): use an older copy of the file") from None
         return tree
 
     def _push(self, node: Node) -> None:

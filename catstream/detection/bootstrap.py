@@ -8,8 +8,8 @@ import numpy as np
 
 from catstream import ridge
 from catstream.errors import BoxError
+from catstream.heads import BACKGROUND
 from catstream.messages import Model
-from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.detection.lessons import Lesson
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["stand_in"]
 
 
-def stand_in(lesson: Lesson, settings: Settings) -> Model:
+def stand_in(lesson: Lesson) -> Model:
     """A model of version 0, from the object's copies against the background of one frame.
 
     Raises
@@ -27,7 +27,7 @@ def stand_in(lesson: Lesson, settings: Settings) -> Model:
     """
     background = lesson.rows[lesson.labels == 0]
     mean, background_mean = lesson.rows[lesson.labels == 1].mean(axis=0), background.mean(axis=0)
-    weights = ridge.between(background, mean - background_mean, settings.teaching.ridge)
+    weights = ridge.between(background, mean - background_mean, BACKGROUND.ridge)
     contrast = float(weights @ (mean - background_mean))
     if not contrast > 0:
         raise BoxError("the object in the box looks like all that is around it: give another box, or another frame")

@@ -17,7 +17,8 @@ from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import COLOURS, row_length
 from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.messages import DetectorState, Features, Model, State, Track
+from catstream.heads import APPEARANCE, EXTENT
+from catstream.messages import DetectorState, Features, Model, State, Track, TrainingRows
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
@@ -104,9 +105,9 @@ class Detector:
             lesson = lessons.with_extents(lesson, frame, window, self.settings)
         else:
             lesson = lessons.first(frame, window, self._random(), self.settings)
-        model = bootstrap.stand_in(lesson, self.settings)
+        model = bootstrap.stand_in(lesson)
         lesson += lessons.far(frame, window, model, self.settings)
-        model = bootstrap.stand_in(lesson, self.settings)
+        model = bootstrap.stand_in(lesson)
         self._forget()
         self._box = self._sure_box = self._first_box = window
         self.model, self._scm, self._started = model, scm, True
@@ -326,8 +327,12 @@ class Detector:
         seq, frame = self.seq, self.seq - 1
         box = None if self.state == "absent" else self.box
         track = Track(seq, frame, time, self.state, box, float(score), self.model.version)
-        rows = lesson.rows, lesson.labels, lesson.weights, lesson.extents, lesson.fits
-        return track, Features(seq, frame, time, box, *rows, self._detector_state(), begins)
+        groups = {
+            APPEARANCE: TrainingRows(lesson.rows, lesson.labels, lesson.weights),
+            EXTENT: TrainingRows(lesson.extents, lesson.fits, np.ones_like(lesson.fits)),
+        }
+        training = {name: rows for name, rows in groups.items() if len(rows)}
+        return track, Features(seq, frame, time, box, training, self._detector_state(), begins)
 
     def _detector_state(self) -> DetectorState | None:
         if not self._started:

@@ -16,6 +16,7 @@ from catstream.detection import search, windows
 from catstream.detection.search import Found
 from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
+from catstream.heads import EXTENT
 from catstream.messages import Model
 from catstream.settings import Settings
 
@@ -32,7 +33,7 @@ def fitted(frame: Pyramid, box: Box, first: Box, model: Model, settings: Setting
     ----------
     first : the window of the first frame, whose extent is likelier than others
     """
-    now = math.log(box.area / first.area) / 2
+    now, fits = math.log(box.area / first.area) / 2, model.heads.get(EXTENT)
     found: dict[int, Found] = {}
 
     def value(step: int) -> float:
@@ -40,12 +41,12 @@ def fitted(frame: Pyramid, box: Box, first: Box, model: Model, settings: Setting
         place = search.highest(scored.scores)
         score = float(scored.scores[place])
         found[step] = Found(score, scored.box(*scored.refined(*place)))
-        fit = 0.0 if model.extent is None else settings.extent.weight * float(scored.row(1, 1) @ model.extent)
+        fit = 0.0 if fits is None else settings.extent.weight * float(scored.row(1, 1) @ fits)
         return score + fit - _cost(step * math.log(1 + settings.extent.size_step), now, settings)
 
     step, beside = _climbed(value, settings.extent.size_count // 2)
     best = Found(found[step].score, found[step].box.scaled(_size(beside, settings)))
-    return best if model.extent is None else _widened(frame, best, first, model, settings)
+    return best if fits is None else _widened(frame, best, first, model, settings)
 
 
 def _widened(frame: Pyramid, found: Found, first: Box, model: Model, settings: Settings) -> Found:
@@ -54,7 +55,7 @@ def _widened(frame: Pyramid, found: Found, first: Box, model: Model, settings: S
 
     def value(step: int) -> float:
         scored = search.scored_around(frame, found.box.scaled(*_stretch(step, settings)), WINDOW, model)
-        fit = settings.extent.weight * float(scored.row(0, 0) @ model.extent)
+        fit = settings.extent.weight * float(scored.row(0, 0) @ model.heads[EXTENT])
         return float(scored.scores[0, 0]) + fit - _cost(step * math.log(1 + settings.extent.aspect_step), now, settings)
 
     step, beside = _climbed(value, settings.extent.aspect_count // 2)

@@ -10,6 +10,7 @@ import numpy as np
 
 from catstream.compression.compressor import Compressor
 from catstream.errors import RecordingError
+from catstream.heads import APPEARANCE
 from catstream.messages import Features, Model
 from catstream.recording.file import Recording
 from catstream.settings import Settings
@@ -34,12 +35,13 @@ class Marks:
 
     def add(self, model: Model | None, features: Features) -> None:
         """Mark a model on the rows of one frame."""
-        if model is None or not len(features.rows):
+        training = features.training.get(APPEARANCE)
+        if model is None or training is None:
             return
-        scores = features.rows @ model.weights + np.float32(model.bias)
-        self._errors += float(features.weights @ (scores - features.labels) ** 2)
-        self._weights += float(features.weights.sum())
-        objects, others = scores[features.labels == 1], scores[features.labels == 0]
+        scores = training.rows @ model.weights + np.float32(model.bias)
+        self._errors += float(training.weights @ (scores - training.labels) ** 2)
+        self._weights += float(training.weights.sum())
+        objects, others = scores[training.labels == 1], scores[training.labels == 0]
         if len(objects) and len(others):
             self.frames += 1
             self.won += bool(objects.min() > others.max())

@@ -8,6 +8,7 @@ import numpy as np
 
 from catstream import ridge
 from catstream.errors import ProtocolError
+from catstream.heads import BACKGROUND, HEADS
 from catstream.messages import Model, Motion, Sample
 from catstream.paper.one_class import one_class
 from catstream.settings import Settings
@@ -34,36 +35,47 @@ class Trainer:
         ProtocolError
             For a sample in which object and background are the same.
         """
-        background_mean = sample.background.mean
-        apart = sample.object.mean - background_mean
+        background_mean = sample.trees["background"].mean
+        apart = sample.trees["object"].mean - background_mean
         # A direction in which the object scores no higher, as very few rows may give one, is worth nothing.
         useful = [scaled for each in self._directions(sample) if (scaled := _unit_contrast(each, apart)) is not None]
-        weights = _unit_contrast(np.sum(useful, axis=0) if useful else _between(sample, self.settings), apart)
+        weights = _unit_contrast(np.sum(useful, axis=0) if useful else _between(sample), apart)
         if weights is None:
             raise ProtocolError(
                 f"sample {sample.version} holds no difference between object and background: give another box"
             )
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
-        extent = None
-        if sample.extent is not None:
-            # What the score says of a cut already is taken off: the two are added up where size and aspect are chosen.
-            rows = sample.extent.rows.copy()
-            rows[:, -1] -= rows[:, :-2] @ weights
-            extent = ridge.fit(rows, self.settings.teaching.extent_ridge)
-        return Model(sample.version, sample.frame, weights, -float(weights @ background_mean), motion, extent)
+        bias = -float(weights @ background_mean)
+        return Model(sample.version, sample.frame, weights, bias, motion, _beside_the_score(sample, weights))
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
         if settings.teaching.classifier == "one-class":
-            return [one_class(sample.object.rows, sample.background.mean)]
+            return [one_class(sample.trees["object"].rows, sample.trees["background"].mean)]
         if settings.teaching.classifier == "least-squares":
-            return [_between(sample, settings)]
-        return [_between(sample, settings), ridge.fit(sample.loss.rows, settings.teaching.loss_ridge)]
+            return [_between(sample)]
+        fitted = [head for head in HEADS.values() if head.adds_to_score and head.label is None]
+        return [_between(sample), *(ridge.fit(sample.trees[head.name].rows, head.ridge) for head in fitted)]
 
 
-def _between(sample: Sample, settings: Settings) -> np.ndarray:
-    """Least squares of the two trees: its contrast is positive wherever the means differ."""
-    return ridge.between(sample.background.rows, sample.object.mean - sample.background.mean, settings.teaching.ridge)
+def _between(sample: Sample) -> np.ndarray:
+    """Least squares of the object's tree against the background's: the contrast is positive if the means differ."""
+    background = sample.trees["background"]
+    return ridge.between(background.rows, sample.trees["object"].mean - background.mean, BACKGROUND.ridge)
+
+
+def _beside_the_score(sample: Sample, weights: np.ndarray) -> dict[str, np.ndarray]:
+    """The vectors of the heads that do not add to the score, each fitted to what the score leaves of the labels.
+
+    Detection adds the two up where it chooses size and aspect.
+    """
+    vectors = {}
+    for name, head in HEADS.items():
+        if not head.adds_to_score and name in sample.trees:
+            rows = sample.trees[name].rows.copy()
+            rows[:, -1] -= rows[:, :-2] @ weights
+            vectors[name] = ridge.fit(rows, head.ridge)
+    return vectors
 
 
 def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | None:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections import Counter, OrderedDict, deque
 from typing import Any, Literal
 
+from catstream.heads import HEADS
 from catstream.messages import End, Features, Health, Model, Preview, Track
 from catstream.web.film import Film
 
-__all__ = ["SILENCE_SECONDS", "TREES", "Board", "Standing"]
+__all__ = ["SILENCE_SECONDS", "Board", "Standing"]
 
 #: How the pipeline is: not heard yet, heard, silent since, at its end.
 Standing = Literal["waiting", "running", "gone", "ended"]
-
-#: The compressor's coreset trees.
-TREES = ("object", "background", "loss", "extent")
 
 #: After which who says nothing is gone: each process is heard once a second.
 SILENCE_SECONDS = 4.0
@@ -43,7 +41,9 @@ class Board:
 
     def __init__(self) -> None:
         self.endpoint = self._attached = ""
-        self._revisions: Counter[str] = Counter(pipeline=1)  # told first: a page clears what it shows of another
+        self._revisions: Counter[str] = Counter(
+            pipeline=1, trees=1
+        )  # told first: a page clears what it shows of another
         self._forget()
 
     def _forget(self) -> None:
@@ -254,7 +254,10 @@ class Board:
     def _trees_part(self, _: int) -> dict[str, Any]:
         counted = self._last["compressor"].counters if "compressor" in self._last else {}
         return {
-            "leaves": {tree: counted.get(f"{tree}_leaves") for tree in TREES},
+            "trees": [
+                {"title": head.title, "meaning": head.meaning, "leaves": counted.get(f"{name}_leaves")}
+                for name, head in HEADS.items()
+            ],
             "bytes": counted.get("bytes"),
             "rows": counted.get("rows"),
         }

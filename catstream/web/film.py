@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from catstream.messages import Features, Model, Preview
+from catstream.heads import APPEARANCE
+from catstream.messages import Features, Model, Preview, TrainingRows
 
 __all__ = ["Film", "Shot", "surprise"]
 
@@ -31,14 +32,14 @@ class Shot:
     preview: Preview
 
 
-def surprise(features: Features, model: Model) -> float:
+def surprise(training: TrainingRows, model: Model) -> float:
     """What a frame taught: how wrong a model was about its rows.
 
     It is the weighted squared error, the frame's own part of the loss that training minimises:
     the sum of weight * (score - label)^2 over its rows.
     """
-    wrong = features.rows @ model.weights + np.float32(model.bias) - features.labels
-    return float(features.weights @ wrong**2)
+    wrong = training.rows @ model.weights + np.float32(model.bias) - training.labels
+    return float(training.weights @ wrong**2)
 
 
 class Film:
@@ -61,9 +62,10 @@ class Film:
 
     def learn(self, features: Features) -> bool:
         """Take a frame's lesson; returns whether the film changed."""
-        if self._model is None or not len(features.rows) or features.rows.shape[1] != len(self._model.weights):
+        training = features.training.get(APPEARANCE)
+        if self._model is None or training is None or training.rows.shape[1] != len(self._model.weights):
             return False
-        self._keep(self._lessons, features.frame, (features.time, surprise(features, self._model)))
+        self._keep(self._lessons, features.frame, (features.time, surprise(training, self._model)))
         return self._match(features.frame)
 
     def look(self, preview: Preview) -> bool:

@@ -8,7 +8,7 @@ from time import monotonic, time
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from catstream.web.board import TREES
+from catstream.heads import HEADS
 from catstream.web.feed import Feed
 from catstream.wire.channels import CHANNELS
 
@@ -70,7 +70,7 @@ class _Collector:
         leaves = GaugeMetricFamily(
             "catstream_tree_leaves", "Leaves ever inserted into a coreset tree.", labels=["tree"]
         )
-        for tree in TREES:
+        for tree in HEADS:
             if (value := board.counter("compressor", f"{tree}_leaves")) is not None:
                 leaves.add_metric([tree], value)
         yield leaves

@@ -1,20 +1,19 @@
-"""Messages to bytes and back; nothing that arrives is believed before it is checked.
+"""Messages to bytes and back. Everything that arrives is checked before it is used.
 
 A message is one frame of msgpack, `[version, kind, fields]`:
 
-    version   1; another one is refused
+    version   2; another one is refused
     kind      name of the message in small letters: "features", "track" ...
     fields    map from each field's name to its value, see `catstream.messages`
     a box     [x, y, w, h]
     an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
 
-Every size has a limit before memory is taken for it; then types, shapes, dtypes and ranges are
-checked, and every number is finite. A field that this version does not know is ignored.
+Every size has a limit before memory is taken for it. Then the message is checked against its
+schema (`catstream.wire.checks`). A field that this version does not know is ignored.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
@@ -22,66 +21,34 @@ import msgpack
 import msgspec
 import numpy as np
 
-from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import (
     Answer,
     Command,
-    DetectorState,
     End,
     Features,
     Health,
     Model,
-    Motion,
     Position,
     Preview,
     Run,
     Sample,
     Stored,
-    Summary,
     Track,
 )
+from catstream.schema import LONGEST_LIST, LONGEST_TEXT
+from catstream.wire.checks import check
 
-__all__ = ["KINDS", "VERSION", "check", "decode", "decode_json", "encode", "encode_json", "opening"]
+__all__ = ["KINDS", "VERSION", "decode", "decode_json", "encode", "encode_json", "opening"]
 
 #: Of the envelope and of what the fields mean.
-VERSION = 1
+VERSION = 2
 
 #: Kinds of message, by their name on the wire.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind
     for kind in (Answer, Command, End, Features, Health, Model, Position, Preview, Run, Sample, Stored, Track)
 }
-
-_F32, _F64 = np.dtype("<f4"), np.dtype("<f8")
-
-#: Of each array: its dtype and shape. A letter stands for the same length throughout a message.
-_ARRAYS: dict[type, dict[str, tuple[np.dtype, tuple[int | str, ...]]]] = {
-    Features: {
-        "rows": (_F32, ("k", "d")),
-        "labels": (_F32, ("k",)),
-        "weights": (_F32, ("k",)),
-        "extents": (_F32, ("s", "d")),
-        "fits": (_F32, ("s",)),
-    },
-    Summary: {"rows": (_F32, ("r", "d")), "mean": (_F32, ("d",))},
-    Sample: {"centres": (_F64, ("m", 2))},
-    DetectorState: {"centre": (_F64, (5, 4)), "balance": (_F64, (6,))},
-    Motion: {"process": (_F64, (4, 4)), "observation": (_F64, (2, 2))},
-    Model: {"weights": (_F32, ("d",)), "extent": (_F32, ("d",))},
-}
-
-#: Names of the fields: to ask a class for them takes longer than to check them.
-_NAMES = {kind: tuple(field.name for field in dataclasses.fields(kind)) for kind in (*KINDS.values(), *_ARRAYS)}
-
-#: Arrays in which NaN has a meaning.
-_MAY_BE_NAN = {(Sample, "centres")}
-
-_LONGEST_TEXT = 4096  # bytes
-_LONGEST_LIST = 256  # entries of a list or map: levels of a tree, counters
-_LONGEST_PICTURE = 1 << 19  # bytes
-_JPEG = b"\xff\xd8\xff"  # what every one begins with
-_LARGEST_INTEGER = 2**53  # so that a reader in any language holds it exactly
 
 
 def encode(message: Any) -> bytes:
@@ -90,7 +57,7 @@ def encode(message: Any) -> bytes:
     Raises
     ------
     ProtocolError
-        Where it is not what its kind promises: it would be refused on arrival.
+        If it breaks its schema: it would be refused on arrival.
     """
     check(message)
     return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
@@ -102,7 +69,7 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
     Raises
     ------
     ProtocolError
-        Where it is anything else; says what was expected and what came.
+        If it is anything else; says what was expected and what came.
     """
     expected = " or ".join(sorted(kind.__name__.lower() for kind in kinds))
     try:
@@ -110,9 +77,9 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
             data,
             object_pairs_hook=_unique,
             max_bin_len=len(data),
-            max_str_len=_LONGEST_TEXT,
-            max_array_len=_LONGEST_LIST,
-            max_map_len=_LONGEST_LIST,
+            max_str_len=LONGEST_TEXT,
+            max_array_len=LONGEST_LIST,
+            max_map_len=LONGEST_LIST,
             max_ext_len=0,
         )
     except (ValueError, msgpack.exceptions.UnpackException) as error:
@@ -212,68 +179,3 @@ def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
     if len(fields) < len(pairs):
         raise ValueError("a name comes twice in a map")
     return fields
-
-
-def check(message: Any) -> None:
-    """Raise ProtocolError unless every field of a message keeps its promise."""
-    kind, lengths = type(message), dict[str, int]()
-    for name in _NAMES[kind]:
-        value = getattr(message, name)
-        if isinstance(value, np.ndarray):
-            _check_array(value, kind, name, lengths)
-        elif type(value) in _NAMES:
-            check(value)
-        else:
-            _check_numbers(value, kind, name)
-    if isinstance(message, Features):
-        shares = np.concatenate([message.labels, message.fits])
-        if not ((shares >= 0).all() and (shares <= 1).all() and (message.weights > 0).all()):
-            raise ProtocolError("features: expected labels and fits from 0 to 1 and weights above 0", "range")
-    if isinstance(message, Sample):
-        d = len(message.object.mean)
-        trees = (message.background, message.loss, message.extent)
-        widths = [len(tree.mean) if tree is not None else d + 2 for tree in trees]
-        if widths != [d, d + 2, d + 2]:
-            raise ProtocolError(f"sample: expected trees of d, d, d + 2 and d + 2 columns, got {[d, *widths]}", "width")
-    if isinstance(message, Preview):
-        if not (message.jpeg.startswith(_JPEG) and len(message.jpeg) <= _LONGEST_PICTURE):
-            raise ProtocolError(
-                f"preview jpeg: expected a JPEG of at most {_LONGEST_PICTURE} bytes, got {len(message.jpeg)} "
-                f"that begin with {message.jpeg[:3]!r}"
-            )
-        if not (message.width and message.height):
-            raise ProtocolError(f"preview: expected sides above 0, got {message.width} x {message.height}")
-    if isinstance(message, Command) and (message.box is not None) != (message.verb == "set-box"):
-        raise ProtocolError(f"command: expected a box with set-box and with nothing else, got {message.verb!r}")
-
-
-def _where(kind: type, name: str) -> str:
-    return f"{kind.__name__.lower()} {name}"
-
-
-def _check_array(array: np.ndarray, kind: type, name: str, lengths: dict[str, int]) -> None:
-    dtype, shape = _ARRAYS[kind][name]
-    if array.ndim == len(shape):
-        expected = tuple(
-            lengths.setdefault(side, length) if isinstance(side, str) else side
-            for side, length in zip(shape, array.shape, strict=True)
-        )
-    if array.ndim != len(shape) or array.shape != expected or array.dtype != dtype:
-        letters = ", ".join(map(str, shape))
-        raise ProtocolError(
-            f"{_where(kind, name)}: expected {dtype} ({letters}), got {array.dtype} {array.shape} with {lengths}",
-            "dtype" if array.dtype != dtype else "shape",
-        )
-    if (kind, name) not in _MAY_BE_NAN and not np.isfinite(array).all():
-        raise ProtocolError(f"{_where(kind, name)}: holds numbers that are not finite", "finite")
-
-
-def _check_numbers(value: Any, kind: type, name: str) -> None:
-    if isinstance(value, Box) and not (value.w > 0 and value.h > 0):
-        raise ProtocolError(f"{_where(kind, name)}: expected a width and a height above 0, got {value}", "range")
-    numbers = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
-    for number in numbers:
-        if isinstance(number, float) and not math.isfinite(number):
-            raise ProtocolError(f"{_where(kind, name)}: expected a finite number, got {number}", "finite")
-        if isinstance(number, int) and not 0 <= number <= _LARGEST_INTEGER:
-            raise ProtocolError(f"{_where(kind, name)}: expected a whole number from 0 to 2**53, got {number}", "range")

@@ -54,7 +54,7 @@ def test_tracks_come_as_lines_of_json_until_the_pipeline_ends_and_features_as_li
     assert errors.endswith(": the source came to its end\n")
     lines = shown.splitlines()
     assert len(lines) == 3
-    assert all(word in lines[0] for word in ("frame ", "rows ", "background ", "extents "))
+    assert all(word in lines[0] for word in ("frame ", "background ", "appearance ", "extent "))
     assert (tracks.returncode, features.returncode) == (0, 0)
 
 

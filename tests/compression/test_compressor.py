@@ -14,7 +14,8 @@ from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, SettingsError
-from catstream.messages import DetectorState, Features, Motion, Sample
+from catstream.heads import APPEARANCE, EXTENT
+from catstream.messages import DetectorState, Features, Motion, Sample, TrainingRows
 from catstream.settings import Settings
 
 WIDTH = 20
@@ -35,14 +36,14 @@ def messages(rng) -> Iterator[Features]:
             labels = np.array([1, 1, 0, 0, 0, 0.5], np.float32)
             weights = np.array([4, 4, 1, 1, 1, 1], np.float32)
             box = Box(frame, 10, 20, 30) if frame % 5 else None
-            yield Features(frame + 1, frame, frame / 25, box, rows, labels, weights, rows[:3], labels[:3])
+            training = {APPEARANCE: TrainingRows(rows, labels, weights), EXTENT: TrainingRows.of(rows[:3], labels[:3])}
+            yield Features(frame + 1, frame, frame / 25, box, training)
 
     return stream()
 
 
 def without_rows(message):
-    none = {name: getattr(message, name)[:0] for name in ("rows", "labels", "weights", "extents", "fits")}
-    return dataclasses.replace(message, **none)
+    return dataclasses.replace(message, training={})
 
 
 def take(compressor: Compressor, messages: Iterator[Features], count: int) -> list[Sample]:
@@ -53,8 +54,9 @@ def take(compressor: Compressor, messages: Iterator[Features], count: int) -> li
 def assert_same(sample: Sample, other: Sample) -> None:
     assert (sample.version, sample.frame) == (other.version, other.frame)
     assert_array_equal(sample.centres, other.centres)
-    for name in ("object", "background", "loss", "extent"):
-        summary, expected = getattr(sample, name), getattr(other, name)
+    assert sample.trees.keys() == other.trees.keys()
+    for name, summary in sample.trees.items():
+        expected = other.trees[name]
         assert_array_equal(summary.rows, expected.rows)
         assert_array_equal(summary.mean, expected.mean)
         assert (summary.count, summary.levels) == (expected.count, expected.levels)
@@ -64,7 +66,8 @@ def test_each_row_goes_where_its_label_says(settings, messages):
     compressor = Compressor(settings)
     sample = take(compressor, messages, 60)[-1]
     frames = sample.frame + 1
-    assert (sample.object.count, sample.background.count, sample.loss.count) == (2 * frames, 3 * frames, 6 * frames)
+    counts = {"object": 2 * frames, "background": 3 * frames, "loss": 6 * frames, "extent": 3 * frames}
+    assert {name: tree.count for name, tree in sample.trees.items()} == counts
 
 
 def test_rows_of_the_loss_tree_give_the_loss_of_any_model(settings, messages, rng):
@@ -72,12 +75,13 @@ def test_rows_of_the_loss_tree_give_the_loss_of_any_model(settings, messages, rn
     compressor, seen = Compressor(settings), [next(messages) for _ in range(60)]
     for message in seen:
         compressor.take(message)
+    trained = [message.training[APPEARANCE] for message in seen]
     tree = compressor.trees["loss"]
     kept = np.vstack([*(node.rows for node in tree.nodes), tree.pending]).astype(np.float64)
     for _ in range(10):
         model = rng.normal(size=WIDTH + 2)
         model[-1] = -1
-        loss = sum(float(m.weights @ (m.rows @ model[:-2] + model[-2] - m.labels) ** 2) for m in seen)
+        loss = sum(float(m.weights @ (m.rows @ model[:-2] + model[-2] - m.labels) ** 2) for m in trained)
         approximate = float(np.sum((kept @ model) ** 2))
         assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
 
@@ -113,7 +117,7 @@ def test_rows_of_another_length_are_refused_and_nothing_is_stored(settings, mess
     compressor.take(first)
     before = compressor.counters()
     with pytest.raises(ProtocolError, match="same settings"):
-        compressor.take(dataclasses.replace(second, rows=second.rows[:, 1:]))
+        compressor.take(dataclasses.replace(second, training={EXTENT: TrainingRows.of(np.ones((3, WIDTH - 1)), 1)}))
     assert compressor.counters() == before
     compressor.take(second)
 
@@ -204,7 +208,7 @@ def test_a_torn_state_is_refused(settings, messages, share, tmp_path):
     compressor.save(path)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ProtocolError, match="take an older copy"):
+    with pytest.raises(ProtocolError, match="use an older copy"):
         Compressor.load(path, settings)
 
 
@@ -217,13 +221,13 @@ def test_a_forged_state_is_refused(energy, level, settings, messages, tmp_path):
     arrays, facts = storage.read(path)
     facts["trees"]["object"]["nodes"][0] |= {"level": level, "energy": energy}
     storage.write(path, arrays, facts)
-    with pytest.raises(ProtocolError, match="take an older copy"):
+    with pytest.raises(ProtocolError, match="use an older copy"):
         Compressor.load(path, settings)
 
 
 def test_a_tree_is_no_compressor(settings, tmp_path):
     Compressor(settings).trees["object"].save(tmp_path / "tree")
-    with pytest.raises(ProtocolError, match="take an older copy"):
+    with pytest.raises(ProtocolError, match="use an older copy"):
         Compressor.load(tmp_path / "tree", settings)
 
 

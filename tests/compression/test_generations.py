@@ -11,7 +11,8 @@ import pytest
 from catstream.compression.compressor import Compressor
 from catstream.compression.generations import Generations
 from catstream.errors import SettingsError
-from catstream.messages import Features
+from catstream.heads import GROUPS
+from catstream.messages import Features, TrainingRows
 from catstream.settings import Settings
 
 SETTINGS = Settings(coreset={"size": 8})
@@ -24,7 +25,8 @@ def grow(rng):
     def take(compressor, count=1):
         for seq in range(compressor.seq + 1, compressor.seq + count + 1):
             rows, labels = rng.normal(size=(4, 9)).astype(np.float32), np.float32([1, 0, 0, 0.5])
-            compressor.take(Features(seq, seq - 1, 0.0, None, rows, labels, np.ones_like(labels), rows, labels))
+            training = {group: TrainingRows.of(rows, labels) for group in GROUPS}
+            compressor.take(Features(seq, seq - 1, 0.0, None, training))
         return compressor
 
     return take

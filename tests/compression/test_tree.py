@@ -194,7 +194,7 @@ def test_a_torn_file_is_refused(stream, share, tmp_path):
     grown(stream).save(path)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ProtocolError, match="take an older copy"):
+    with pytest.raises(ProtocolError, match="use an older copy"):
         CoresetTree.load(path)
 
 

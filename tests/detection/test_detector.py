@@ -41,9 +41,10 @@ def test_the_first_frame_teaches_a_leaf_of_each_tree(scene):
     track, features = Detector(settings).init(scene((60, 50)), START, time=2.5)
     assert (track.seq, track.frame, track.state, track.time) == (1, 0, "bootstrapping", 2.5)
     assert track.box == pytest.approx(START)
-    assert features.rows.shape[1] == row_length()
-    assert (features.labels == 1).sum() == settings.coreset.size
-    assert (features.labels == 0).sum() >= settings.coreset.size
+    training = features.training["appearance"]
+    assert training.rows.shape[1] == row_length()
+    assert (training.labels == 1).sum() == settings.coreset.size
+    assert (training.labels == 0).sum() >= settings.coreset.size
 
 
 def test_without_colours_no_row_tells_of_them_and_the_model_weighs_none(scene):
@@ -53,13 +54,16 @@ def test_without_colours_no_row_tells_of_them_and_the_model_weighs_none(scene):
         detector.seq = 4  # the next frame is searched for hard negatives
         _, later = detector.step(scene((62, 50)))
         for features in (first, later):
-            assert features.rows[:, COLOURS].any() == features.extents[:, COLOURS].any() == colours
+            assert {rows.rows[:, COLOURS].any() for rows in features.training.values()} == {colours}
         assert detector.model.weights[COLOURS].any() == colours
 
 
 def test_half_of_the_first_copies_are_put_on_another_background(scene):
     one, other = (
-        Detector(Settings(teaching={"other_backgrounds": share})).init(scene((60, 50)), START)[1].rows[:64]
+        Detector(Settings(teaching={"other_backgrounds": share}))
+        .init(scene((60, 50)), START)[1]
+        .training["appearance"]
+        .rows[:64]
         for share in (0, 0.5)
     )
     differ = (one != other).any(axis=1)
@@ -89,7 +93,7 @@ def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
     for _ in range(3):
         track, features = detector.step(scene())
     assert (track.state, track.box, features.box) == ("absent", None, None)
-    assert features.rows.shape == (0, row_length())
+    assert not features.training
 
 
 @pytest.mark.parametrize(("share", "state"), [(0.0, "bootstrapping"), (0.9, "absent")])
@@ -116,7 +120,7 @@ def test_what_is_found_elsewhere_teaches_only_once_it_is_trusted(scene, trust, t
     detector.step(scene())
     _, features = detector.step(scene((250, 180)))
     assert features.box.overlap(Box(250, 180, 48, 40)) > 0.6
-    assert (len(features.rows) > 0) == teaches
+    assert bool(features.training) == teaches
 
 
 def test_seq_counts_every_frame(scene):
@@ -168,7 +172,7 @@ def test_a_frame_teaches_the_same_whatever_came_before(scene):
     detector.adopt(model)
     other.resume(1, other.state_at(START, START), model)
     one, two = (stage.step(scene((60, 50)))[1] for stage in (detector, other))
-    np.testing.assert_allclose(one.rows, two.rows, atol=1e-5)
+    np.testing.assert_allclose(one.training["appearance"].rows, two.training["appearance"].rows, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -289,7 +293,7 @@ def test_what_is_in_another_place_in_each_frame_is_not_the_object(scene, learned
 def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned):
     detector = Detector(Settings())
     detector.seek(learned, START)
-    taught = [len(detector.step(scene((90, 60)))[1].rows) for _ in range(5)]
+    taught = [len(detector.step(scene((90, 60)))[1].training) for _ in range(5)]
     assert not any(taught[:2])
     assert any(taught)
 
@@ -316,7 +320,7 @@ def test_a_corrected_box_is_gone_on_with_and_teaches(scene):
     track, features = detector.correct(scene((90, 60)), Box(90, 60, 48, 40))
     assert (track.seq, track.state, track.model_version) == (2, "present", 1)
     assert track.box == Box(90, 60, 48, 40)
-    assert len(features.rows)
+    assert len(features.training["appearance"])
     assert not features.begins
     assert detector.step(scene((92, 60)))[0].box.overlap(Box(92, 60, 48, 40)) > 0.7
 

@@ -17,7 +17,7 @@ from mcap.stream_reader import StreamReader
 
 from catstream.box import Box
 from catstream.errors import RecordingError
-from catstream.messages import End, Features, Health, Model, Run, Track
+from catstream.messages import End, Features, Health, Model, Run, Track, TrainingRows
 from catstream.recording.container import MAGIC
 from catstream.recording.file import Recording, RecordingWriter
 from catstream.settings import Settings
@@ -26,7 +26,7 @@ from catstream.wire.codec import decode, encode
 
 def features(seq, value=0.5):
     rows = np.full((1, 3), value, np.float32)
-    return Features(seq, seq - 1, 0.0, None, rows, rows[0, :1], rows[0, :1], rows[:0], rows[:0, 0])
+    return Features(seq, seq - 1, 0.0, None, {"appearance": TrainingRows(rows, rows[0, :1], rows[0, :1])})
 
 
 def track(seq):
@@ -161,7 +161,7 @@ def test_what_a_restarted_compressor_took_anew_replaces_what_it_had_taken(writte
     path = written([features(1), model(1, 0), features(2), features(3, 0.125), model(2, 2)])
     written([features(3, 0.75), model(2, 2), features(4)], resume=True)
     recording = Recording(path)
-    taken = [(message.seq, float(message.rows[0, 0])) for message in recording.features()]
+    taken = [(message.seq, float(message.training["appearance"].rows[0, 0])) for message in recording.features()]
     assert taken == [(1, 0.5), (2, 0.5), (3, 0.75), (4, 0.5)]
     assert [model.version for model in recording.models()] == [1, 2]
     assert recording.missing[Features] == 0

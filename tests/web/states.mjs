@@ -20,9 +20,10 @@ const status = {
 const track = (state) => ({ frame: 210, time: 8.4, state, version: 12 });
 const box = [120, 90, 60, 50];
 const points = [...Array(40).keys()].map((n) => [n / 4, Math.sin(n / 6) / 2 + 0.5, 60 + n, 0.2, Math.floor(n / 4), n < 30]);
+const trees = (...leaves) => leaves.map((leaves, place) => ({ title: `Tree ${place}`, meaning: "what it summarises", leaves }));
 const all = {
   pipeline: 1, status, track: track("present"), picture: { frame: 210, width: 320, height: 240, box }, points,
-  trees: { leaves: { object: 13, background: 22, loss: 9, extent: 0 }, bytes: 4e6, rows: 5120 },
+  trees: { trees: trees(13, 22, 9, 0), bytes: 4e6, rows: 5120 },
   film: { frames: 90, shots: [20, 90, 160].map((frame) => ({ frame, time: frame / 25, taught: 1 + frame / 40, box, width: 320, height: 240 })) },
 };
 const changed = (more, state = "present") => ({ status: { ...status, ...more }, track: track(state) });
@@ -30,7 +31,7 @@ const changed = (more, state = "present") => ({ status: { ...status, ...more }, 
 //: What the page is told in each state, after it was told all; what is done there; in that order.
 const STATES = {
   "no pipeline": { pipeline: 0, status: { ...status, standing: "waiting", source: "", endpoint: "", reason: "no pipeline of yours is running" },
-    track: null, picture: null, trees: { leaves: {}, bytes: null, rows: null }, film: { frames: 0, shots: [] } },
+    track: null, picture: null, trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, film: { frames: 0, shots: [] } },
   "waiting for a box": { ...all, ...changed({ waiting: true }), track: null },
   bootstrapping: { ...all, ...changed({}, "bootstrapping") },
   present: { ...all },
@@ -40,7 +41,7 @@ const STATES = {
   lost: changed({ lost_seconds: 12, skipped: 40 }, "absent"),
   gone: changed({ standing: "gone" }),
   "another pipeline": { pipeline: 2, status: { ...status, source: "rtsp://10.0.0.7/stream1", endpoint: "run" }, track: null, picture: null,
-    trees: { leaves: {}, bytes: null, rows: null }, film: { frames: 0, shots: [] } },
+    trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, film: { frames: 0, shots: [] } },
   drawing: { ...all },
   stopping: {},
   "the end": changed({ standing: "ended", reason: "the source came to its end" }),

@@ -98,7 +98,7 @@ def test_the_trees_are_shown_as_the_last_health_said_after_the_end_too(board):
     board.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 200.0}), 10.1)
     board.lost("no pipeline is running")
     trees = board.news({})["trees"]
-    assert (trees["leaves"]["object"], trees["rows"]) == (3.0, 200.0)
+    assert (trees["trees"][0]["leaves"], trees["rows"]) == (3.0, 200.0)
 
 
 def followed(board, facts, endpoint):
@@ -145,7 +145,7 @@ def test_nothing_of_a_pipeline_is_left_once_another_one_is_seen(board, facts, en
     assert parts["status"]["source"] != "first.mp4"
     assert parts["film"]["shots"] == []
     assert parts["picture"] is None
-    assert not any(parts["trees"]["leaves"].values())
+    assert not any(tree["leaves"] for tree in parts["trees"]["trees"])
     assert len(parts.get("points", [])) <= 1
     assert board.picture(51) is None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from catstream.messages import Features, Model
+from catstream.messages import Model, TrainingRows
 from catstream.web.film import Film, surprise
 
 
@@ -29,9 +29,8 @@ def test_surprise_is_the_weighted_squared_error_of_the_model(rng):
     rows, labels, weights = rng.normal(size=(7, 5)), rng.uniform(size=7), rng.uniform(1, 3, 7)
     model = Model(1, 0, rng.normal(size=5).astype(np.float32), 0.25)
     narrow = [array.astype(np.float32) for array in (rows, labels, weights)]
-    features = Features(1, 0, 0.0, None, *narrow, np.empty((0, 5), np.float32), np.empty(0, np.float32))
     errors = rows @ model.weights + model.bias - labels
-    assert surprise(features, model) == pytest.approx(np.sum(weights * errors**2), rel=1e-4)
+    assert surprise(TrainingRows(*narrow), model) == pytest.approx(np.sum(weights * errors**2), rel=1e-4)
 
 
 def test_of_neighbours_only_the_one_that_taught_most_is_kept(film, facts):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import struct
+from typing import Any, Literal, get_args, get_origin
 
 import msgpack
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from catstream.box import Box
 from catstream.errors import ProtocolError
@@ -29,7 +31,9 @@ from catstream.messages import (
     Stored,
     Summary,
     Track,
+    TrainingRows,
 )
+from catstream.schema import LARGEST_INTEGER, Array, Bytes, Field, Named, OnlyWith, Whole, fields
 from catstream.wire.codec import KINDS, VERSION, decode, encode
 
 
@@ -44,30 +48,49 @@ def summary(columns: int) -> Summary:
 MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
 BOXES = Box(4.0, 2.0, 25.0, 12.5), Box(4.5, 2.0, 25.0, 12.5), Box(9.0, 2.0, 25.0, 12.5)
 DETECTOR = DetectorState("present", *BOXES, 0.9, False, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
+TRAINING = TrainingRows(array(3, 5), array(3), array(3))
+TREES = {"object": summary(5), "background": summary(5), "loss": summary(7), "extent": summary(7)}
 EXAMPLES = {
     "answer": Answer("7f", True, "followed from frame 9 on", 9, Box(4.5, 3.0, 20.0, 10.0), 4),
     "command": Command("7f", "set-box", Box(4.5, 3.0, 20.0, 10.0), True),
     "end": End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),
     "features": Features(
-        3, 2, 0.08, Box(4.5, 3.0, 20.0, 10.0), array(3, 5), array(3), array(3), array(1, 5), array(1), DETECTOR
+        3,
+        2,
+        0.08,
+        Box(4.5, 3.0, 20.0, 10.0),
+        {"appearance": TRAINING, "extent": TrainingRows(array(1, 5), array(1), array(1))},
+        DETECTOR,
     ),
     "health": Health("detector", 1.7e9, {"sent": 4.0}, "the disk is full", "walk.mp4"),
-    "model": Model(4, 20, array(5), -0.25, MOTION, array(5)),
+    "model": Model(4, 20, array(5), -0.25, MOTION, {"extent": array(5)}),
     "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2, DETECTOR),
     "preview": Preview(2, 1280, 720, Box(4.5, 3.0, 20.0, 10.0), b"\xff\xd8\xff\xe0 and so on"),
-    "run": Run("0.1.0", {"coreset.size": "64", "teaching.classifier": "joint"}),
-    "sample": Sample(4, 20, summary(5), summary(5), summary(7), summary(7), np.array([[1.0, 2.0], [np.nan, np.nan]])),
+    "run": Run("0.1.0", {"coreset.size": "64", "classifier": "joint"}),
+    "sample": Sample(4, 20, TREES, np.array([[1.0, 2.0], [np.nan, np.nan]])),
     "stored": Stored(5, 7, 2),
     "track": Track(3, 2, 0.08, "present", Box(4.5, 3.0, 20.0, 10.0), 0.75, 4, 1234.5),
 }
 MESSAGES = pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
 ALL = tuple(KINDS.values())
+FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def packed(kind: str, **changes: object) -> bytes:
     """An example as bytes, with some of its fields replaced on the wire."""
-    version, name, fields = msgpack.unpackb(encode(EXAMPLES[kind]))
-    return msgpack.packb([version, name, {**fields, **changes}])
+    return msgpack.packb([VERSION, kind, fields_of(kind) | changes])
+
+
+def fields_of(kind: str) -> dict[str, Any]:
+    """The fields of an example, as they travel."""
+    _, _, sent = msgpack.unpackb(encode(EXAMPLES[kind]))
+    return sent
+
+
+def retrained(**arrays: object) -> bytes:
+    """The example of features as bytes, with some of its training rows replaced on the wire."""
+    training = fields_of("features")["training"]
+    return packed("features", training=training | {"appearance": training["appearance"] | arrays})
 
 
 def plain(dtype: str, shape: list[int], data: bytes) -> dict[str, object]:
@@ -78,37 +101,90 @@ def test_every_kind_has_an_example():
     assert set(EXAMPLES) == set(KINDS)
 
 
-@MESSAGES
-def test_a_message_arrives_as_it_was_sent(message):
+FINITE = st.floats(-1e6, 1e6)
+SIDE = st.floats(0.5, 1e6)
+
+
+@st.composite
+def messages(draw: st.DrawFn, kind: type, width: int | None = None) -> Any:
+    """Any message of a kind that its schema allows.
+
+    width : columns of its rows; None: any
+    """
+    lengths = {"d": draw(st.integers(3, 6)) if width is None else width}
+    values = {field.name: _value(draw, field, lengths) for field in fields(kind)}
+    for field in fields(kind):
+        if (rule := field.limit(OnlyWith)) is not None:
+            wanted = values[rule.field] == rule.value
+            values[field.name] = _value(draw, dataclasses.replace(field, optional=False), lengths) if wanted else None
+    return kind(**values)
+
+
+def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
+    if field.optional and draw(st.booleans()):
+        return None
+    if field.values is not None:
+        return _map(draw, field, lengths)
+    if dataclasses.is_dataclass(field.type):
+        return draw(messages(field.type))
+    if array := field.limit(Array):
+        return draw(_arrays(array, tuple(_length(draw, side, lengths) for side in array.shape)))
+    if limits := field.limit(Bytes):
+        return limits.begin + draw(st.binary(max_size=8))
+    return draw(_plain(field))
+
+
+def _map(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> dict[str, Any]:
+    named = field.limit(Named)
+    if named is None:
+        return {name: _value(draw, field.values, lengths) for name in draw(st.sets(st.text(max_size=8), max_size=3))}
+    names = [name for name in named.columns if name in named.required or draw(st.booleans())]
+    if dataclasses.is_dataclass(field.values.type):
+        return {name: draw(messages(field.values.type, lengths["d"] + named.columns[name])) for name in names}
+    return {name: _value(draw, field.values, lengths) for name in names}
+
+
+def _length(draw: st.DrawFn, side: int | str, lengths: dict[str, int]) -> int:
+    return lengths.setdefault(side, draw(st.integers(0, 3))) if isinstance(side, str) else side
+
+
+def _arrays(limits: Array, shape: tuple[int, ...]) -> st.SearchStrategy[np.ndarray]:
+    low, high = limits.low, limits.high
+    if limits.above is not None:
+        low = limits.above + 0.5
+    numbers = st.floats(-1000 if low is None else low, 1000 if high is None else high, width=32)
+    return arrays.arrays(limits.dtype, shape, elements=numbers | st.just(np.nan) if limits.may_be_nan else numbers)
+
+
+def _plain(field: Field) -> st.SearchStrategy[Any]:
+    if get_origin(field.type) is Literal:
+        return st.sampled_from(get_args(field.type))
+    least = field.limit(Whole)
+    whole = st.integers(least.low if least else 0, LARGEST_INTEGER)
+    if get_origin(field.type) is tuple:
+        return st.lists(whole, max_size=4).map(tuple)
+    kinds = {bool: st.booleans(), int: whole, float: FINITE, str: st.text(max_size=8)}
+    return kinds[field.type] if field.type is not Box else st.builds(Box, FINITE, FINITE, SIDE, SIDE)
+
+
+@FUZZ
+@given(st.sampled_from(ALL).flatmap(messages))
+def test_every_message_that_the_schema_allows_arrives_as_it_was_sent(message):
     arrived = decode(encode(message), type(message))
     assert type(arrived) is type(message)
     np.testing.assert_equal(dataclasses.asdict(arrived), dataclasses.asdict(message))
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        Track(1, 0, 0.0, "absent", None, -0.5, 0),
-        Features(1, 0, 0.0, None, np.empty((0, 5), "<f4"), array(0), array(0), np.empty((0, 5), "<f4"), array(0)),
-        Model(1, 0, array(5), 0.0, None),
-        Position(),
-    ],
-    ids=["absent", "no rows", "no motion", "nowhere"],
-)
-def test_what_is_missing_arrives_as_missing(message):
-    np.testing.assert_equal(dataclasses.asdict(decode(encode(message), type(message))), dataclasses.asdict(message))
-
-
 def test_arrays_arrive_read_only():
     arrived = decode(encode(EXAMPLES["features"]), Features)
     with pytest.raises(ValueError, match="read-only"):
-        arrived.rows[0, 0] = 1
+        arrived.training["appearance"].rows[0, 0] = 1
 
 
 def test_arrays_travel_row_by_row_whatever_their_layout():
-    rows = np.asfortranarray(array(3, 5)).astype(">f4")
-    message = dataclasses.replace(EXAMPLES["features"], rows=np.asfortranarray(array(3, 5)))
-    np.testing.assert_array_equal(decode(encode(message), Features).rows, rows)
+    rows = TrainingRows(np.asfortranarray(array(3, 5)), array(3), array(3))
+    message = dataclasses.replace(EXAMPLES["features"], training={"appearance": rows})
+    np.testing.assert_array_equal(decode(encode(message), Features).training["appearance"].rows, array(3, 5))
 
 
 def test_a_field_of_a_later_version_is_ignored():
@@ -122,27 +198,32 @@ def test_a_message_of_another_kind_is_refused(message):
         decode(encode(message), *others)
 
 
+TREES_SENT = fields_of("sample")["trees"]
 REFUSED = {
     "a verb that is none": packed("command", verb="format"),
     "a box that nothing is done with": packed("command", verb="stop"),
     "set-box without a box": packed("command", box=None),
-    "a dtype that is not promised": packed("features", rows=plain("<f8", [3, 5], bytes(120))),
-    "objects": packed("features", rows=plain("|O", [3, 5], bytes(120))),
-    "another width of its labels": packed("features", labels=plain("<f4", [2], bytes(8))),
-    "rows in one dimension": packed("features", rows=plain("<f4", [15], bytes(60))),
-    "rows in three dimensions": packed("features", rows=plain("<f4", [1, 3, 5], bytes(60))),
-    "a negative side": packed("features", rows=plain("<f4", [-3, -5], bytes(60))),
-    "less data than its shape": packed("features", rows=plain("<f4", [3, 5], bytes(59))),
-    "a side of 2**63": packed("features", rows=plain("<f4", [0, 2**63], b"")),
-    "sides whose product is huge": packed("features", rows=plain("<f4", [2**32, 2**32], bytes(60))),
-    "NaN in an array": packed("features", rows=plain("<f4", [3, 5], struct.pack("<f", np.nan) * 15)),
+    "a dtype that is not promised": retrained(rows=plain("<f8", [3, 5], bytes(120))),
+    "objects": retrained(rows=plain("|O", [3, 5], bytes(120))),
+    "another width of its labels": retrained(labels=plain("<f4", [2], bytes(8))),
+    "rows in one dimension": retrained(rows=plain("<f4", [15], bytes(60))),
+    "rows in three dimensions": retrained(rows=plain("<f4", [1, 3, 5], bytes(60))),
+    "a negative side": retrained(rows=plain("<f4", [-3, -5], bytes(60))),
+    "less data than its shape": retrained(rows=plain("<f4", [3, 5], bytes(59))),
+    "a side of 2**63": retrained(rows=plain("<f4", [0, 2**63], b"")),
+    "sides whose product is huge": retrained(rows=plain("<f4", [2**32, 2**32], bytes(60))),
+    "NaN in an array": retrained(rows=plain("<f4", [3, 5], struct.pack("<f", np.nan) * 15)),
     "infinity in an array": packed("model", weights=plain("<f4", [1], struct.pack("<f", np.inf))),
     "NaN as a number": packed("track", score=np.nan),
     "infinity as a counter": packed("health", counters={"rate": np.inf}),
-    "a fit below 0": packed("features", fits=plain("<f4", [1], struct.pack("<f", -0.5))),
-    "a label above 1": packed("features", labels=plain("<f4", [3], struct.pack("<3f", 0, 1, 1.5))),
-    "a weight of 0": packed("features", weights=plain("<f4", [3], bytes(12))),
-    "a tree of another width": packed("sample", loss=msgpack.unpackb(packed("sample"))[2]["object"]),
+    "a label below 0": retrained(labels=plain("<f4", [3], struct.pack("<3f", 0, 1, -0.5))),
+    "a label above 1": retrained(labels=plain("<f4", [3], struct.pack("<3f", 0, 1, 1.5))),
+    "a weight of 0": retrained(weights=plain("<f4", [3], bytes(12))),
+    "a tree of another width": packed("sample", trees=TREES_SENT | {"loss": TREES_SENT["object"]}),
+    "a sample without the object's tree": packed("sample", trees={"loss": TREES_SENT["loss"]}),
+    "a tree of no head": packed("sample", trees=TREES_SENT | {"corner": TREES_SENT["loss"]}),
+    "training rows of no group": packed("features", training={"corner": {}}),
+    "rows of another width in another group": retrained(rows=plain("<f4", [3, 4], bytes(48))),
     "a picture that is no JPEG": packed("preview", jpeg=b"<svg onload=...>"),
     "a picture above its limit": packed("preview", jpeg=b"\xff\xd8\xff" + bytes(1 << 19)),
     "a frame without width": packed("preview", width=0),
@@ -159,19 +240,19 @@ REFUSED = {
     "nothing": b"",
     "half a message": encode(EXAMPLES["features"])[:-20],
     "more than a message": encode(EXAMPLES["track"]) + b"\x00",
-    "a name twice in a map": b"\x93\x01\xa3end\x82\xa3seq\x01\xa3seq\x02",
-    "a map of bytes": b"\x93\x01\xa3end\x82\xc4\x03seq\x01\xa6reason\xa1x",
-    "a list of four thousand million": b"\x93\x01\xa3end\xdd\xff\xff\xff\xff",
-    "a map of four thousand million": b"\x93\x01\xa3end\xdf\xff\xff\xff\xff",
-    "bytes of four gigabytes": b"\x93\x01\xa3end\xc6\xff\xff\xff\xff",
-    "a text of four gigabytes": b"\x93\x01\xdb\xff\xff\xff\xff",
+    "a name twice in a map": b"\x93\x02\xa3end\x82\xa3seq\x01\xa3seq\x02",
+    "a map of bytes": b"\x93\x02\xa3end\x82\xc4\x03seq\x01\xa6reason\xa1x",
+    "a list of four thousand million": b"\x93\x02\xa3end\xdd\xff\xff\xff\xff",
+    "a map of four thousand million": b"\x93\x02\xa3end\xdf\xff\xff\xff\xff",
+    "bytes of four gigabytes": b"\x93\x02\xa3end\xc6\xff\xff\xff\xff",
+    "a text of four gigabytes": b"\x93\x02\xdb\xff\xff\xff\xff",
     "a list longer than any message's": msgpack.packb([VERSION, "end", [None] * 257]),
     "a reason longer than a page": packed("end", reason="x" * 4097),
-    "an extension type": b"\x93\x01\xa3end\xd4\x05\x00",
-    "a timestamp": b"\x93\x01\xa3end\xd6\xff\x00\x00\x00\x00",
+    "an extension type": b"\x93\x02\xa3end\xd4\x05\x00",
+    "a timestamp": b"\x93\x02\xa3end\xd6\xff\x00\x00\x00\x00",
     "lists in lists, as version": b"\x93" + b"\x91" * 1015 + b"\x90\xa3end\x80",
-    "lists in lists, as kind": b"\x93\x01" + b"\x91" * 1015 + b"\x90\x80",
-    "lists in lists, as fields": b"\x93\x01\xa3end" + b"\x91" * 1015 + b"\x90",
+    "lists in lists, as kind": b"\x93\x02" + b"\x91" * 1015 + b"\x90\x80",
+    "lists in lists, as fields": b"\x93\x02\xa3end" + b"\x91" * 1015 + b"\x90",
     "lists in lists without end": b"\x91" * 100_000,
 }
 
@@ -185,8 +266,10 @@ def test_what_breaks_a_promise_is_refused_on_arrival(data):
 @pytest.mark.parametrize(
     "message",
     [
-        dataclasses.replace(EXAMPLES["features"], rows=array(3, 5, dtype="<f8")),
-        dataclasses.replace(EXAMPLES["features"], labels=array(4)),
+        dataclasses.replace(
+            EXAMPLES["features"], training={"extent": TrainingRows(array(3, 5, dtype="<f8"), array(3), array(3))}
+        ),
+        dataclasses.replace(EXAMPLES["features"], training={"extent": TrainingRows(array(3, 5), array(4), array(3))}),
         dataclasses.replace(EXAMPLES["track"], score=float("nan")),
         dataclasses.replace(EXAMPLES["track"], seq=-1),
     ],
@@ -213,7 +296,6 @@ VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
     max_leaves=8,
 )
-FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def decoded_or_refused(data: bytes) -> None:
@@ -226,16 +308,16 @@ def decoded_or_refused(data: bytes) -> None:
 
 
 @FUZZ
-@given(st.sampled_from(sorted(EXAMPLES)), st.data())
+@given(st.sampled_from(ALL), st.data())
 def test_any_value_in_any_field_arrives_whole_or_is_refused(kind, data):
-    version, name, fields = msgpack.unpackb(encode(EXAMPLES[kind]))
-    place = fields
+    version, name, sent = msgpack.unpackb(encode(data.draw(messages(kind))))
+    place = sent
     while isinstance(inner := place[key := data.draw(st.sampled_from(sorted(place)))], dict) and inner:
         if data.draw(st.booleans()):
             break
         place = inner
     place[key] = data.draw(VALUES)
-    decoded_or_refused(msgpack.packb([version, name, fields]))
+    decoded_or_refused(msgpack.packb([version, name, sent]))
 
 
 @FUZZ

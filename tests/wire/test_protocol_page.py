@@ -1,25 +1,34 @@
-"""docs/protocol.md says what the wire does: a channel or a field that it leaves out fails here."""
+"""docs/protocol.md says what the wire does: a channel or a field that it leaves out fails here.
+
+Run as a program, it writes the tables of the messages and of the heads anew: `make protocol`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 import select
 import subprocess
 import sys
 from pathlib import Path
+from typing import Literal, get_args, get_origin
 
 import pytest
 
 from catstream.box import Box
-from catstream.messages import DetectorState, End, Motion, Stored, Summary, Track
+from catstream.heads import HEADS
+from catstream.messages import DetectorState, End, Motion, Stored, Summary, Track, TrainingRows
+from catstream.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Bytes, Named, OnlyWith, Whole, fields
 from catstream.wire import codec
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
 
-PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
-MESSAGES = [*codec.KINDS.values(), DetectorState, Summary, Motion]
+PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
+PAGE = PATH.read_text()
+MESSAGES = [*codec.KINDS.values(), DetectorState, Motion, Summary, TrainingRows]
+PLAIN = {int: "whole number", float: "number", str: "text", bool: "boolean", Box: "box"}
 
 
 def block(language):
@@ -27,11 +36,71 @@ def block(language):
     return re.search(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)[1]
 
 
-def fields(name):
-    """Type of each field in the table of a message."""
-    section = re.search(rf"^### `{name}`\n(.*?)(?=^##|\Z)", PAGE, re.DOTALL | re.MULTILINE)
-    assert section, f"docs/protocol.md has no section on {name}"
-    return dict(re.findall(r"^\| `(\w+)` \| ([^|]+?) \|", section[1], re.MULTILINE))
+def table(kind):
+    """The table of the fields of a message: types and limits from its schema, meanings from its docstring."""
+    meanings = dict(
+        re.findall(r"^(\w+)(?: : .*\n +|  +)(\S.*(?:\n +\S.*)*)", inspect.cleandoc(kind.__doc__), re.MULTILINE)
+    )
+    rows = []
+    for field in fields(kind):
+        meaning = re.sub(r"\s+", " ", meanings[field.name]).replace("None", "nil").replace("|", "\\|").rstrip(".")
+        rows.append(f"| `{field.name}` | {described(field)} | {meaning} |\n")
+    return "".join(["| field | type | meaning |\n| --- | --- | --- |\n", *rows])
+
+
+def described(field):
+    """The type of a field and its limits, in words."""
+    if (rule := field.limit(OnlyWith)) is not None:
+        return f"{kind_of(field)} with `{rule.field}` `{rule.value}`, otherwise nil"
+    return kind_of(field) + (" or nil" if field.optional else "")
+
+
+def kind_of(field):
+    if field.values is not None:
+        return f"map of {names_of(field.limit(Named))} to {kind_of(field.values)}"
+    if dataclasses.is_dataclass(field.type):
+        return f"`{field.type.__name__.lower()}`"
+    if array := field.limit(Array):
+        return f"{array.dtype} ({', '.join(map(str, array.shape))}){range_of(array)}"
+    if limits := field.limit(Bytes):
+        return f"bytes, {limits.kind} of at most {limits.longest}"
+    if get_origin(field.type) is Literal:
+        return f"text: {', '.join(f'`{value}`' for value in get_args(field.type))}"
+    if get_origin(field.type) is tuple:
+        return "array of whole numbers"
+    least = field.limit(Whole)
+    return PLAIN[field.type] + (f", at least {least.low}" if least else "")
+
+
+def names_of(named):
+    if named is None:
+        return "text"
+    return ", ".join(f"`{name}`" + (" (always)" if name in named.required else "") for name in named.columns)
+
+
+def range_of(array):
+    """The range of the numbers of an array."""
+    between = f", from {array.low} to {array.high}" if array.low is not None else ""
+    above = f", above {array.above}" if array.above is not None else ""
+    return between + above + (", may be NaN" if array.may_be_nan else "")
+
+
+def heads_table():
+    rows = [
+        f"| `{name}` | `{head.group}` | {'all' if head.label is None else f'label {head.label:g}'} | "
+        f"{'d + 2' if head.more_columns else 'd'} | {'score' if head.adds_to_score else f'`heads.{name}`'} |\n"
+        for name, head in HEADS.items()
+    ]
+    head = "| head | group of training rows | rows | columns of its tree | adds to |\n| --- | --- | --- | --- | --- |\n"
+    return head + "".join(rows)
+
+
+def section(kind):
+    """Where the page has the table of a message."""
+    name = kind.__name__.lower()
+    found = re.compile(rf"(^### `{name}`\n(?:(?!^###? ).*\n)*?)((?:^\|.*\n)+)", re.MULTILINE)
+    assert found.search(PAGE), f"docs/protocol.md has no table in a section on {name}"
+    return found
 
 
 @pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
@@ -46,23 +115,19 @@ def test_every_channel_has_its_row(channel):
 
 
 @pytest.mark.parametrize("kind", MESSAGES, ids=lambda kind: kind.__name__.lower())
-def test_every_field_has_its_row(kind):
-    names = [field.name for field in dataclasses.fields(kind)]
-    assert list(fields(kind.__name__.lower())) == names, "docs/protocol.md, in the order of catstream.messages"
+def test_the_table_of_a_message_is_what_its_schema_says(kind):
+    assert section(kind).search(PAGE)[2] == table(kind), "docs/protocol.md is not the schema: run `make protocol`"
 
 
-@pytest.mark.parametrize("kind", codec._ARRAYS, ids=lambda kind: kind.__name__.lower())
-def test_every_array_has_its_type_and_shape(kind):
-    types = fields(kind.__name__.lower())
-    for name, (dtype, shape) in codec._ARRAYS[kind].items():
-        assert types[name].removesuffix(" or nil") == f"{dtype.name} ({', '.join(map(str, shape))})"
+def test_the_table_of_heads_is_that_of_the_library():
+    assert heads_table() in PAGE, "docs/protocol.md is not the table of heads: run `make protocol`"
 
 
 def test_the_limits_are_those_of_the_codec():
-    text = f"Text is at most {codec._LONGEST_TEXT} bytes, a list or map at most {codec._LONGEST_LIST} entries"
+    text = f"Text is at most {LONGEST_TEXT} bytes, a list or map at most {LONGEST_LIST} entries"
     assert text in PAGE
     assert f"The version is {codec.VERSION}." in PAGE
-    assert codec._LARGEST_INTEGER == 2**53
+    assert LARGEST_INTEGER == 2**53
 
 
 def test_the_example_in_bytes_is_what_travels():
@@ -97,3 +162,9 @@ def test_the_subscriber_of_the_page_hears_every_track(endpoint, until):
 def heard(stream):
     """Whether there is something to read."""
     return select.select([stream], [], [], 0.05)[0]
+
+
+if __name__ == "__main__":
+    for kind in MESSAGES:
+        PAGE = section(kind).sub(lambda found, kind=kind: found[1] + table(kind), PAGE)
+    PATH.write_text(re.sub(r"^\| head \|.*\n(\|.*\n)+", lambda _: heads_table(), PAGE, flags=re.MULTILINE))

@@ -414,7 +414,7 @@ def test_the_end_comes_through_like_any_other_message(endpoint, until):
 
 def test_what_was_sent_last_arrives_though_its_sender_closes_at_once(endpoint, until):
     tree, loss = (Summary(np.ones((200, d), np.float32), np.ones(d, np.float32), 200, (0,)) for d in (2000, 2002))
-    large = Sample(1, 0, tree, tree, loss, None, np.empty((0, 2)))
+    large = Sample(1, 0, {"object": tree, "background": tree, "loss": loss}, np.empty((0, 2)))
 
     def run():
         heard = []

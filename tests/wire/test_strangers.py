@@ -11,10 +11,23 @@ import zmq
 
 from catstream.compression.compressor import Compressor
 from catstream.errors import ProtocolError
-from catstream.messages import Command, End, Features, Health, Model, Position, Preview, Run, Sample, Stored, Track
+from catstream.messages import (
+    Command,
+    End,
+    Features,
+    Health,
+    Model,
+    Position,
+    Preview,
+    Run,
+    Sample,
+    Stored,
+    Track,
+    TrainingRows,
+)
 from catstream.settings import Settings
 from catstream.wire.channels import CHANNELS
-from catstream.wire.codec import encode
+from catstream.wire.codec import VERSION, encode
 from catstream.wire.refusals import refusals
 from catstream.wire.sockets import Publisher, Receiver, Responder, Sender, Subscriber
 
@@ -23,16 +36,19 @@ PUBLISHED = [name for name, channel in CHANNELS.items() if not channel.acknowled
 
 
 def features(seq, width=5, rows=3):
-    return Features(
-        seq, seq, 0.0, None, np.ones((rows, width), "f4"), np.ones(rows, "f4"), np.ones(rows, "f4"),
-        np.ones((0, width), "f4"), np.ones(0, "f4"),
-    )  # fmt: skip
+    return Features(seq, seq, 0.0, None, {"appearance": TrainingRows.of(np.ones((rows, width)), 1)})
 
 
 def changed(message, **fields):
     """A message as bytes, with some of its fields replaced on the wire."""
     version, kind, plain = msgpack.unpackb(encode(message))
     return msgpack.packb([version, kind, plain | fields])
+
+
+def retrained(**arrays):
+    """Features as bytes, with some of their training rows replaced on the wire."""
+    _, _, plain = msgpack.unpackb(encode(features(1)))
+    return changed(features(1), training={"appearance": plain["training"]["appearance"] | arrays})
 
 
 def rows(dtype, shape, number=1.0):
@@ -44,14 +60,14 @@ def rows(dtype, shape, number=1.0):
 WRONG = {
     "msgpack": [b"GET / HTTP/1.1"],
     "envelope": [msgpack.packb({"seq": 1})],
-    "version": [msgpack.packb([2, "features", {}])],
+    "version": [msgpack.packb([VERSION + 1, "features", {}])],
     "kind": [encode(Health("trainer", 0.0))],
     "type": [changed(features(1), seq="1")],
-    "dtype": [changed(features(1), rows=rows("<f8", [3, 5]))],
-    "shape": [changed(features(1), rows=rows("<f4", [2, 5]))],
+    "dtype": [retrained(rows=rows("<f8", [3, 5]))],
+    "shape": [retrained(rows=rows("<f4", [2, 5]))],
     "width": [encode(features(2, width=6))],
-    "finite": [changed(features(1), rows=rows("<f4", [3, 5], float("nan")))],
-    "range": [changed(features(1), labels=rows("<f4", [3], 2.0))],
+    "finite": [retrained(rows=rows("<f4", [3, 5], float("nan")))],
+    "range": [retrained(labels=rows("<f4", [3], 2.0))],
     "sequence": [encode(features(2**40))],
     "parts": [b"", encode(features(2))],
 }

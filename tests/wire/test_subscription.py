@@ -12,7 +12,7 @@ import pytest
 import catstream
 from catstream.box import Box
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import End, Features, Health, Model, Run, Track
+from catstream.messages import End, Features, Health, Model, Run, Track, TrainingRows
 from catstream.wire.announced import Announcement, readers_of
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
@@ -29,7 +29,7 @@ def model(version):
 
 def features(seq):
     rows = np.full((2, 5), seq, np.float32)
-    return Features(seq, seq - 1, 0.0, None, rows, rows[:, 0] * 0, rows[:, 0], rows[:0], rows[:0, 0])
+    return Features(seq, seq - 1, 0.0, None, {"appearance": TrainingRows.of(rows, 0, seq)})
 
 
 @pytest.fixture
@@ -152,7 +152,7 @@ def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, un
         subscription.timeout = 20
         heard = list(subscription)
     assert [message.seq for message in heard] == [3, 4, 7]
-    assert np.array_equal(heard[0].rows, features(3).rows)
+    assert np.array_equal(heard[0].training["appearance"].rows, features(3).training["appearance"].rows)
     assert subscription.missed == 2 + 2 + 1
     assert subscription.missed_before == 2
     assert subscription.losses() == "5 missed, 2 of them before this subscriber connected"
@@ -164,7 +164,7 @@ def test_what_nobody_listens_to_is_not_even_made(endpoint, until):
         lessons.send(no_message)
         with catstream.subscribe(str(endpoint), "features"):
             until(lambda: lessons.heard, lessons.welcome)
-            with pytest.raises(KeyError):
+            with pytest.raises(TypeError):
                 lessons.send(no_message)
         until(lambda: not lessons.heard, lessons.welcome)
         lessons.send(no_message)

@@ -3,37 +3,35 @@
 
 import { figure, make } from "./svg.js";
 
-const TREES = { object: "accent", background: "blue", loss: "violet", extent: "green" };
-const MEANING = {
-  object: ["Object", "what the object has looked like"],
-  background: ["Background", "what is around it"],
-  loss: ["Object or background", "both, with the score that each should get: the score is learned from these"],
-  extent: ["Size and shape", "boxes that fit the object, and boxes too large, small, wide or narrow: the box is learned from these"],
-};
+const TONES = ["accent", "blue", "violet", "green"];
 const [HEIGHT, EDGE] = [120, 8];
 const CLOSEST = 7; // pixels between two nodes of a level that is still drawn
 
 export class Trees {
   constructor(element, kept) {
+    this.element = element;
     this.kept = kept;
-    this.trees = Object.entries(TREES).map(([name, tone]) => {
-      const drawing = make("svg", { role: "img" });
-      const parts = figure("tree", "", tone, drawing);
-      const [label, meaning] = MEANING[name];
-      parts.left.textContent = label;
-      parts.left.className = "label";
-      parts.caption.append(Object.assign(document.createElement("small"), { textContent: meaning }));
-      element.append(parts.element);
-      return { name, drawing, ...parts, leaves: -1 };
-    });
+    this.trees = [];
   }
 
-  show({ leaves, rows, bytes }) {
+  /** Show the trees that the pipeline has, by the table of heads: a figure for each, made when it is first received. */
+  show({ trees, rows, bytes }) {
     this.kept.textContent = rows ? `${rows.toLocaleString("en")} rows in ${(bytes / 1e6).toFixed(1)} MB.` : "";
-    for (const tree of this.trees) {
-      const count = leaves[tree.name] ?? 0;
+    for (const [place, { title, meaning, leaves }] of trees.entries()) {
+      const tree = this.trees[place] ??= this.add(title, meaning, TONES[place % TONES.length]);
+      const count = leaves ?? 0;
       if (count !== tree.leaves) this.draw(tree, count);
     }
+  }
+
+  add(title, meaning, tone) {
+    const drawing = make("svg", { role: "img" });
+    const parts = figure("tree", "", tone, drawing);
+    parts.left.textContent = title;
+    parts.left.className = "label";
+    parts.caption.append(Object.assign(document.createElement("small"), { textContent: meaning }));
+    this.element.append(parts.element);
+    return { drawing, ...parts, leaves: -1 };
   }
 
   redraw() {
