@@ -151,11 +151,11 @@ def load(record: Record) -> Iterator[Table]:
 
 def limit(record: Record) -> Iterator[Table]:
     """Of the search for the highest rate: the highest that held its limits, and the lowest that did not."""
-    held = [step for step in record["steps"] if not step["broken"]]
-    broken = [step for step in record["steps"] if step["broken"]]
+    held = [step for step in record["steps"] if not step["violations"]]
+    broken = [step for step in record["steps"] if step["violations"]]
     bounds = [max(held, key=_due, default=None), min(broken, key=_due, default=None)]
     rows = [
-        (_due(step), step["followed"], 1000 * step["track"]["p99"], "broken" if step["broken"] else "held")
+        (_due(step), step["followed"], 1000 * step["track"]["p99"], "broken" if step["violations"] else "held")
         for step in bounds
         if step is not None
     ]

@@ -1,4 +1,4 @@
-"""What subscribers cost a pipeline: frames a second with many attached, some of them frozen, beside none attached.
+"""What subscribers cost a pipeline: frames a second with many connected, some of them frozen, beside none connected.
 
 All runs follow the same rendered video. The readers run where a core is idle: what is measured is the
 pipeline, not what readers do with a track.
@@ -20,7 +20,7 @@ from table import Table, command, publish
 
 import catstream
 from catstream.errors import SilenceError
-from catstream.loadtest.crowd import Crowd
+from catstream.loadtest.subscribers import Subscribers
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.wire.endpoint import private_folder
@@ -38,7 +38,7 @@ class Run:
     work     of each process: seconds of processor time, when last seen
     joined   seconds until each late joiner had the last model
     frozen   seconds for which the frozen readers were that
-    heard    tracks that each other reader heard
+    received    tracks that each other reader received
     """
 
     moments: list[float] = field(default_factory=list)
@@ -46,7 +46,7 @@ class Run:
     work: dict[str, float] = field(default_factory=dict)
     joined: list[float] = field(default_factory=list)
     frozen: float = 0.0
-    heard: list[int] = field(default_factory=list)
+    received: list[int] = field(default_factory=list)
 
     @property
     def rate(self) -> float:
@@ -65,15 +65,15 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
     columns = ("subscribers", "frozen", "for s", "frames", "frames/s", "slowest run", "ratio")
     base, rows = median(run.rate for run in alone), []
-    for all_runs, attached, stopped in ((alone, 0, 0), (beside, readers, frozen)):
+    for all_runs, connected, stopped in ((alone, 0, 0), (beside, readers, frozen)):
         rate, seconds = median(run.rate for run in all_runs), median(run.frozen for run in all_runs)
-        rows.append((attached, stopped, seconds, frames, rate, min(run.rate for run in all_runs), rate / base))
+        rows.append((connected, stopped, seconds, frames, rate, min(run.rate for run in all_runs), rate / base))
     yield Table("Frames a second", columns, rows, f"median of {runs} runs each, made in turn")
 
     columns = ("subscribers", "process", "MB at a quarter", "MB at the end", "most", "CPU ms a frame")
     rows = [
-        (attached, name, seen[len(seen) // 4], seen[-1], max(seen), 1000 * run.work[name] / frames)
-        for attached, run in ((0, alone[-1]), (readers, beside[-1]))
+        (connected, name, seen[len(seen) // 4], seen[-1], max(seen), 1000 * run.work[name] / frames)
+        for connected, run in ((0, alone[-1]), (readers, beside[-1]))
         for name, seen in run.memory.items()
     ]
     yield Table("Processes", columns, rows, "of the last runs; the coreset trees grow with the logarithm of the frames")
@@ -83,18 +83,18 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     rows = [(len(joined), median(joined) if joined else None, max(joined, default=None))]
     yield Table("Until a late joiner has the last model", columns, rows, "its sockets included")
 
-    heard = [count for run in beside for count in run.heard]
+    received = [count for run in beside for count in run.received]
     columns = ("readers", "frames", "median", "least")
-    rows = [(len(heard), frames, median(heard), min(heard))]
+    rows = [(len(received), frames, median(received), min(received))]
     yield Table(
-        "Tracks heard by readers that were not frozen", columns, rows, "they attach while the first frames pass"
+        "Tracks received by readers that were not frozen", columns, rows, "they attach while the first frames pass"
     )
 
 
 def travel(frames: int, readers: int, frozen: int) -> Run:
     """Run a pipeline to the end of the video, with readers that attach as it starts."""
     sequence, run, ended = rendered(frames, SIZE), Run(), threading.Event()
-    with private_folder() as folder, Crowd(str(folder), readers, frozen=frozen) as crowd:
+    with private_folder() as folder, Subscribers(str(folder), readers, frozen=frozen) as group:
         late = threading.Thread(target=join, args=(str(folder), ended, run.joined))
         with Pipeline(video(sequence), sequence.boxes[0], Settings(run={"endpoint": str(folder)})) as pipeline:
             try:
@@ -103,15 +103,15 @@ def travel(frames: int, readers: int, frozen: int) -> Run:
                     if readers and track.model_version and late.ident is None:
                         late.start()
                     if track.frame % (frames // 50 + 1) == 0:
-                        crowd.freeze()
+                        group.freeze()
                         for name, pid in pipeline.pids.items():
                             look(run, name, pid)
             finally:
                 ended.set()
                 if late.ident is not None:
                     late.join()
-        crowd.wait()
-        run.frozen, run.heard = crowd.frozen_seconds, crowd.heard()
+        group.wait()
+        run.frozen, run.received = group.frozen_seconds, group.received()
     return run
 
 
@@ -139,7 +139,7 @@ def join(endpoint: str, ended: threading.Event, seconds: list[float]) -> None:
 if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--frames", type=int, default=4_000, help="of each run (default: %(default)s)")
-    parser.add_argument("--readers", type=int, default=200, help="subscribers attached (default: %(default)s)")
+    parser.add_argument("--readers", type=int, default=200, help="subscribers connected (default: %(default)s)")
     parser.add_argument("--frozen", type=int, default=20, help="of them frozen (default: %(default)s)")
     parser.add_argument("--runs", type=int, default=2, help="with and without each (default: %(default)s)")
     options = parser.parse_args()

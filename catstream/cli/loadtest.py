@@ -21,8 +21,8 @@ from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.loadtest.limits import Limit
+    from catstream.loadtest.load_test import Step
     from catstream.loadtest.run import Result
-    from catstream.loadtest.trial import Step
 
 __all__ = ["loadtest"]
 
@@ -108,10 +108,10 @@ def loadtest(
     # Here, so that --help and the other verbs need not wait for these.
     from catstream.loadtest.figures import to_json
     from catstream.loadtest.limits import Limit
+    from catstream.loadtest.load_test import run_load_test
     from catstream.loadtest.plan import Plan
     from catstream.loadtest.report import write_report
-    from catstream.loadtest.run import News
-    from catstream.loadtest.trial import hold
+    from catstream.loadtest.run import Status
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     plan = Plan(streams, subscribers, slow, rate, duration, size, chaos, settings)
@@ -122,30 +122,34 @@ def loadtest(
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("starting", total=1.0, figures="")
 
-        def tell(news: News) -> None:
-            progress.update(task, description=news.doing, completed=news.share, figures=news.figures)
+        def report_status(news: Status) -> None:
+            progress.update(task, description=news.activity, completed=news.share, figures=news.figures)
 
-        def tried(step: Step) -> None:
+        def step_done(step: Step) -> None:
             if find_limit:
                 console.print(_step(step))
 
-        trial = hold(plan, asked, find=find_limit, tell=tell, tried=tried)
-    if trial.steps:
-        _print(console, trial.result, asked)
+        load_test = run_load_test(plan, asked, find=find_limit, report_status=report_status, step_done=step_done)
+    if load_test.steps:
+        _print(console, load_test.result, asked)
         if json_file is not None:
-            json_file.write_text(json.dumps(to_json(trial), indent=1) + "\n", encoding="utf-8")
+            json_file.write_text(json.dumps(to_json(load_test), indent=1) + "\n", encoding="utf-8")
         if output is not None:
-            trial.result.track.write(output / "track.hgrm")
-            trial.result.model.write(output / "model.hgrm")
-            console.print(f"report: {write_report(output / 'report.html', trial)}", soft_wrap=True)
-    if trial.interrupted:
-        console.print("stopped: these are the figures so far" if trial.steps else "stopped: nothing was measured yet")
+            load_test.result.track.write(output / "track.hgrm")
+            load_test.result.model.write(output / "model.hgrm")
+            console.print(f"report: {write_report(output / 'report.html', load_test)}", soft_wrap=True)
+    if load_test.interrupted:
+        console.print(
+            "stopped: these are the figures so far" if load_test.steps else "stopped: nothing was measured yet"
+        )
         sys.exit(INTERRUPTED)
-    if trial.found:
-        console.print(f"the highest rate that holds {', '.join(map(str, asked))}: {trial.found:g} frames/s a stream")
-    for line in trial.broken:
+    if load_test.highest_rate:
+        console.print(
+            f"the highest rate that holds {', '.join(map(str, asked))}: {load_test.highest_rate:g} frames/s a stream"
+        )
+    for line in load_test.violations:
         click.echo(f"catstream: broken: {line}", err=True)
-    if trial.broken:
+    if load_test.violations:
         sys.exit(_BROKEN)
 
 
@@ -161,7 +165,7 @@ def _writable(json_file: Path | None, output: Path | None) -> None:
 
 
 def _step(step: Step) -> str:
-    verdict = f"[red]{'; '.join(step.broken)}[/]" if step.broken else "[green]holds[/]"
+    verdict = f"[red]{'; '.join(step.violations)}[/]" if step.violations else "[green]holds[/]"
     p99 = _ms(step.result.track["p99"])
     return f"{step.rate:g} frames/s due, {step.followed:.1f} followed, p99 {p99} ms: {verdict}"
 
@@ -184,14 +188,14 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
                         *(f"{found[key]:.2f}" for key in ("cores", "cores_most")),
                         *(f"{found[key] / 1e6:.0f}" for key in ("memory", "memory_most")),
                     )
-                    for name, found in ((name, summary(samples)) for name, samples in result.usage.items())
+                    for name, found in ((name, summary(readings)) for name, readings in result.usage.items())
                 ],
             )
         )
     if plan.subscribers:
         console.print(
             f"subscribers: {plan.subscribers * plan.streams}, {plan.slow * plan.streams} of them slow or frozen; the "
-            f"others heard {sum(result.heard)} tracks and missed {sum(result.missed)}"
+            f"others received {sum(result.received)} tracks and missed {sum(result.missed)}"
         )
     if plan.chaos:
         rows = [
@@ -199,13 +203,13 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
             for recovery in result.recoveries
         ]
         console.print(_table((f"{len(rows)} killed", "s to the next track", "s to the next model"), rows))
-    if result.others > _QUIET_CORES:
+    if result.other_load > _QUIET_CORES:
         console.print(
-            f"others kept {result.others:.1f} cores busy meanwhile: for figures to rely on, run it on a quiet machine"
+            f"other processes kept {result.other_load:.1f} cores busy: run it on a quiet machine for reliable figures"
         )
     for limit in limits:
-        mark = "[green]held[/]" if limit.held(result) else "[red]broken[/]"
-        console.print(f"{mark}: {limit.told(result)}")
+        mark = "[green]held[/]" if limit.is_met(result) else "[red]broken[/]"
+        console.print(f"{mark}: {limit.describe(result)}")
 
 
 def _streams(result: Result) -> Table:
@@ -222,7 +226,7 @@ def _streams(result: Result) -> Table:
                 f"{100 * measures.skipped_share:.1f} %",
                 *(_ms(measures.track[name]) for name in PERCENTILES),
                 *(_ms(measures.model[name]) for name in ("p50", "p99")),
-                measures.most_lag,
+                measures.max_lag,
                 stored,
                 "-" if measures.success is None else f"{measures.success:.3f}",
             )

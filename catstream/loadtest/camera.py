@@ -41,14 +41,14 @@ class Camera:
 
     def __init__(self, streams: int, size: tuple[int, int], pictures: int) -> None:
         self._pipe, other = SPAWN.Pipe()
-        self._process = SPAWN.Process(target=_film, args=(other, streams, size, pictures, os.getpid()))
+        self._process = SPAWN.Process(target=_run_camera, args=(other, streams, size, pictures, os.getpid()))
         self._other = other
 
     def render(self, done: Callable[[int], None] = lambda _: None) -> None:
         """Wait until all is rendered; `done` is called with the number of pictures so far."""
-        while isinstance(news := self._answer(), int):
-            done(news)
-        self.urls, boxes = news
+        while isinstance(message := self._receive(), int):
+            done(message)
+        self.urls, boxes = message
         self.truth = np.array([box or (np.nan,) * 4 for box in boxes])
 
     @property
@@ -64,16 +64,16 @@ class Camera:
     def late(self) -> float:
         """Seconds by which it sent a frame of this schedule too late at most, by its own fault."""
         self._pipe.send(None)
-        return self._answer()
+        return self._receive()
 
-    def stand_still(self) -> None:
+    def show_still(self) -> None:
         """Show the first picture, at the video's own rate."""
         self.play(Schedule(monotonic(), demo.RATE, frames=1))
 
     def play(self, schedule: Schedule) -> list[Schedule]:
         """Show the video from the start of a schedule on; returns the schedule of each stream."""
         self._pipe.send(schedule)
-        return self._answer()
+        return self._receive()
 
     def __enter__(self) -> Self:
         start(self._process)
@@ -85,14 +85,14 @@ class Camera:
         self._process.join()
         self._pipe.close()
 
-    def _answer(self) -> Any:
+    def _receive(self) -> Any:
         try:
             return self._pipe.recv()
         except (EOFError, ConnectionError):
             raise ServiceError("the camera of the load test has died: its last words are above") from None
 
 
-def _film(pipe: Connection, streams: int, size: tuple[int, int], pictures: int, parent: int) -> None:
+def _run_camera(pipe: Connection, streams: int, size: tuple[int, int], pictures: int, parent: int) -> None:
     die_with(parent)
     files, boxes = [], []
     for image, box in demo.render(pictures, size):

@@ -14,7 +14,7 @@ from catstream.loadtest.stream import Stream
 __all__ = ["Chaos", "Kill"]
 
 _PAUSE_SECONDS = 4.0  # from one kill to the next, on average
-_MOST, _PER_SECONDS = 4, 60.0  # of one process: a supervisor gives up after more than five
+_MAX_KILLS, _PER_SECONDS = 4, 60.0  # of one process: a supervisor gives up after more than five
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,23 +42,23 @@ class Chaos:
         self._random = random.Random(seed)
         self._due = monotonic() + self._pause()
 
-    def turn(self, streams: list[Stream]) -> None:
+    def step(self, streams: list[Stream]) -> None:
         """Kill one, where it is time."""
         now = monotonic()
         if now < self._due:
             return
         self._due = now + self._pause()
-        found = [(number, name, pid) for number, stream in enumerate(streams) for name, pid in stream.pids.items()]
-        found = [victim for victim in found if self._may_die(now, *victim[:2])]
-        if found:
-            number, name, pid = self._random.choice(found)
+        candidates = [(number, name, pid) for number, stream in enumerate(streams) for name, pid in stream.pids.items()]
+        candidates = [victim for victim in candidates if self._may_be_killed(now, *victim[:2])]
+        if candidates:
+            number, name, pid = self._random.choice(candidates)
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
                 self.kills.append(Kill(now, number, name))
 
-    def _may_die(self, now: float, stream: int, process: str) -> bool:
+    def _may_be_killed(self, now: float, stream: int, process: str) -> bool:
         before = [kill.moment for kill in self.kills if (kill.stream, kill.process) == (stream, process)]
-        return sum(now - moment < _PER_SECONDS for moment in before) < _MOST
+        return sum(now - moment < _PER_SECONDS for moment in before) < _MAX_KILLS
 
     def _pause(self) -> float:
         return _PAUSE_SECONDS * self._random.uniform(0.5, 1.5)

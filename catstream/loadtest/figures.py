@@ -5,19 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 from catstream.evaluation.provenance import provenance
+from catstream.loadtest.load_test import LoadTest
 from catstream.loadtest.measures import Measures
-from catstream.loadtest.trial import Trial
 from catstream.loadtest.usage import summary
 
 __all__ = ["to_json"]
 
 
-def to_json(trial: Trial) -> dict[str, Any]:
+def to_json(load_test: LoadTest) -> dict[str, Any]:
     """The figures of the run that counts, of the steps that led to it, and what they were made with.
 
     Seconds, shares from 0 to 1, bytes.
     """
-    result = trial.result
+    result = load_test.result
     plan = result.plan
     return {
         **provenance(plan.settings),
@@ -31,13 +31,13 @@ def to_json(trial: Trial) -> dict[str, Any]:
             "chaos": plan.chaos,
         },
         "seconds": result.seconds,
-        "interrupted": trial.interrupted,
+        "interrupted": load_test.interrupted,
         "latency": {"track": result.track.figures(), "model": result.model.figures()},
         "streams": [_stream(measures, plan.rate) for measures in result.streams],
-        "processes": {name: summary(samples) for name, samples in result.usage.items()},
+        "processes": {name: summary(readings) for name, readings in result.usage.items()},
         "subscribers": {
-            "quick": len(result.heard),
-            "heard": sum(result.heard),
+            "quick": len(result.received),
+            "received": sum(result.received),
             "missed": result.missed,
             "frozen_seconds": round(result.frozen, 3),
         },
@@ -52,17 +52,17 @@ def to_json(trial: Trial) -> dict[str, Any]:
         ],
         "restarts": result.restarts,
         "camera_late": round(result.camera_late, 6),
-        "limits": {limit.name: {"value": limit.value, "held": limit.held(result)} for limit in trial.limits},
-        "broken": trial.broken,
-        "found": trial.found,
+        "limits": {limit.name: {"value": limit.value, "met": limit.is_met(result)} for limit in load_test.limits},
+        "violations": load_test.violations,
+        "highest_rate": load_test.highest_rate,
         "steps": [
             {
                 "rate": step.rate,
                 "followed": step.followed,
                 "track": step.result.track.figures(),
-                "broken": step.broken,
+                "violations": step.violations,
             }
-            for step in trial.steps
+            for step in load_test.steps
         ],
     }
 
@@ -72,10 +72,10 @@ def _stream(measures: Measures, rate: float) -> dict[str, Any]:
         "frames": measures.frames,
         "frames_per_second": measures.rate(rate),
         "skipped": measures.skipped,
-        "never": measures.never,
+        "without_track": measures.without_track,
         "track": measures.track.figures(),
         "model": measures.model.figures(),
-        "lag": measures.most_lag,
+        "lag": measures.max_lag,
         "sent": measures.sent,
         "stored": measures.stored,
         "success": measures.success,

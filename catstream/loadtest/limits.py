@@ -1,4 +1,4 @@
-"""Limits: what a run must hold, and what of it was broken."""
+"""Limits: what a run must hold, and what of it was violations."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from catstream.errors import SettingsError
 from catstream.loadtest.latencies import PERCENTILES
 from catstream.loadtest.run import Result
 
-__all__ = ["KINDS", "Limit", "broken"]
+__all__ = ["KINDS", "Limit", "violations"]
 
 
 @dataclass(frozen=True, slots=True)
-class _Kind:
+class _Quantity:
     """What a limit may be on: how it is read off a result, and whether more of it is better."""
 
     about: str
-    of: Callable[[Result], float]
-    least: bool = False
+    measure: Callable[[Result], float]
+    minimum: bool = False
 
 
 def _worst(name: str, kind: str) -> Callable[[Result], float]:
@@ -32,22 +32,22 @@ def _recovery(result: Result) -> float:
 
 
 #: All limits, by name. Of several streams the worst counts.
-KINDS: dict[str, _Kind] = {
-    **{name: _Kind("seconds from a frame to its track", _worst(name, "track")) for name in PERCENTILES},
+KINDS: dict[str, _Quantity] = {
+    **{name: _Quantity("seconds from a frame to its track", _worst(name, "track")) for name in PERCENTILES},
     **{
-        f"model-{name}": _Kind("seconds from a frame to the model that has seen it", _worst(name, "model"))
+        f"model-{name}": _Quantity("seconds from a frame to the model that has seen it", _worst(name, "model"))
         for name in PERCENTILES
     },
-    "skipped": _Kind(
+    "skipped": _Quantity(
         "share of frames that were not followed",
         lambda result: max(stream.skipped_share for stream in result.streams),
     ),
-    "missed": _Kind("share of tracks that quick subscribers missed", lambda result: result.missed_share),
-    "recovery": _Kind("seconds from a kill to the next track", _recovery),
-    "success": _Kind(
+    "missed": _Quantity("share of tracks that quick subscribers missed", lambda result: result.missed_share),
+    "recovery": _Quantity("seconds from a kill to the next track", _recovery),
+    "success": _Quantity(
         "share of frames with an overlap above 0.5",
         lambda result: min(stream.success or 0.0 for stream in result.streams),
-        least=True,
+        minimum=True,
     ),
 }
 
@@ -86,17 +86,17 @@ class Limit:
     def __str__(self) -> str:
         return f"{self.name}={self.value:g}"
 
-    def held(self, result: Result) -> bool:
+    def is_met(self, result: Result) -> bool:
         kind = KINDS[self.name]
-        return (operator.ge if kind.least else operator.le)(kind.of(result), self.value)
+        return (operator.ge if kind.minimum else operator.le)(kind.measure(result), self.value)
 
-    def told(self, result: Result) -> str:
+    def describe(self, result: Result) -> str:
         """What it is, and what came of it."""
         kind = KINDS[self.name]
-        sense = "least" if kind.least else "most"
-        return f"{self.name} is {kind.of(result):.4g}, to be at {sense} {self.value:g} ({kind.about})"
+        sense = "least" if kind.minimum else "most"
+        return f"{self.name} is {kind.measure(result):.4g}, to be at {sense} {self.value:g} ({kind.about})"
 
 
-def broken(limits: list[Limit], result: Result) -> list[str]:
-    """What was broken, in a line each: limits, and streams that failed."""
-    return [*result.errors, *(limit.told(result) for limit in limits if not limit.held(result))]
+def violations(limits: list[Limit], result: Result) -> list[str]:
+    """What was violations, in a line each: limits, and streams that failed."""
+    return [*result.errors, *(limit.describe(result) for limit in limits if not limit.is_met(result))]

@@ -12,21 +12,21 @@ from catstream.wire.sockets import Subscriber
 
 __all__ = ["arrivals", "rounds"]
 
-_TURN_SECONDS = 0.1
+_POLL_SECONDS = 0.1
 
 Key = TypeVar("Key")
 
 
 def arrivals(
-    readers: Mapping[Key, Subscriber], over: Callable[[], bool] = lambda: False
+    readers: Mapping[Key, Subscriber], is_over: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Key, float, Any]]:
-    """Who received, when by `time.monotonic`, and what; each until its End, all until `over`."""
+    """Who received, when by `time.monotonic`, and what; each until its End, all until `is_over`."""
     poller, keys = select.poll(), {}
     for key, reader in readers.items():
         keys[reader.fileno()] = key
         poller.register(reader.fileno(), select.POLLIN)
-    while keys and not over():
-        for handle, _ in poller.poll(1000 * _TURN_SECONDS):
+    while keys and not is_over():
+        for handle, _ in poller.poll(1000 * _POLL_SECONDS):
             key = keys[handle]
             while (message := readers[key].receive(0)) is not None:
                 yield key, time.monotonic(), message

@@ -1,4 +1,4 @@
-"""From what was seen of a stream to what it is worth under load.
+"""From what was observations of a stream to what it is worth under load.
 
 Every frame that was due counts once, whether it was followed or skipped: its latency ends with the first track of
 it or of a newer frame, and with the first model whose sample summarises it or a newer one. So a pipeline that
@@ -13,34 +13,34 @@ import numpy as np
 
 from catstream.evaluation.metrics import overlaps
 from catstream.loadtest.latencies import Latencies
-from catstream.loadtest.observer import Seen
+from catstream.loadtest.observer import Observations
 from catstream.video.broadcast import Schedule
 
-__all__ = ["Measures", "held", "measure", "waits"]
+__all__ = ["Measures", "carried_forward", "latencies_to_answer", "measure"]
 
 _SUCCESS = 0.5  # overlap with the truth above which a frame counts as followed well
 
 
 @dataclass(slots=True)
 class Measures:
-    """Of one stream.
+    """The measures of one stream.
 
-    due              moment at which each frame was due, float64 (frames,)
-    followed         which of them have a track, bool (frames,)
-    track            seconds from each frame's moment to the track that covers it
-    model            the same to the model; of those before the first model's, the first one counts
-    never            frames that no track covered until the end of the run: their latency counts as if one came then
-    success          share of frames with the object whose overlap is above 0.5; a skipped frame has the box before it
-    success_followed the same of the followed frames alone; None where there is none
-    lag              messages that the compressor had not taken: moment and number of each report
-    sent, stored     features messages at the end; None where the stream did not come to its end
+    due              due time of each frame, float64 (frames,)
+    followed         whether each frame has a track, bool (frames,)
+    track            seconds from the due time of each frame to the track of this frame or a newer one
+    model            seconds to the model trained on this frame or a newer one
+    without_track    frames without such a track until the end of the run, which counts as their arrival
+    success          share of frames with the object whose overlap is above 0.5; a skipped frame has the last known box
+    success_followed the same share of the tracked frames alone; None if there are none
+    lag              reports of the number of messages that the compressor had not received: arrival time and number
+    sent, stored     number of features messages at the end; None if the stream did not come to its end
     """
 
     due: np.ndarray
     followed: np.ndarray
     track: Latencies
     model: Latencies
-    never: int
+    without_track: int
     success: float | None
     success_followed: float | None
     lag: list[tuple[float, int]] = field(default_factory=list)
@@ -66,12 +66,12 @@ class Measures:
         return rate * (1 - self.skipped_share)
 
     @property
-    def most_lag(self) -> int:
+    def max_lag(self) -> int:
         return max((behind for _, behind in self.lag), default=0)
 
 
 def measure(
-    seen: Seen, schedule: Schedule, frames: int, truth: np.ndarray, end: float, totals: dict[str, int]
+    observations: Observations, schedule: Schedule, frames: int, truth: np.ndarray, end: float, totals: dict[str, int]
 ) -> Measures:
     """What one stream is worth.
 
@@ -84,11 +84,15 @@ def measure(
     totals : of the pipeline, at its end
     """
     due = np.array([schedule.due(number) for number in range(frames)])
-    tracks = [(moment, track, schedule.number(track.pts)) for moment, track in seen.tracks if track.pts is not None]
+    tracks = [
+        (moment, track, schedule.number(track.pts)) for moment, track in observations.tracks if track.pts is not None
+    ]
     numbers = np.array([number for *_, number in tracks], int)
-    to_track, never = waits(due, numbers, np.array([moment for moment, *_ in tracks]), end)
-    models = _models(seen, schedule)
-    to_model, _ = waits(due, np.array([number for _, number in models], int), np.array([at for at, _ in models]), end)
+    to_track, without_track = latencies_to_answer(due, numbers, np.array([moment for moment, *_ in tracks]), end)
+    models = _models(observations, schedule)
+    to_model, _ = latencies_to_answer(
+        due, np.array([number for _, number in models], int), np.array([at for at, _ in models]), end
+    )
 
     boxes = np.full((frames, 4), np.nan)
     followed = np.zeros(frames, bool)
@@ -101,12 +105,12 @@ def measure(
         followed=followed,
         track=Latencies(to_track),
         model=Latencies(to_model),
-        never=never,
-        success=_success(held(boxes, followed), true),
+        without_track=without_track,
+        success=_success(carried_forward(boxes, followed), true),
         success_followed=_success(boxes[followed], true[followed]),
         lag=[
             (moment, int(health.counters["sent"] - health.counters["taken"]))
-            for moment, health in seen.health
+            for moment, health in observations.health
             if health.process == "detector" and schedule.start <= moment <= end
         ],
         sent=totals.get("sent"),
@@ -114,7 +118,9 @@ def measure(
     )
 
 
-def waits(due: np.ndarray, numbers: np.ndarray, moments: np.ndarray, end: float) -> tuple[np.ndarray, int]:
+def latencies_to_answer(
+    due: np.ndarray, numbers: np.ndarray, moments: np.ndarray, end: float
+) -> tuple[np.ndarray, int]:
     """Seconds from each frame's moment to the first answer to it or to a newer frame.
 
     Parameters
@@ -127,7 +133,7 @@ def waits(due: np.ndarray, numbers: np.ndarray, moments: np.ndarray, end: float)
     -------
     float64 (frames,), and how many of them have no answer
 
-    >>> waits(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0, 2]), np.array([0.5, 2.5]), end=9.0)
+    >>> latencies_to_answer(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0, 2]), np.array([0.5, 2.5]), end=9.0)
     (array([0.5, 1.5, 0.5, 6. ]), 1)
     """
     frames = len(due)
@@ -138,10 +144,10 @@ def waits(due: np.ndarray, numbers: np.ndarray, moments: np.ndarray, end: float)
     return np.minimum(first, end) - due, int(np.isinf(first).sum())
 
 
-def held(boxes: np.ndarray, followed: np.ndarray) -> np.ndarray:
+def carried_forward(boxes: np.ndarray, followed: np.ndarray) -> np.ndarray:
     """The boxes that were known at each frame: its own, or of the last one before it that was followed.
 
-    >>> held(np.array([[1.0], [2.0], [3.0]]), np.array([False, True, False])).ravel()
+    >>> carried_forward(np.array([[1.0], [2.0], [3.0]]), np.array([False, True, False])).ravel()
     array([nan,  2.,  2.])
     """
     last = np.maximum.accumulate(np.where(followed, np.arange(len(boxes)), -1))
@@ -153,19 +159,19 @@ def _success(boxes: np.ndarray, truth: np.ndarray) -> float | None:
     return float((overlaps(boxes, truth)[present] > _SUCCESS).mean()) if present.any() else None
 
 
-def _models(seen: Seen, schedule: Schedule) -> list[tuple[float, int]]:
+def _models(observations: Observations, schedule: Schedule) -> list[tuple[float, int]]:
     """When each model came, and the newest frame that it summarises, in the numbers of the schedule.
 
     A restarted detector gives frames that were lost with it new pictures: what a number stands for depends on the time.
     """
-    stood_for: dict[int, int] = {}
-    models, tracks = [], iter(seen.tracks)
+    number_of_frame: dict[int, int] = {}
+    models, tracks = [], iter(observations.tracks)
     ahead = next(tracks, None)
-    for moment, frame in seen.models:
+    for moment, frame in observations.models:
         while ahead is not None and ahead[0] <= moment:
             if ahead[1].pts is not None:
-                stood_for[ahead[1].frame] = schedule.number(ahead[1].pts)
+                number_of_frame[ahead[1].frame] = schedule.number(ahead[1].pts)
             ahead = next(tracks, None)
-        if frame in stood_for:
-            models.append((moment, stood_for[frame]))
+        if frame in number_of_frame:
+            models.append((moment, number_of_frame[frame]))
     return models

@@ -12,9 +12,9 @@ import numpy as np
 from catstream.html.page import table, write_page
 from catstream.html.plots import Axis, plot
 from catstream.loadtest.latencies import PERCENTILES, Latencies
+from catstream.loadtest.load_test import LoadTest
 from catstream.loadtest.measures import Measures
 from catstream.loadtest.run import Result
-from catstream.loadtest.trial import Trial
 from catstream.loadtest.usage import summary
 
 __all__ = ["write_report"]
@@ -23,7 +23,7 @@ _STREAMS = 6  # curves that can be told apart
 _POINTS = 200  # of a curve over time
 
 
-def write_report(path: Path, trial: Trial) -> Path:
+def write_report(path: Path, load_test: LoadTest) -> Path:
     """Write the report of the run that counts, and of the steps that led to it.
 
     Raises
@@ -31,10 +31,10 @@ def write_report(path: Path, trial: Trial) -> Path:
     VideoError
         Where the file cannot be written.
     """
-    result = trial.result
+    result = load_test.result
     plan = result.plan
     about = (
-        f"{plan}, {result.seconds:.1f} s{', interrupted' if trial.interrupted else ''}. Latency counts from the "
+        f"{plan}, {result.seconds:.1f} s{', interrupted' if load_test.interrupted else ''}. Latency counts from the "
         "moment at which a frame was due; a skipped one waits for the track of a newer one."
     )
     return write_page(
@@ -44,8 +44,8 @@ def write_report(path: Path, trial: Trial) -> Path:
             "<h1>How it bears the load</h1>",
             f'<p class="about">{about}</p>',
             *(f'<p class="bad">{escape(error)}</p>' for error in result.errors),
-            _limits(trial),
-            _steps(trial),
+            _limits(load_test),
+            _steps(load_test),
             "<h2>Streams</h2>",
             _streams(result),
             _plots(result),
@@ -56,27 +56,27 @@ def write_report(path: Path, trial: Trial) -> Path:
             "<h2>How far to trust this</h2>",
             f'<p class="about">The camera sent no frame more than {_ms(result.camera_late)} ms after it was due by its '
             "own fault: latencies are not better known than that. What is not of the load test kept "
-            f"{result.others:.2f} cores busy meanwhile: on a quiet machine that is next to none.</p>",
+            f"{result.other_load:.2f} cores busy meanwhile: on a quiet machine that is next to none.</p>",
             "<h2>Settings that are not the default</h2>",
             f"<pre>{escape(chr(10).join(plan.settings.changed()) or 'none')}</pre>",
         ],
     )
 
 
-def _limits(trial: Trial) -> str:
+def _limits(load_test: LoadTest) -> str:
     lines = []
-    for limit in trial.limits:
-        style, word = ("good", "held") if limit.held(trial.result) else ("bad", "broken")
-        lines.append(f'<li class="{style}">{word}: {escape(limit.told(trial.result))}</li>')
+    for limit in load_test.limits:
+        style, word = ("good", "held") if limit.is_met(load_test.result) else ("bad", "broken")
+        lines.append(f'<li class="{style}">{word}: {escape(limit.describe(load_test.result))}</li>')
     return f"<ul>{''.join(lines)}</ul>" if lines else ""
 
 
-def _steps(trial: Trial) -> str:
-    if not trial.searched:
+def _steps(load_test: LoadTest) -> str:
+    if not load_test.is_search:
         return ""
     rows = []
-    for step in trial.steps:
-        style, verdict = ("bad", "; ".join(step.broken)) if step.broken else ("good", "holds")
+    for step in load_test.steps:
+        style, verdict = ("bad", "; ".join(step.violations)) if step.violations else ("good", "holds")
         latencies = [_ms(step.result.track[name]) for name in PERCENTILES]
         rows.append(
             [
@@ -87,11 +87,11 @@ def _steps(trial: Trial) -> str:
             ]
         )
     heads = ["due", "", "followed", *(f"{name} ms" for name in PERCENTILES)]
-    if trial.found:
-        found = f"The highest rate that holds: {trial.found:g} frames/s"
+    if load_test.highest_rate:
+        found = f"The highest rate that holds: {load_test.highest_rate:g} frames/s"
     else:
-        found = "Interrupted before a rate was found" if trial.interrupted else "No rate holds"
-    return f'<h2>{found}</h2><p class="about">What was tried, in this order.</p>{table(heads, rows, texts=2)}'
+        found = "Interrupted before a rate was found" if load_test.interrupted else "No rate holds"
+    return f'<h2>{found}</h2><p class="about">The runs, in this order.</p>{table(heads, rows, texts=2)}'
 
 
 def _streams(result: Result) -> str:
@@ -105,7 +105,7 @@ def _streams(result: Result) -> str:
             f"{100 * measures.skipped_share:.1f} %",
             *(_ms(measures.track[name]) for name in PERCENTILES),
             *(_ms(measures.model[name]) for name in ("p50", "p99")),
-            measures.most_lag,
+            measures.max_lag,
             "-" if measures.sent is None or measures.stored is None else measures.sent - measures.stored,
             _share(measures.success),
             _share(measures.success_followed),
@@ -140,8 +140,8 @@ def _plots(result: Result) -> str:
         _percentiles("From frame to track", [measures.track for _, measures in shown]),
         _percentiles("From frame to the model that has seen it", [measures.model for _, measures in shown]),
         _lines("Latency to the track over time", seconds, "ms", over_time),
-        _lines("Frames followed", seconds, "frames/s", rates, least=result.plan.rate),
-        _lines("Lag of the compressor", seconds, "messages", lag, least=5),
+        _lines("Frames followed", seconds, "frames/s", rates, minimum=result.plan.rate),
+        _lines("Lag of the compressor", seconds, "messages", lag, minimum=5),
     ]
     for title, unit, column, scale in (("Processor", "cores", 1, 1.0), ("Memory", "MB", 2, 1e-6)):
         parts.append(_lines(title, seconds, unit, _kinds(result, column, scale, start)))
@@ -162,9 +162,11 @@ def _percentiles(title: str, streams: Iterable[Latencies]) -> str:
     return plot(title, Axis("share of frames that waited less", nines, ticks), Axis.upto(most, "ms"), curves)
 
 
-def _lines(title: str, x: Axis, unit: str, curves: dict[str, tuple[np.ndarray, np.ndarray]], least: float = 1.0) -> str:
+def _lines(
+    title: str, x: Axis, unit: str, curves: dict[str, tuple[np.ndarray, np.ndarray]], minimum: float = 1.0
+) -> str:
     most = max((float(ys.max()) for _, ys in curves.values() if len(ys)), default=0.0)
-    return plot(title, x, Axis.upto(max(most, least), unit), curves)
+    return plot(title, x, Axis.upto(max(most, minimum), unit), curves)
 
 
 def _thinned(xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,9 +191,9 @@ def _rate(measures: Measures, when: np.ndarray, rate: float) -> tuple[np.ndarray
 def _kinds(result: Result, column: int, scale: float, start: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Samples of all processes of a kind, added up over the streams."""
     kinds: dict[str, list[np.ndarray]] = {}
-    for name, samples in result.usage.items():
-        kinds.setdefault(name.rstrip(" 0123456789"), []).append(np.array(samples, float))
-    moments = np.unique([sample.moment for samples in result.usage.values() for sample in samples])
+    for name, readings in result.usage.items():
+        kinds.setdefault(name.rstrip(" 0123456789"), []).append(np.array(readings, float))
+    moments = np.unique([reading.moment for readings in result.usage.values() for reading in readings])
     added = {}
     for kind, several in kinds.items():
         total = np.zeros(len(moments))
@@ -203,8 +205,8 @@ def _kinds(result: Result, column: int, scale: float, start: float) -> dict[str,
 
 def _processes(result: Result) -> str:
     rows = []
-    for name, samples in result.usage.items():
-        found = summary(samples)
+    for name, readings in result.usage.items():
+        found = summary(readings)
         cores, memory = (found["cores"], found["cores_most"]), (found["memory"], found["memory_most"])
         rows.append([escape(name), *(f"{value:.2f}" for value in cores), *(f"{value / 1e6:.0f}" for value in memory)])
     return table(["process", "cores, mean", "most", "MB, mean", "most"], rows)
@@ -214,11 +216,11 @@ def _subscribers(result: Result) -> str:
     plan = result.plan
     if not plan.subscribers:
         return ""
-    heard, missed = result.heard or [0], result.missed or [0]
+    received, missed = result.received or [0], result.missed or [0]
     return (
         f'<h2>Subscribers</h2><p class="about">{plan.subscribers} to each stream, of which {plan.slow} slow: '
-        f"{plan.frozen} of these frozen for {result.frozen:.0f} s. The quick ones heard {min(heard)} to "
-        f"{max(heard)} tracks each, and missed {sum(missed)} in all, {max(missed)} at most.</p>"
+        f"{plan.frozen} of these frozen for {result.frozen:.0f} s. The quick ones received {min(received)} to "
+        f"{max(received)} tracks each, and missed {sum(missed)} in all, {max(missed)} at most.</p>"
     )
 
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["highest"]
+__all__ = ["find_highest_rate"]
 
 _LEAST, _MOST = 0.5, 1000.0  # frames a second
 _PRECISION = 0.05  # share of the rate by which it may be too low
 
 
-def highest(start: float, holds: Callable[[float], bool]) -> float | None:
+def find_highest_rate(start: float, holds: Callable[[float], bool]) -> float | None:
     """The highest rate that holds, to a twentieth; None where not even half a frame a second does.
 
     From a start it is doubled or halved until it lies between two rates, then bisected. `holds` is
     called once a rate; where chance plays a part in what it says, so it does in the answer.
 
-    >>> highest(25.0, lambda rate: rate <= 42)
+    >>> find_highest_rate(25.0, lambda rate: rate <= 42)
     40.6
     """
     low = high = None

@@ -15,8 +15,8 @@ from catstream.settings import Settings
 
 __all__ = ["Stream"]
 
-_FAREWELL_SECONDS = 30.0
-_AGAIN_SECONDS = 3.0  # one that was killed before it was told is restarted, and told then
+_STOP_SECONDS = 30.0
+_RETRY_SECONDS = 3.0  # one that was killed before it was told is restarted, and told then
 
 
 class Stream(threading.Thread):
@@ -39,7 +39,7 @@ class Stream(threading.Thread):
         self.restarts = 0
         self._url, self._box, self._settings = url, box, settings
         self._pipeline: Pipeline | None = None
-        self._told: set[int] = set()
+        self._signalled: set[int] = set()
 
     def run(self) -> None:
         try:
@@ -51,7 +51,7 @@ class Stream(threading.Thread):
                 self.totals, self.restarts = pipeline.totals, pipeline.restarts
         except CatstreamError as error:
             # A detector that is told to stop while it resumes has nothing to end.
-            self.error = None if self._told else error
+            self.error = None if self._signalled else error
         finally:
             self._pipeline = None
             self.ready.set()
@@ -65,14 +65,14 @@ class Stream(threading.Thread):
     def ask_to_stop(self) -> None:
         """Tell the detector that no more frames are wanted: it ends when all that it sent is stored."""
         pid = self.pids.get("detector")
-        if pid is not None and pid not in self._told:  # a second signal would find it on its way out, and deaf
-            self._told.add(pid)
+        if pid is not None and pid not in self._signalled:  # a second signal would find it on its way out, and deaf
+            self._signalled.add(pid)
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGTERM)
 
     def stop(self) -> None:
         """End the pipeline in order, which may take a while."""
-        deadline = monotonic() + _FAREWELL_SECONDS
+        deadline = monotonic() + _STOP_SECONDS
         while self.is_alive() and monotonic() < deadline:
             self.ask_to_stop()
-            self.join(_AGAIN_SECONDS)
+            self.join(_RETRY_SECONDS)

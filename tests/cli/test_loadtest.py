@@ -27,7 +27,7 @@ def test_a_run_counts_every_frame_and_says_which_limit_was_broken(said, tmp_path
     assert 0 < stream["track"]["p50"] <= stream["track"]["max"]
     assert 0 < stream["model"]["p50"] <= stream["model"]["max"]
     assert stream["success_followed"] > 0.5
-    assert figures["subscribers"]["heard"] > 0
+    assert figures["subscribers"]["received"] > 0
     assert figures["subscribers"]["frozen_seconds"] >= 3
     assert {"detector 0", "compressor 0", "trainer 0", "camera", "subscribers"} <= set(figures["processes"])
     assert figures["processes"]["detector 0"]["cores"] > 0

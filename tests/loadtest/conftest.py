@@ -50,13 +50,13 @@ def result() -> Callable[..., Result]:
                     followed=frames < followed * len(seconds),
                     track=Latencies(seconds),
                     model=Latencies(seconds),
-                    never=0,
+                    without_track=0,
                     success=success,
                     success_followed=success,
                     lag=[(100.5, 3)],
                 )
             )
-        facts = {"restarts": 0, "recoveries": [], "usage": {}, "heard": [], "missed": [], "frozen": 0.0}
+        facts = {"restarts": 0, "recoveries": [], "usage": {}, "received": [], "missed": [], "frozen": 0.0}
         return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, "camera_late": 0.001, **others})
 
     return made

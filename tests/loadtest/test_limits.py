@@ -8,45 +8,45 @@ from hypothesis import strategies as st
 
 from catstream.errors import SettingsError
 from catstream.loadtest.chaos import Kill
-from catstream.loadtest.limits import KINDS, Limit, broken
+from catstream.loadtest.limits import KINDS, Limit, violations
 from catstream.loadtest.plan import Plan
 from catstream.loadtest.run import Recovery
-from catstream.loadtest.search import highest
+from catstream.loadtest.search import find_highest_rate
 from catstream.settings import Settings
 
 
 def test_a_limit_holds_for_the_worst_stream(result):
     run = result([0.01] * 100, [0.01] * 90 + [0.2] * 10)
-    assert broken([Limit("p99", 0.1)], run) == ["p99 is 0.2, to be at most 0.1 (seconds from a frame to its track)"]
-    assert broken([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2)], run) == []
+    assert violations([Limit("p99", 0.1)], run) == ["p99 is 0.2, to be at most 0.1 (seconds from a frame to its track)"]
+    assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2)], run) == []
 
 
 def test_success_is_to_be_at_least_what_is_asked(result):
     run = result([0.01], success=0.8)
-    assert broken([Limit("success", 0.8)], run) == []
-    assert "to be at least 0.9" in broken([Limit("success", 0.9)], run)[0]
+    assert violations([Limit("success", 0.8)], run) == []
+    assert "to be at least 0.9" in violations([Limit("success", 0.9)], run)[0]
 
 
 def test_skipped_and_missed_are_shares(result):
-    run = result([0.01] * 10, followed=0.9, heard=[99, 99], missed=[1, 1])
-    assert broken([Limit("skipped", 0.1), Limit("missed", 0.01)], run) == []
-    assert len(broken([Limit("skipped", 0.09), Limit("missed", 0.009)], run)) == 2
+    run = result([0.01] * 10, followed=0.9, received=[99, 99], missed=[1, 1])
+    assert violations([Limit("skipped", 0.1), Limit("missed", 0.01)], run) == []
+    assert len(violations([Limit("skipped", 0.09), Limit("missed", 0.009)], run)) == 2
 
 
 def test_a_process_that_never_recovered_breaks_every_limit(result):
     run = result([0.01], recoveries=[Recovery(Kill(100.0, 0, "trainer"), None, None)])
-    assert not Limit("recovery", 1000).held(run)
+    assert not Limit("recovery", 1000).is_met(run)
 
 
 def test_a_stream_that_failed_breaks_a_run_without_limits(result):
-    assert broken([], result([0.01], errors=["stream 0: it died"])) == ["stream 0: it died"]
+    assert violations([], result([0.01], errors=["stream 0: it died"])) == ["stream 0: it died"]
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_every_limit_can_be_read_and_told(name, result):
     limit = Limit.parse(f"{name}=0.5")
     assert Limit.parse(str(limit)) == limit
-    assert limit.told(result([0.25])).startswith(f"{name} is ")
+    assert limit.describe(result([0.25])).startswith(f"{name} is ")
 
 
 @pytest.mark.parametrize("text", ["p98=0.1", "p99", "p99=", "p99=fast", "p99=-1", "p99=nan", "p99=inf", "=1", ""])
@@ -71,16 +71,16 @@ def test_a_plan_that_makes_no_sense_is_refused(facts, said):
 
 @given(st.floats(0.5, 1000), st.floats(0.5, 1000))
 def test_the_highest_rate_that_holds_is_found_to_a_twentieth_and_each_is_tried_once(start, capacity):
-    tried = []
+    step_done = []
 
     def holds(rate):
-        tried.append(rate)
+        step_done.append(rate)
         return rate <= capacity
 
-    found = highest(start, holds)
+    found = find_highest_rate(start, holds)
     assert found <= capacity <= max(found * 1.05 + 0.1, 1000 * (found == 1000))
-    assert len(tried) == len(set(tried)) <= 18
+    assert len(step_done) == len(set(step_done)) <= 18
 
 
 def test_a_rate_that_never_holds_is_none():
-    assert highest(25.0, lambda _: False) is None
+    assert find_highest_rate(25.0, lambda _: False) is None

@@ -7,58 +7,58 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.loadtest.measures import held, measure, waits
-from catstream.loadtest.observer import Seen
+from catstream.loadtest.measures import carried_forward, latencies_to_answer, measure
+from catstream.loadtest.observer import Observations
 
 TRUTH = np.tile((10.0, 10.0, 20.0, 20.0), (10, 1))
 
 
 def test_a_frame_waits_for_its_own_track(schedule, track):
-    seen = Seen(tracks=[track(number, 0.02) for number in range(10)])
-    measures = measure(seen, schedule, 10, TRUTH, end=102.0, totals={"sent": 10, "stored": 9})
+    observations = Observations(tracks=[track(number, 0.02) for number in range(10)])
+    measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={"sent": 10, "stored": 9})
     assert measures.track.seconds == pytest.approx(np.full(10, 0.02))
-    assert (measures.skipped, measures.never, measures.rate(10.0)) == (0, 0, 10.0)
+    assert (measures.skipped, measures.without_track, measures.rate(10.0)) == (0, 0, 10.0)
     assert (measures.success, measures.sent, measures.stored) == (1.0, 10, 9)
 
 
 def test_a_skipped_frame_waits_for_the_track_of_a_newer_one(schedule, track):
-    seen = Seen(tracks=[track(0, 0.02), track(5, 0.02), track(9, 0.02)])
-    measures = measure(seen, schedule, 10, TRUTH, end=102.0, totals={})
+    observations = Observations(tracks=[track(0, 0.02), track(5, 0.02), track(9, 0.02)])
+    measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={})
     assert measures.track.seconds[1:6] == pytest.approx([0.42, 0.32, 0.22, 0.12, 0.02])
     assert (measures.skipped, measures.skipped_share, measures.rate(10.0)) == (7, 0.7, pytest.approx(3.0))
 
 
 def test_a_frame_that_no_track_covers_waits_until_the_end(schedule, track):
-    measures = measure(Seen(tracks=[track(7, 0.02)]), schedule, 10, TRUTH, end=105.0, totals={})
-    assert measures.never == 2
+    measures = measure(Observations(tracks=[track(7, 0.02)]), schedule, 10, TRUTH, end=105.0, totals={})
+    assert measures.without_track == 2
     assert measures.track["max"] == pytest.approx(4.2)
 
 
 def test_stills_before_the_start_and_after_the_end_count_only_for_what_they_cover(schedule, track):
-    seen = Seen(tracks=[track(-3, 0.01), track(4, 0.01), track(12, 0.01)])
-    measures = measure(seen, schedule, 10, TRUTH, end=105.0, totals={})
+    observations = Observations(tracks=[track(-3, 0.01), track(4, 0.01), track(12, 0.01)])
+    measures = measure(observations, schedule, 10, TRUTH, end=105.0, totals={})
     assert measures.followed.sum() == 1
-    assert (measures.never, measures.track["max"]) == (0, pytest.approx(0.71))
+    assert (measures.without_track, measures.track["max"]) == (0, pytest.approx(0.71))
 
 
 def test_a_frame_is_seen_by_the_first_model_of_it_or_of_a_newer_one(schedule, track):
-    seen = Seen(tracks=[track(number, 0.02) for number in range(10)])
-    seen.models = [(100.45, 2), (100.95, 7), (101.5, 9)]
-    measures = measure(seen, schedule, 10, TRUTH, end=102.0, totals={})
+    observations = Observations(tracks=[track(number, 0.02) for number in range(10)])
+    observations.models = [(100.45, 2), (100.95, 7), (101.5, 9)]
+    measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={})
     assert measures.model.seconds == pytest.approx([0.45, 0.35, 0.25, 0.65, 0.55, 0.45, 0.35, 0.25, 0.7, 0.6])
 
 
 def test_a_number_that_a_restarted_detector_gives_again_stands_for_its_new_frame(schedule, track):
-    seen = Seen(tracks=[track(0, 0.0, frame=50), track(1, 0.0, frame=51), track(6, 0.0, frame=51)])
-    seen.models = [(100.2, 51), (100.8, 51)]
-    measures = measure(seen, schedule, 10, TRUTH, end=101.0, totals={})
+    observations = Observations(tracks=[track(0, 0.0, frame=50), track(1, 0.0, frame=51), track(6, 0.0, frame=51)])
+    observations.models = [(100.2, 51), (100.8, 51)]
+    measures = measure(observations, schedule, 10, TRUTH, end=101.0, totals={})
     assert measures.model.seconds[[1, 2, 6]] == pytest.approx([0.1, 0.6, 0.2])
 
 
 def test_a_skipped_frame_is_judged_by_the_box_before_it(schedule, track):
     truth = TRUTH.copy()
     truth[3:, 0] += 100  # the object jumps while nobody looks
-    measures = measure(Seen(tracks=[track(0, 0.02), track(9, 0.02, box=None)]), schedule, 10, truth, 102.0, {})
+    measures = measure(Observations(tracks=[track(0, 0.02), track(9, 0.02, box=None)]), schedule, 10, truth, 102.0, {})
     assert (measures.success, measures.success_followed) == (0.3, 0.5)
 
 
@@ -66,12 +66,12 @@ def test_a_skipped_frame_is_judged_by_the_box_before_it(schedule, track):
 def test_waits_are_those_of_brute_force(answers, frames):
     due = np.arange(frames) / 10
     numbers, moments = np.array([number for number, _ in answers], int), np.array([at for _, at in answers])
-    found, never = waits(due, numbers, moments, end=60.0)
+    found, without_track = latencies_to_answer(due, numbers, moments, end=60.0)
     # What is newer than the last frame covers them all.
     expected = [min([at for number, at in answers if number >= frame], default=60.0) for frame in range(frames)]
     np.testing.assert_allclose(found, np.array(expected) - due)
-    assert never == sum(wait == 60.0 for wait in expected)
+    assert without_track == sum(wait == 60.0 for wait in expected)
 
 
 def test_before_the_first_box_nothing_is_held():
-    assert np.isnan(held(np.ones((3, 4)), np.zeros(3, bool))).all()
+    assert np.isnan(carried_forward(np.ones((3, 4)), np.zeros(3, bool))).all()

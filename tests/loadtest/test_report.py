@@ -1,4 +1,4 @@
-"""The report: what was tried, what was broken, who was killed, on one page that needs nothing else."""
+"""The report: what was step_done, what was broken, who was killed, on one page that needs nothing else."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ import pytest
 
 from catstream.loadtest.chaos import Kill
 from catstream.loadtest.figures import to_json
-from catstream.loadtest.limits import Limit, broken
+from catstream.loadtest.limits import Limit, violations
+from catstream.loadtest.load_test import LoadTest, Step
 from catstream.loadtest.report import write_report
 from catstream.loadtest.run import Recovery, Result
-from catstream.loadtest.trial import Step, Trial
-from catstream.loadtest.usage import Sample
+from catstream.loadtest.usage import UsageReading
 
 
-def searched(*results: Result) -> Trial:
+def is_search(*results: Result) -> LoadTest:
     limits = [Limit("p99", 0.1)]
-    steps = [Step(result, broken(limits, result)) for result in results]
-    return Trial(limits, searched=True, steps=steps, found=max((s.rate for s in steps if not s.broken), default=None))
+    steps = [Step(result, violations(limits, result)) for result in results]
+    return LoadTest(
+        limits, is_search=True, steps=steps, highest_rate=max((s.rate for s in steps if not s.violations), default=None)
+    )
 
 
 def at(rate: float, result: Result) -> Result:
@@ -30,19 +32,19 @@ def at(rate: float, result: Result) -> Result:
 
 
 def test_a_search_shows_the_highest_rate_that_held_and_why_others_did_not(result, tmp_path):
-    trial = searched(at(25.0, result([0.01] * 50)), at(50.0, result([0.3] * 50)), at(37.5, result([0.02] * 50)))
-    assert (trial.found, trial.result.plan.rate, trial.broken) == (37.5, 37.5, [])
-    page = write_report(tmp_path / "report.html", trial).read_text()
+    load_test = is_search(at(25.0, result([0.01] * 50)), at(50.0, result([0.3] * 50)), at(37.5, result([0.02] * 50)))
+    assert (load_test.highest_rate, load_test.result.plan.rate, load_test.violations) == (37.5, 37.5, [])
+    page = write_report(tmp_path / "report.html", load_test).read_text()
     assert "The highest rate that holds: 37.5 frames/s" in page
     assert page.count(">holds<") == 2
     assert "p99 is 0.3, to be at most 0.1" in page
-    assert [step["rate"] for step in to_json(trial)["steps"]] == [25.0, 50.0, 37.5]
+    assert [step["rate"] for step in to_json(load_test)["steps"]] == [25.0, 50.0, 37.5]
 
 
 def test_a_search_without_success_says_so(result, tmp_path):
-    trial = searched(result([0.3] * 50))
-    assert trial.broken == ["no rate holds p99=0.1: the last one, 25, did not"]
-    assert "No rate holds" in write_report(tmp_path / "report.html", trial).read_text()
+    load_test = is_search(result([0.3] * 50))
+    assert load_test.violations == ["no rate holds p99=0.1: the last one, 25, did not"]
+    assert "No rate holds" in write_report(tmp_path / "report.html", load_test).read_text()
 
 
 def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
@@ -51,11 +53,11 @@ def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
         [0.02] * 50,
         restarts=1,
         recoveries=[Recovery(Kill(101.0, 1, "trainer"), 0.025, None)],
-        usage={"detector 0": [Sample(100.5, 0.5, 10**8)], "detector 1": [Sample(100.5, 0.7, 10**8)]},
+        usage={"detector 0": [UsageReading(100.5, 0.5, 10**8)], "detector 1": [UsageReading(100.5, 0.7, 10**8)]},
         errors=["stream 1: <it> died"],
     )
     run.plan = replace(run.plan, chaos=True)
-    page = write_report(tmp_path / "report.html", Trial([], False, [Step(run, run.errors)])).read_text()
+    page = write_report(tmp_path / "report.html", LoadTest([], False, [Step(run, run.errors)])).read_text()
     for row in ("detector 0", "detector 1", "trainer 1"):
         assert f'<td class="text">{row}</td>' in page
     assert "<td>0.025</td><td>none</td>" in page
@@ -69,10 +71,10 @@ def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
 
 def test_json_holds_what_json_can(result):
     run = result([0.01] * 5, recoveries=[Recovery(Kill(101.0, 0, "trainer"), None, None)])
-    text = json.dumps(to_json(Trial([Limit("recovery", 1.0)], False, [Step(run, [])])), allow_nan=False)
+    text = json.dumps(to_json(LoadTest([Limit("recovery", 1.0)], False, [Step(run, [])])), allow_nan=False)
     figures = json.loads(text)
     assert figures["chaos"] == [{"stream": 0, "process": "trainer", "to_track": None, "to_model": None}]
-    assert figures["limits"] == {"recovery": {"value": 1.0, "held": False}}
+    assert figures["limits"] == {"recovery": {"value": 1.0, "met": False}}
     (stream,) = figures["streams"]
     assert stream["frames"] == 5
     assert stream["track"]["max"] == pytest.approx(0.01, rel=0.01)

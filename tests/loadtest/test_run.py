@@ -14,8 +14,8 @@ import pytest
 
 from catstream.loadtest.chaos import Chaos
 from catstream.loadtest.limits import Limit
+from catstream.loadtest.load_test import run_load_test
 from catstream.loadtest.plan import Plan
-from catstream.loadtest.trial import hold
 from catstream.loadtest.usage import REST, Usage
 
 
@@ -56,7 +56,7 @@ def test_chaos_kills_whom_it_says(sleepers):
     chaos = Chaos(seed=7)
     for _ in range(3):
         chaos._due = 0.0
-        chaos.turn(sleepers)
+        chaos.step(sleepers)
         kill = chaos.kills[-1]
         assert sleepers[kill.stream].children[kill.process].wait(30) == -signal.SIGKILL
     assert sum(len(stream.pids) for stream in sleepers) == 3
@@ -66,7 +66,7 @@ def test_chaos_spares_whom_a_supervisor_would_give_up(sleepers):
     (stream, _), chaos = sleepers, Chaos(seed=1)
     for _ in range(40):
         before, chaos._due = len(chaos.kills), 0.0
-        chaos.turn([stream])
+        chaos.step([stream])
         for kill in chaos.kills[before:]:
             stream.children[kill.process].wait(30)
             stream.children[kill.process] = stream.start()
@@ -90,15 +90,15 @@ def test_ctrl_c_reaches_not_even_the_first_child():
 
 def test_usage_tells_who_is_busy(sleepers):
     usage, busy = Usage(), psutil.Process().pid
-    usage.look(0.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
+    usage.read(0.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
     deadline = time.process_time() + 0.3
     while time.process_time() < deadline:
         pass
-    usage.look(1.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
-    assert usage.samples["busy"][0].cores > 0.27  # the kernel counts in hundredths
-    assert usage.samples["idle"][0].cores < usage.samples["busy"][0].cores
-    assert usage.samples[REST][0].cores >= 0
-    assert 0 < usage.samples["idle"][0].memory < usage.samples["busy"][0].memory
+    usage.read(1.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
+    assert usage.readings["busy"][0].cores > 0.27  # the kernel counts in hundredths
+    assert usage.readings["idle"][0].cores < usage.readings["busy"][0].cores
+    assert usage.readings[REST][0].cores >= 0
+    assert 0 < usage.readings["idle"][0].memory < usage.readings["busy"][0].memory
 
 
 def test_an_interrupted_run_tells_what_it_measured_and_leaves_nobody_behind():
@@ -107,35 +107,37 @@ def test_an_interrupted_run_tells_what_it_measured_and_leaves_nobody_behind():
             raise KeyboardInterrupt
 
     plan = Plan(rate=20.0, duration=20.0, size=(320, 240))
-    trial = hold(plan, [Limit("p99", 60.0)], find=False, tell=tell)
-    assert trial.interrupted
-    assert trial.broken == []
-    (stream,) = trial.result.streams
+    load_test = run_load_test(plan, [Limit("p99", 60.0)], find=False, report_status=tell)
+    assert load_test.interrupted
+    assert load_test.violations == []
+    (stream,) = load_test.result.streams
     assert 10 <= stream.frames < plan.frames
     assert stream.frames == len(stream.track)
-    assert trial.result.seconds == pytest.approx(stream.frames / 20)
+    assert load_test.result.seconds == pytest.approx(stream.frames / 20)
     assert stream.sent == stream.stored > stream.frames  # what it learned before counts too
     assert children() == []
 
 
 @pytest.mark.slow
 def test_all_processes_come_back_from_chaos():
-    trial = hold(Plan(streams=2, rate=8.0, duration=40.0, size=(320, 240), chaos=True), [], find=False)
-    assert not trial.broken
-    assert len(trial.result.recoveries) >= 5
+    load_test = run_load_test(Plan(streams=2, rate=8.0, duration=40.0, size=(320, 240), chaos=True), [], find=False)
+    assert not load_test.violations
+    assert len(load_test.result.recoveries) >= 5
     early = [
-        recovery for recovery in trial.result.recoveries if recovery.kill.moment < trial.result.streams[0].due[200]
+        recovery
+        for recovery in load_test.result.recoveries
+        if recovery.kill.moment < load_test.result.streams[0].due[200]
     ]
     assert all(recovery.track is not None and recovery.model is not None for recovery in early)
-    assert all(stream.sent == stream.stored for stream in trial.result.streams)
+    assert all(stream.sent == stream.stored for stream in load_test.result.streams)
     assert children() == []
 
 
 @pytest.mark.slow
 def test_a_search_ends_with_a_rate_that_held_below_one_that_did_not():
     plan = Plan(rate=30.0, duration=3.0, size=(320, 240))
-    trial = hold(plan, [Limit("p99", 1.0), Limit("skipped", 0.05)], find=True)
-    held = {step.rate for step in trial.steps if not step.broken}
-    assert trial.found in held
-    assert trial.result.plan.rate == max(held)
-    assert any(step.broken for step in trial.steps) or trial.found == 1000.0
+    load_test = run_load_test(plan, [Limit("p99", 1.0), Limit("skipped", 0.05)], find=True)
+    held = {step.rate for step in load_test.steps if not step.violations}
+    assert load_test.highest_rate in held
+    assert load_test.result.plan.rate == max(held)
+    assert any(step.violations for step in load_test.steps) or load_test.highest_rate == 1000.0

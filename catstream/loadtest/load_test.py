@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from catstream.loadtest.camera import Camera
-from catstream.loadtest.limits import Limit, broken
+from catstream.loadtest.limits import Limit, violations
 from catstream.loadtest.plan import Plan
-from catstream.loadtest.run import News, Result, run
-from catstream.loadtest.search import highest
+from catstream.loadtest.run import Result, Status, run
+from catstream.loadtest.search import find_highest_rate
 from catstream.video import demo
 
-__all__ = ["Step", "Trial", "hold"]
+__all__ = ["LoadTest", "Step", "run_load_test"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class Step:
     """One run, and what it broke."""
 
     result: Result
-    broken: list[str]
+    violations: list[str]
 
     @property
     def rate(self) -> float:
@@ -34,71 +34,73 @@ class Step:
 
 
 @dataclass(slots=True)
-class Trial:
+class LoadTest:
     """What was run.
 
-    searched     whether a rate was looked for
+    is_search     whether a rate was looked for
     steps        all runs, in order; empty where it was stopped before the first was measured
-    found        the highest rate that holds; None where none was looked for, or found
+    highest_rate        the highest rate that holds; None where none was looked for, or highest_rate
     interrupted  whether it was stopped before its end
     """
 
     limits: list[Limit]
-    searched: bool
+    is_search: bool
     steps: list[Step] = field(default_factory=list)
-    found: float | None = None
+    highest_rate: float | None = None
     interrupted: bool = False
 
     @property
     def result(self) -> Result:
         """The run that counts: of a search, that with the highest rate that held; the last one where none did."""
-        held = [step for step in self.steps if not step.broken]
+        held = [step for step in self.steps if not step.violations]
         return max(held, key=lambda step: step.rate, default=self.steps[-1]).result
 
     @property
-    def broken(self) -> list[str]:
+    def violations(self) -> list[str]:
         """Why it is no success, a line each."""
-        if not self.searched:
-            return [line for step in self.steps for line in step.broken]
-        if self.found is None and not self.interrupted:
+        if not self.is_search:
+            return [line for step in self.steps for line in step.violations]
+        if self.highest_rate is None and not self.interrupted:
             return [f"no rate holds {', '.join(map(str, self.limits))}: the last one, {self.steps[-1].rate:g}, did not"]
         return []
 
 
-def hold(
+def run_load_test(
     plan: Plan,
     limits: list[Limit],
     *,
     find: bool,
-    tell: Callable[[News], None] = lambda _: None,
-    tried: Callable[[Step], None] = lambda _: None,
-) -> Trial:
+    report_status: Callable[[Status], None] = lambda _: None,
+    step_done: Callable[[Step], None] = lambda _: None,
+) -> LoadTest:
     """Run a load test. Ctrl-C ends it: what was measured so far is returned.
 
     Parameters
     ----------
     find : look for the highest rate that holds, from that of the plan on
-    tell : called ten times a second or so
-    tried : called after each run
+    report_status : called ten times a second or so
+    step_done : called after each run
     """
-    trial = Trial(limits, find)
+    load_test = LoadTest(limits, find)
     pictures = demo.FRAMES if find else min(plan.frames, demo.FRAMES)
 
     def holds(rate: float) -> bool:
-        result = run(replace(plan, rate=rate), camera, tell)
-        trial.steps.append(Step(result, broken(limits, result)))
-        tried(trial.steps[-1])
+        result = run(replace(plan, rate=rate), camera, report_status)
+        load_test.steps.append(Step(result, violations(limits, result)))
+        step_done(load_test.steps[-1])
         if result.interrupted:
             raise KeyboardInterrupt
-        return not trial.steps[-1].broken
+        return not load_test.steps[-1].violations
 
     try:
         with Camera(plan.streams, plan.size, pictures) as camera:
-            camera.render(lambda count: tell(News("rendering", count / pictures, f"{count} of {pictures} frames")))
+            camera.render(
+                lambda count: report_status(Status("rendering", count / pictures, f"{count} of {pictures} frames"))
+            )
             if find:
-                trial.found = highest(plan.rate, holds)
+                load_test.highest_rate = find_highest_rate(plan.rate, holds)
             else:
                 holds(plan.rate)
     except KeyboardInterrupt:
-        trial.interrupted = True
-    return trial
+        load_test.interrupted = True
+    return load_test

@@ -1,4 +1,4 @@
-"""A crowd of subscribers: real sockets in processes of their own, most of them quick, some slow, some frozen."""
+"""A group of subscribers: real sockets in processes of their own, most of them quick, some slow, some frozen."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from catstream.subscription import GapCounter
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Subscriber
 
-__all__ = ["Crowd"]
+__all__ = ["Subscribers"]
 
-_TOGETHER = 20  # readers in one process: a process each would be more than most machines hold
+_PER_PROCESS = 20  # readers in one process: a process each would be more than most machines hold
 #: Messages that a reader takes at once, at most, and seconds until it takes the next.
 _QUICK, _SLOW = (64, 0.05), (1, 0.5)
-_LAST_WORDS_SECONDS = 20.0  # that quick readers have to take what is still on its way
+_DRAIN_SECONDS = 20.0  # that quick readers have to take what is still on its way
 
 
-class Crowd:
+class Subscribers:
     """Readers of the tracks of one pipeline, while it is open. They run where a core is idle, and the quick
     ones take what has come twenty times a second: what is measured is the pipeline, not what readers do with a track.
 
@@ -37,16 +37,16 @@ class Crowd:
 
     def __init__(self, endpoint: str, readers: int, *, slow: int = 0, frozen: int = 0, keys: str = "") -> None:
         self._quick, self._readers = readers - slow - frozen, readers
-        self._heard, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
-        self._since = 0.0  # when they were frozen
+        self._received, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
+        self._frozen_since = 0.0  # when they were frozen
         self._groups: list[list[Any]] = []
         first = 0
         for size, pace in ((self._quick, _QUICK), (slow, _SLOW), (frozen, _QUICK)):
             self._groups.append([])
-            for begin in range(first, first + size, _TOGETHER):
-                numbers = range(begin, min(begin + _TOGETHER, first + size))
-                arguments = (endpoint, keys, numbers, pace, self._heard, self._missed, os.getpid())
-                self._groups[-1].append(SPAWN.Process(target=_listen, args=arguments))
+            for begin in range(first, first + size, _PER_PROCESS):
+                numbers = range(begin, min(begin + _PER_PROCESS, first + size))
+                arguments = (endpoint, keys, numbers, pace, self._received, self._missed, os.getpid())
+                self._groups[-1].append(SPAWN.Process(target=_read_until_end, args=arguments))
             first += size
 
     @property
@@ -54,31 +54,31 @@ class Crowd:
         return [process.pid for group in self._groups for process in group]
 
     @property
-    def attached(self) -> bool:
-        """Whether each of them has heard a track."""
-        return all(self._heard[: self._readers])
+    def connected(self) -> bool:
+        """Whether each of them has received a track."""
+        return all(self._received[: self._readers])
 
     @property
     def frozen_seconds(self) -> float:
         """For how long some have been frozen."""
-        return monotonic() - self._since if self._since else 0.0
+        return monotonic() - self._frozen_since if self._frozen_since else 0.0
 
     def freeze(self) -> None:
-        """Stop those that are to be frozen, once all are attached."""
-        if not self._since and self._groups[2] and self.attached:
+        """Stop those that are to be frozen, once all are connected."""
+        if not self._frozen_since and self._groups[2] and self.connected:
             for process in self._groups[2]:
                 os.kill(process.pid, signal.SIGSTOP)
-            self._since = monotonic()
+            self._frozen_since = monotonic()
 
     def wait(self) -> None:
-        """Until each quick reader has heard the end, but not for ever."""
-        deadline = monotonic() + _LAST_WORDS_SECONDS
+        """Until each quick reader has received the end, but not for ever."""
+        deadline = monotonic() + _DRAIN_SECONDS
         for process in self._groups[0]:
             process.join(max(0.0, deadline - monotonic()))
 
-    def heard(self) -> list[int]:
-        """Tracks that each quick reader has heard."""
-        return self._heard[: self._quick]
+    def received(self) -> list[int]:
+        """Tracks that each quick reader has received."""
+        return self._received[: self._quick]
 
     def missed(self) -> list[int]:
         """Tracks that each quick reader has missed, by the gaps in `seq`."""
@@ -98,8 +98,8 @@ class Crowd:
                     process.join()
 
 
-def _listen(
-    endpoint: str, keys: str, numbers: range, pace: tuple[int, float], heard: Any, missed: Any, parent: int
+def _read_until_end(
+    endpoint: str, keys: str, numbers: range, pace: tuple[int, float], received: Any, missed: Any, parent: int
 ) -> None:
     """Be some of the readers, until the end."""
     die_with(parent)
@@ -111,4 +111,4 @@ def _listen(
         gaps[number].take(message.seq)
         missed[number] = gaps[number].missed
         if not isinstance(message, End):
-            heard[number] += 1
+            received[number] += 1
