@@ -1,4 +1,4 @@
-"""`catstream loadtest`: what pipelines on this machine bear."""
+"""`catstream loadtest`: measure pipelines under load."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["loadtest"]
 
-_BROKEN = 1  # exit code where a limit was, or a stream
-_QUIET_CORES = 0.25  # busy with other things: more is worth a word
-_FIND = ("p99=0.1", "skipped=0.01")  # what a rate must hold where nothing else is given
+_FAILED = 1  # exit code if a limit was not met or a stream failed
+_QUIET_CORES = 0.25  # load by other processes above which a warning is printed
+_FIND = ("p99=0.1", "skipped=0.01")  # limits of a search if none are given
 
 
 def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
@@ -39,17 +39,29 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 
 
 @click.command()
-@click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Pipelines side by side.")
-@click.option("--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Attached to each.")
-@click.option("--slow-subscribers", "slow", type=click.IntRange(0), default=0, help="Of them slow or frozen.")
+@click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Number of pipelines.")
 @click.option(
-    "--rate", type=click.FloatRange(0.5, 1000), default=25.0, show_default=True, help="Frames a second of each."
+    "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
+)
+@click.option(
+    "--slow-subscribers", "slow", type=click.IntRange(0), default=0, help="How many of them are slow or frozen."
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0.5, 1000),
+    default=25.0,
+    show_default=True,
+    help="Frames per second of each stream.",
 )
 @click.option("--duration", type=click.FloatRange(1, 86400), default=10.0, show_default=True, help="Seconds.")
-@click.option("--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Of a frame, pixels.")
+@click.option(
+    "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
+)
 @click.option("--chaos", is_flag=True, help="Kill a random process every few seconds.")
-@click.option("--find-limit", is_flag=True, help="Look for the highest rate that holds.")
-@click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="To be held; may be repeated; see below.")
+@click.option("--find-limit", is_flag=True, help="Search for the highest rate that meets the limits.")
+@click.option(
+    "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see below."
+)
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all figures.")
 @click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and .hgrm.")
 @with_settings
@@ -67,36 +79,35 @@ def loadtest(
     json_file: Path | None,
     output: Path | None,
 ) -> None:
-    """Put pipelines under load, and measure what they bear.
+    """Run pipelines under load, and measure latency and losses.
 
-    A camera of the load test broadcasts a rendered video with known truth over
-    HTTP on loopback; each stream is followed by a detector, a compressor and a
-    trainer of its own. The camera does not wait: frame i is due at start + i /
-    RATE, and latency counts from then. A frame that was skipped waits for the
-    track of a newer one.
+    The load test sends a rendered video with ground truth over HTTP on the
+    loopback interface; a pipeline of its own tracks each stream. The camera
+    does not wait: frame i is due at start + i / RATE, and latency counts from
+    then. The latency of a skipped frame ends with the track of a newer one.
 
-    Slow subscribers take two tracks a second, every other one is frozen
-    instead. Chaos kills by SIGKILL, the same in each run with --set run.seed=N.
+    Slow subscribers read two tracks per second; half of them are frozen
+    instead. Chaos kills processes by SIGKILL; --set run.seed=N repeats it.
 
     \b
     LIMITS, of the worst stream
       p50 p95 p99 p99.9 max     seconds from a frame to its track, at most
-      model-p50 ... model-max   seconds from a frame to the model that has seen it, at most
-      skipped                   share of frames that were not followed, at most
-      missed                    share of tracks that quick subscribers missed, at most
+      model-p50 ... model-max   seconds from a frame to the model trained on it, at most
+      skipped                   share of frames that were not tracked, at most
+      missed                    share of tracks that fast subscribers missed, at most
       recovery                  seconds from a kill to the next track, at most
       success                   share of frames with an overlap above 0.5, at least
 
-    With --find-limit, RATE is where to begin, each rate runs for DURATION, and
-    the limits are p99=0.1 and skipped=0.01 where none is given.
+    With --find-limit, the search begins with RATE, each rate runs for DURATION,
+    and the limits are p99=0.1 and skipped=0.01 if none are given.
 
     \b
     Writes
       OUTPUT/report.html             figures and plots
       OUTPUT/track.hgrm, model.hgrm  HDR histograms: percentiles of both latencies, in milliseconds
 
-    The exit code is 0, 1 where a limit was broken or a stream failed, and 130
-    after Ctrl-C, which ends all processes and tells what was measured so far.
+    The exit code is 0; 1 if a limit was not met or a stream failed; 130 after
+    Ctrl-C, which ends all processes and prints the measurements so far.
 
     \b
     EXAMPLES
@@ -105,7 +116,7 @@ def loadtest(
       catstream loadtest --duration 60 --chaos --limit recovery=5
       catstream loadtest --find-limit --size 320x240
     """
-    # Here, so that --help and the other verbs need not wait for these.
+    # Imported here so that --help and the other verbs start faster.
     from catstream.loadtest.figures import to_json
     from catstream.loadtest.limits import Limit
     from catstream.loadtest.load_test import run_load_test
@@ -140,21 +151,21 @@ def loadtest(
             console.print(f"report: {write_report(output / 'report.html', load_test)}", soft_wrap=True)
     if load_test.interrupted:
         console.print(
-            "stopped: these are the figures so far" if load_test.steps else "stopped: nothing was measured yet"
+            "stopped: these are the figures so far" if load_test.steps else "stopped: there are no measurements yet"
         )
         sys.exit(INTERRUPTED)
     if load_test.highest_rate:
         console.print(
-            f"the highest rate that holds {', '.join(map(str, asked))}: {load_test.highest_rate:g} frames/s a stream"
+            f"the highest rate that meets {', '.join(map(str, asked))}: {load_test.highest_rate:g} frames/s a stream"
         )
     for line in load_test.violations:
         click.echo(f"catstream: broken: {line}", err=True)
     if load_test.violations:
-        sys.exit(_BROKEN)
+        sys.exit(_FAILED)
 
 
 def _writable(json_file: Path | None, output: Path | None) -> None:
-    """Refuse places that cannot be written to before minutes are spent."""
+    """Check before the run that the results can be written."""
     if output is not None:
         try:
             output.mkdir(parents=True, exist_ok=True)
@@ -165,9 +176,9 @@ def _writable(json_file: Path | None, output: Path | None) -> None:
 
 
 def _step(step: Step) -> str:
-    verdict = f"[red]{'; '.join(step.violations)}[/]" if step.violations else "[green]holds[/]"
+    verdict = f"[red]{'; '.join(step.violations)}[/]" if step.violations else "[green]met[/]"
     p99 = _ms(step.result.track["p99"])
-    return f"{step.rate:g} frames/s due, {step.followed:.1f} followed, p99 {p99} ms: {verdict}"
+    return f"{step.rate:g} frames/s due, {step.followed:.1f} tracked, p99 {p99} ms: {verdict}"
 
 
 def _print(console: Console, result: Result, limits: list[Limit]) -> None:
@@ -208,7 +219,7 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
             f"other processes kept {result.other_load:.1f} cores busy: run it on a quiet machine for reliable figures"
         )
     for limit in limits:
-        mark = "[green]held[/]" if limit.is_met(result) else "[red]broken[/]"
+        mark = "[green]met[/]" if limit.is_met(result) else "[red]broken[/]"
         console.print(f"{mark}: {limit.describe(result)}")
 
 

@@ -1,4 +1,4 @@
-"""Load tests: real pipelines on a broadcast whose every frame is known, at a rate that does not wait for them."""
+"""Load tests: real pipelines track a test stream that is sent at a fixed rate, whether or not they keep up."""
 
 from catstream.extras import require_extra
 

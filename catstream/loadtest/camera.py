@@ -1,6 +1,6 @@
-"""The camera: a process that renders the demo's video once, and broadcasts it to all streams.
+"""The camera of a load test: a process that renders the demo video once and sends it to all streams.
 
-By itself, so that frames leave when they are due whatever else the load test is busy with.
+It is a process of its own so that frames are sent on time regardless of other work of the load test.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ __all__ = ["Camera"]
 
 
 class Camera:
-    """Runs while it is open.
+    """Starts the camera process; a context manager.
 
     Parameters
     ----------
-    streams : how many it broadcasts
-    size : (width, height) of a frame, pixels
-    pictures : different frames to render; a longer video shows them backwards, then forwards again
+    streams : number of streams
+    size : (width, height) of a frame in pixels
+    pictures : number of different images to render; a longer video repeats them backwards, then forwards again
 
     Attributes
     ----------
-    urls : of each stream; known once it has rendered
-    truth : float64 (pictures, 4), the object's box in each picture, NaN where it is absent
-    pid : of its process
+    urls : URL of each stream; set by `render`
+    truth : ground truth box in each image, float64 (pictures, 4), NaN if the object is absent; set by `render`
+    pid : id of the process
     """
 
     def __init__(self, streams: int, size: tuple[int, int], pictures: int) -> None:
@@ -45,7 +45,7 @@ class Camera:
         self._other = other
 
     def render(self, done: Callable[[int], None] = lambda _: None) -> None:
-        """Wait until all is rendered; `done` is called with the number of pictures so far."""
+        """Wait until all images are rendered; `done` is called with their number so far."""
         while isinstance(message := self._receive(), int):
             done(message)
         self.urls, boxes = message
@@ -57,21 +57,21 @@ class Camera:
 
     @property
     def box(self) -> Box:
-        """The object in the picture that is shown before the start."""
+        """Box of the object in the still image that is shown before the start."""
         return Box(*self.truth[0].tolist())
 
     @property
     def late(self) -> float:
-        """Seconds by which it sent a frame of this schedule too late at most, by its own fault."""
+        """Largest delay in seconds of a frame of this schedule that was not caused by a slow receiver."""
         self._pipe.send(None)
         return self._receive()
 
     def show_still(self) -> None:
-        """Show the first picture, at the video's own rate."""
+        """Send the first image repeatedly, at the frame rate of the video."""
         self.play(Schedule(monotonic(), demo.RATE, frames=1))
 
     def play(self, schedule: Schedule) -> list[Schedule]:
-        """Show the video from the start of a schedule on; returns the schedule of each stream."""
+        """Send the video by a schedule; return the schedule of each stream."""
         self._pipe.send(schedule)
         return self._receive()
 
@@ -89,7 +89,7 @@ class Camera:
         try:
             return self._pipe.recv()
         except (EOFError, ConnectionError):
-            raise ServiceError("the camera of the load test has died: its last words are above") from None
+            raise ServiceError("the camera of the load test has exited: its error is printed above") from None
 
 
 def _run_camera(pipe: Connection, streams: int, size: tuple[int, int], pictures: int, parent: int) -> None:

@@ -1,4 +1,4 @@
-"""Chaos: now and then a random process of a random stream is killed."""
+"""Kills random processes of random streams at random times."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from catstream.loadtest.stream import Stream
 
 __all__ = ["Chaos", "Kill"]
 
-_PAUSE_SECONDS = 4.0  # from one kill to the next, on average
-_MAX_KILLS, _PER_SECONDS = 4, 60.0  # of one process: a supervisor gives up after more than five
+_PAUSE_SECONDS = 4.0  # mean time between two kills
+_MAX_KILLS, _PER_SECONDS = 4, 60.0  # for each process: the supervisor gives up after more than five deaths
 
 
 @dataclass(frozen=True, slots=True)
 class Kill:
-    """One process that was killed.
+    """A process that was killed.
 
-    moment   by `time.monotonic`
-    stream   its number
-    process  its name
+    moment   time by `time.monotonic`
+    stream   number of the stream
+    process  name of the process
     """
 
     moment: float
@@ -32,9 +32,9 @@ class Kill:
 
 
 class Chaos:
-    """Kills by SIGKILL; whom and when is drawn from a seed.
+    """Kills processes by SIGKILL; victims and times are drawn from a seed.
 
-    kills  so far, oldest first
+    kills  the kills so far, oldest first
     """
 
     def __init__(self, seed: int) -> None:
@@ -43,7 +43,7 @@ class Chaos:
         self._due = monotonic() + self._pause()
 
     def step(self, streams: list[Stream]) -> None:
-        """Kill one, where it is time."""
+        """Kill a process if a kill is due."""
         now = monotonic()
         if now < self._due:
             return

@@ -1,4 +1,4 @@
-"""Processes of a load test beside the pipelines: the camera, and those who read."""
+"""Starts the processes of a load test beside the pipelines: the camera and the subscribers."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ __all__ = ["SPAWN", "start"]
 
 
 def start(process: BaseProcess) -> None:
-    """Start a process that Ctrl-C does not reach: it is for this one, which then ends them in order."""
-    SPAWN.get_context()  # starts the resource tracker: with the first process it would unblock the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits what is blocked
+    """Start a process in which SIGINT is blocked: on Ctrl-C, the parent ends its children in order."""
+    SPAWN.get_context()  # starts the resource tracker now, because its start unblocks the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits the signal mask
     try:
         process.start()
     finally:

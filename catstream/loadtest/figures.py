@@ -1,4 +1,4 @@
-"""All figures of a load test, as JSON holds them."""
+"""The figures of a load test as JSON."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["to_json"]
 
 
 def to_json(load_test: LoadTest) -> dict[str, Any]:
-    """The figures of the run that counts, of the steps that led to it, and what they were made with.
+    """Return the figures of the decisive run, those of the search steps, and the provenance.
 
-    Seconds, shares from 0 to 1, bytes.
+    Units are seconds, bytes, and shares from 0 to 1.
     """
     result = load_test.result
     plan = result.plan

@@ -1,4 +1,4 @@
-"""Latencies in a histogram of high dynamic range: three digits of each, from a microsecond to an hour."""
+"""Latencies in an HDR histogram, from a microsecond to an hour with three significant digits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from catstream.errors import VideoError
 
 __all__ = ["PERCENTILES", "Latencies"]
 
-#: What is told of them, by name.
+#: The percentiles that are reported, by name.
 PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
 _LONGEST = 3_600_000_000  # microseconds
@@ -20,7 +20,7 @@ _DIGITS = 3
 
 
 class Latencies:
-    """Of some frames, in seconds.
+    """The latencies of some frames in seconds.
 
     >>> Latencies([0.010] * 98 + [0.5, 2.0])["p99"]
     0.5
@@ -36,22 +36,22 @@ class Latencies:
         return len(self.seconds)
 
     def __getitem__(self, name: str) -> float:
-        """A percentile by its name, NaN where there is no latency."""
+        """Return a percentile by its name, NaN if there are no latencies."""
         if not len(self):
             return float("nan")
         return float(f"{self._histogram.get_value_at_percentile(PERCENTILES[name]) / 1e6:.{_DIGITS}g}")
 
     def figures(self) -> dict[str, float | None]:
-        """All of `PERCENTILES`, None where there is no latency."""
+        """Return all `PERCENTILES`, None if there are no latencies."""
         return {name: self[name] if len(self) else None for name in PERCENTILES}
 
     def write(self, path: Path) -> None:
-        """Write the distribution of percentiles, in milliseconds, as HdrHistogram's plotter reads it (.hgrm).
+        """Write the percentile distribution in milliseconds, in the .hgrm format of HdrHistogram's plotter.
 
         Raises
         ------
         VideoError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         try:
             with path.open("wb") as file:

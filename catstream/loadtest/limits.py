@@ -1,4 +1,4 @@
-"""Limits: what a run must hold, and what of it was violations."""
+"""Limits on the measures of a load test, and their violations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["KINDS", "Limit", "violations"]
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
-    """What a limit may be on: how it is read off a result, and whether more of it is better."""
+    """A quantity that can have a limit: its description, its value in a result, and whether the limit is a minimum."""
 
     about: str
     measure: Callable[[Result], float]
@@ -31,18 +31,18 @@ def _recovery(result: Result) -> float:
     return max((recovery.track or never for recovery in result.recoveries), default=0.0)
 
 
-#: All limits, by name. Of several streams the worst counts.
+#: All quantities that can have a limit, by name. If there are several streams, the worst one counts.
 KINDS: dict[str, _Quantity] = {
     **{name: _Quantity("seconds from a frame to its track", _worst(name, "track")) for name in PERCENTILES},
     **{
-        f"model-{name}": _Quantity("seconds from a frame to the model that has seen it", _worst(name, "model"))
+        f"model-{name}": _Quantity("seconds from a frame to the model trained on it", _worst(name, "model"))
         for name in PERCENTILES
     },
     "skipped": _Quantity(
-        "share of frames that were not followed",
+        "share of frames that were not tracked",
         lambda result: max(stream.skipped_share for stream in result.streams),
     ),
-    "missed": _Quantity("share of tracks that quick subscribers missed", lambda result: result.missed_share),
+    "missed": _Quantity("share of tracks that fast subscribers missed", lambda result: result.missed_share),
     "recovery": _Quantity("seconds from a kill to the next track", _recovery),
     "success": _Quantity(
         "share of frames with an overlap above 0.5",
@@ -54,7 +54,7 @@ KINDS: dict[str, _Quantity] = {
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """One limit: a name of `KINDS`, and the value to hold.
+    """A limit on one of the quantities in `KINDS`.
 
     >>> Limit.parse("p99=0.1")
     Limit(name='p99', value=0.1)
@@ -70,7 +70,7 @@ class Limit:
         Raises
         ------
         SettingsError
-            Where it is not that.
+            If the text has another format, or the name is unknown.
         """
         name, _, number = text.partition("=")
         try:
@@ -91,12 +91,12 @@ class Limit:
         return (operator.ge if kind.minimum else operator.le)(kind.measure(result), self.value)
 
     def describe(self, result: Result) -> str:
-        """What it is, and what came of it."""
+        """Describe the limit and the measured value."""
         kind = KINDS[self.name]
         sense = "least" if kind.minimum else "most"
-        return f"{self.name} is {kind.measure(result):.4g}, to be at {sense} {self.value:g} ({kind.about})"
+        return f"{self.name} is {kind.measure(result):.4g}, limit at {sense} {self.value:g} ({kind.about})"
 
 
 def violations(limits: list[Limit], result: Result) -> list[str]:
-    """What was violations, in a line each: limits, and streams that failed."""
+    """Return a line for each stream that failed and each limit that was not met."""
     return [*result.errors, *(limit.describe(result) for limit in limits if not limit.is_met(result))]

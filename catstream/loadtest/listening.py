@@ -1,4 +1,4 @@
-"""Listening to many sockets at once: to each message as it comes, or now and then."""
+"""Receives from many subscribers in one thread, at once or at intervals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Key = TypeVar("Key")
 def arrivals(
     readers: Mapping[Key, Subscriber], is_over: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Key, float, Any]]:
-    """Who received, when by `time.monotonic`, and what; each until its End, all until `is_over`."""
+    """Yield (key of the subscriber, arrival time by `time.monotonic`, message) until `is_over` or all have ended."""
     poller, keys = select.poll(), {}
     for key, reader in readers.items():
         keys[reader.fileno()] = key
@@ -37,7 +37,7 @@ def arrivals(
 
 
 def rounds(readers: Mapping[Key, Subscriber], pause: float, most: int) -> Iterator[tuple[Key, Any]]:
-    """Who received what: at most so many messages of each, then a pause of seconds; each until its End."""
+    """Yield (key of the subscriber, message): at most `most` messages of each, then a pause, until all have ended."""
     left = set(readers)
     while left:
         for key, reader in readers.items():

@@ -1,4 +1,4 @@
-"""A whole load test: one run, or one for each rate until the highest that holds is known."""
+"""A load test: a single run, or the search for the highest rate at which the limits are met."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ __all__ = ["LoadTest", "Step", "run_load_test"]
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One run, and what it broke."""
+    """One run and its violations of the limits."""
 
     result: Result
     violations: list[str]
 
     @property
     def rate(self) -> float:
-        """Frames a second that were due."""
+        """Frames per second that were due."""
         return self.result.plan.rate
 
     @property
     def followed(self) -> float:
-        """Frames a second that were followed, of the worst stream."""
+        """Frames per second that were tracked in the worst stream."""
         return min(stream.rate(self.rate) for stream in self.result.streams)
 
 
@@ -51,17 +51,17 @@ class LoadTest:
 
     @property
     def result(self) -> Result:
-        """The run that counts: of a search, that with the highest rate that held; the last one where none did."""
+        """The decisive run: the one with the highest rate that meets the limits, or the last one if none does."""
         held = [step for step in self.steps if not step.violations]
         return max(held, key=lambda step: step.rate, default=self.steps[-1]).result
 
     @property
     def violations(self) -> list[str]:
-        """Why it is no success, a line each."""
+        """The reasons why the load test has failed, one line each."""
         if not self.is_search:
             return [line for step in self.steps for line in step.violations]
         if self.highest_rate is None and not self.interrupted:
-            return [f"no rate holds {', '.join(map(str, self.limits))}: the last one, {self.steps[-1].rate:g}, did not"]
+            return [f"no rate meets {', '.join(map(str, self.limits))}: the lowest tried was {self.steps[-1].rate:g}"]
         return []
 
 
@@ -73,13 +73,13 @@ def run_load_test(
     report_status: Callable[[Status], None] = lambda _: None,
     step_done: Callable[[Step], None] = lambda _: None,
 ) -> LoadTest:
-    """Run a load test. Ctrl-C ends it: what was measured so far is returned.
+    """Run a load test. After Ctrl-C, the measurements so far are returned.
 
     Parameters
     ----------
-    find : look for the highest rate that holds, from that of the plan on
-    report_status : called ten times a second or so
-    step_done : called after each run
+    find : search for the highest rate that meets the limits, beginning with that of the plan
+    report_status : function that is called about ten times a second
+    step_done : function that is called after each run
     """
     load_test = LoadTest(limits, find)
     pictures = demo.FRAMES if find else min(plan.frames, demo.FRAMES)

@@ -1,8 +1,8 @@
-"""From what was observations of a stream to what it is worth under load.
+"""Computes the measures of one stream under load from the messages that were received.
 
-Every frame that was due counts once, whether it was followed or skipped: its latency ends with the first track of
-it or of a newer frame, and with the first model whose sample summarises it or a newer one. So a pipeline that
-skips what comes while it is slow gets no better figures for it (no coordinated omission).
+Every due frame counts once, tracked or skipped. Its track latency ends with the first track of this frame or a newer
+one; its model latency ends with the first model whose training sample includes this frame or a newer one. Thus a
+pipeline does not get better figures by skipping frames while it is slow (no coordinated omission).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from catstream.video.broadcast import Schedule
 
 __all__ = ["Measures", "carried_forward", "latencies_to_answer", "measure"]
 
-_SUCCESS = 0.5  # overlap with the truth above which a frame counts as followed well
+_SUCCESS = 0.5  # a frame with a larger overlap with the ground truth is a success
 
 
 @dataclass(slots=True)
@@ -49,12 +49,12 @@ class Measures:
 
     @property
     def frames(self) -> int:
-        """That were due."""
+        """Number of due frames."""
         return len(self.due)
 
     @property
     def skipped(self) -> int:
-        """Frames without a track of their own: a newer one came, or nobody was there."""
+        """Number of frames without a track of their own."""
         return self.frames - int(self.followed.sum())
 
     @property
@@ -62,7 +62,7 @@ class Measures:
         return self.skipped / self.frames
 
     def rate(self, rate: float) -> float:
-        """Frames a second that were followed, of so many due."""
+        """Return the tracked frames per second if `rate` frames per second were due."""
         return rate * (1 - self.skipped_share)
 
     @property
@@ -73,15 +73,16 @@ class Measures:
 def measure(
     observations: Observations, schedule: Schedule, frames: int, truth: np.ndarray, end: float, totals: dict[str, int]
 ) -> Measures:
-    """What one stream is worth.
+    """Compute the measures of one stream.
 
     Parameters
     ----------
-    schedule : the camera's
-    frames : how many were due: all of the schedule, or those before an interruption
-    truth : float64 (pictures, 4), NaN where absent
-    end : when nobody looked any more
-    totals : of the pipeline, at its end
+    observations : messages of the stream
+    schedule : schedule of the camera
+    frames : number of due frames: all of the schedule, or those before an interruption
+    truth : ground truth, float64 (pictures, 4), NaN if the object is absent
+    end : time at which the observation ended
+    totals : totals of the pipeline at its end
     """
     due = np.array([schedule.due(number) for number in range(frames)])
     tracks = [
@@ -121,17 +122,17 @@ def measure(
 def latencies_to_answer(
     due: np.ndarray, numbers: np.ndarray, moments: np.ndarray, end: float
 ) -> tuple[np.ndarray, int]:
-    """Seconds from each frame's moment to the first answer to it or to a newer frame.
+    """Return the seconds from each frame's due time to the first answer for this frame or a newer one.
 
     Parameters
     ----------
-    due : float64 (frames,), moments
-    numbers, moments : of each answer, the frame and when it came, int and float64 (answers,)
-    end : when an answer to a frame that has none is taken to have come
+    due : due times, float64 (frames,)
+    numbers, moments : frame number and arrival time of each answer, int and float64 (answers,)
+    end : arrival time that is assumed for frames without an answer
 
     Returns
     -------
-    float64 (frames,), and how many of them have no answer
+    float64 (frames,), and the number of frames without an answer
 
     >>> latencies_to_answer(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0, 2]), np.array([0.5, 2.5]), end=9.0)
     (array([0.5, 1.5, 0.5, 6. ]), 1)
@@ -145,7 +146,7 @@ def latencies_to_answer(
 
 
 def carried_forward(boxes: np.ndarray, followed: np.ndarray) -> np.ndarray:
-    """The boxes that were known at each frame: its own, or of the last one before it that was followed.
+    """Return the last known box at each frame: its own, or that of the last tracked frame before it.
 
     >>> carried_forward(np.array([[1.0], [2.0], [3.0]]), np.array([False, True, False])).ravel()
     array([nan,  2.,  2.])
@@ -160,9 +161,10 @@ def _success(boxes: np.ndarray, truth: np.ndarray) -> float | None:
 
 
 def _models(observations: Observations, schedule: Schedule) -> list[tuple[float, int]]:
-    """When each model came, and the newest frame that it summarises, in the numbers of the schedule.
+    """Return the arrival time of each model, and the newest frame of its sample as a number of the schedule.
 
-    A restarted detector gives frames that were lost with it new pictures: what a number stands for depends on the time.
+    After a restart, the detector reuses the numbers of frames that were lost. The mapping from its frame numbers to the
+    schedule therefore depends on the time.
     """
     number_of_frame: dict[int, int] = {}
     models, tracks = [], iter(observations.tracks)

@@ -1,4 +1,4 @@
-"""What can be observations of running pipelines from outside, and when: their tracks, models and health."""
+"""Records the tracks, models and health reports of running pipelines with their arrival times."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["Observations", "Observer"]
 
 @dataclass(slots=True)
 class Observations:
-    """What came from one pipeline, each with its moment by `time.monotonic`, oldest first.
+    """The messages of one pipeline with their arrival times by `time.monotonic`, oldest first.
 
-    tracks  as they came; a restarted detector may repeat a `seq`, with another frame
-    models  the frame of each, in the numbers that tracks had when it came
-    health  counters of each process
-    first_motion_version  version of the first model that knows how the object moves, 0 before it
+    tracks  tracks in order of arrival; a restarted detector may repeat a `seq` with another frame
+    models  newest training frame of each model, numbered as the tracks were at its arrival
+    health  health reports of all processes
+    first_motion_version  version of the first model with a motion model, 0 before it
     """
 
     tracks: list[tuple[float, Track]] = field(default_factory=list)
@@ -31,7 +31,7 @@ class Observations:
 
     @property
     def warmed_up(self) -> bool:
-        """Whether all that happens only once has happened: the detector has gone on with such a model."""
+        """Whether the start-up phase is over: the detector uses a model with a motion model."""
         return (
             self.first_motion_version > 0
             and bool(self.tracks)
@@ -40,11 +40,11 @@ class Observations:
 
 
 class Observer(threading.Thread):
-    """Subscribes like anybody else, and writes down the moment; `end` it.
+    """A thread that subscribes to the pipelines until `end` is called.
 
     Attributes
     ----------
-    observations : of each endpoint
+    observations : observations of each endpoint
     """
 
     def __init__(self, endpoints: list[str], keys: str) -> None:

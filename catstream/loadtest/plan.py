@@ -1,4 +1,4 @@
-"""What a load test is to do."""
+"""The plan of a load test."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ __all__ = ["Plan"]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """One run.
+    """The parameters of one run.
 
-    streams      pipelines side by side, each of three processes
-    subscribers  of the tracks of each stream
-    slow         of them slow, and every other one of these frozen
-    rate         frames a second of each stream, due whether or not the pipeline keeps up
+    streams      number of pipelines, each of three processes
+    subscribers  number of subscribers to the tracks of each stream
+    slow         number of those that are slow; half of these are frozen instead
+    rate         frames per second of each stream, whether or not the pipeline keeps up
     duration     seconds
-    size         (width, height) of a frame, pixels
-    chaos        whether processes are killed meanwhile
-    settings     of all pipelines; the seed is that of the chaos too
+    size         (width, height) of a frame in pixels
+    chaos        whether random processes are killed during the run
+    settings     settings of all pipelines; their seed is used for the chaos too
 
     Raises
     ------
     SettingsError
-        For settings that the streams cannot have.
+        If the parameters contradict one another, or a setting is not possible in a load test.
     """
 
     streams: int = 1
@@ -42,16 +42,16 @@ class Plan:
     def __post_init__(self) -> None:
         if self.slow > self.subscribers:
             raise SettingsError(
-                f"{self.slow} of {self.subscribers} subscribers cannot be slow: attach more, or fewer slow"
+                f"{self.slow} of {self.subscribers} subscribers cannot be slow: give more, or fewer slow ones"
             )
         if self.frames < 1:
             raise SettingsError(
                 f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: give a higher rate or more seconds"
             )
         if self.settings.run.lockstep:
-            raise SettingsError("the frames of a load test do not wait: leave lockstep away")
+            raise SettingsError("the frames of a load test do not wait for models: leave out lockstep")
         if self.settings.run.endpoint:
-            raise SettingsError("each stream of a load test meets in a folder of its own: leave endpoint away")
+            raise SettingsError("each stream of a load test has an endpoint of its own: leave out endpoint")
 
     def __str__(self) -> str:
         streams = f"{self.streams} streams" if self.streams > 1 else "1 stream"
@@ -59,10 +59,10 @@ class Plan:
 
     @property
     def frozen(self) -> int:
-        """Subscribers that are frozen, of those that are slow."""
+        """Number of the slow subscribers that are frozen."""
         return self.slow // 2
 
     @property
     def frames(self) -> int:
-        """Frames of each stream."""
+        """Number of frames of each stream."""
         return round(self.rate * self.duration)

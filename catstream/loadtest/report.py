@@ -1,4 +1,4 @@
-"""The report of a load test: one HTML file with its figures and plots."""
+"""Writes the report of a load test as one HTML file with figures and plots."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from catstream.loadtest.usage import summary
 
 __all__ = ["write_report"]
 
-_STREAMS = 6  # curves that can be told apart
-_POINTS = 200  # of a curve over time
+_STREAMS = 6  # maximum number of curves in a plot
+_POINTS = 200  # maximum number of points of a curve over time
 
 
 def write_report(path: Path, load_test: LoadTest) -> Path:
-    """Write the report of the run that counts, and of the steps that led to it.
+    """Write the report of the decisive run, and of the search steps.
 
     Raises
     ------
     VideoError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     result = load_test.result
     plan = result.plan
     about = (
         f"{plan}, {result.seconds:.1f} s{', interrupted' if load_test.interrupted else ''}. Latency counts from the "
-        "moment at which a frame was due; a skipped one waits for the track of a newer one."
+        "due time of a frame; the latency of a skipped frame ends with the track of a newer one."
     )
     return write_page(
         path,
         "load test",
         [
-            "<h1>How it bears the load</h1>",
+            "<h1>Load test</h1>",
             f'<p class="about">{about}</p>',
             *(f'<p class="bad">{escape(error)}</p>' for error in result.errors),
             _limits(load_test),
@@ -53,10 +53,10 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
             _processes(result),
             _subscribers(result),
             _chaos(result),
-            "<h2>How far to trust this</h2>",
-            f'<p class="about">The camera sent no frame more than {_ms(result.camera_late)} ms after it was due by its '
-            "own fault: latencies are not better known than that. What is not of the load test kept "
-            f"{result.other_load:.2f} cores busy meanwhile: on a quiet machine that is next to none.</p>",
+            "<h2>Reliability</h2>",
+            '<p class="about">The precision of the latencies is the largest delay that the camera itself caused: '
+            f"{_ms(result.camera_late)} ms. Other processes of this machine kept {result.other_load:.2f} cores busy during "
+            "the run; on a quiet machine it is close to 0.</p>",
             "<h2>Settings that are not the default</h2>",
             f"<pre>{escape(chr(10).join(plan.settings.changed()) or 'none')}</pre>",
         ],
@@ -66,7 +66,7 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
 def _limits(load_test: LoadTest) -> str:
     lines = []
     for limit in load_test.limits:
-        style, word = ("good", "held") if limit.is_met(load_test.result) else ("bad", "broken")
+        style, word = ("good", "met") if limit.is_met(load_test.result) else ("bad", "broken")
         lines.append(f'<li class="{style}">{word}: {escape(limit.describe(load_test.result))}</li>')
     return f"<ul>{''.join(lines)}</ul>" if lines else ""
 
@@ -76,7 +76,7 @@ def _steps(load_test: LoadTest) -> str:
         return ""
     rows = []
     for step in load_test.steps:
-        style, verdict = ("bad", "; ".join(step.violations)) if step.violations else ("good", "holds")
+        style, verdict = ("bad", "; ".join(step.violations)) if step.violations else ("good", "met")
         latencies = [_ms(step.result.track[name]) for name in PERCENTILES]
         rows.append(
             [
@@ -86,17 +86,17 @@ def _steps(load_test: LoadTest) -> str:
                 *latencies,
             ]
         )
-    heads = ["due", "", "followed", *(f"{name} ms" for name in PERCENTILES)]
+    heads = ["due", "limits", "tracked", *(f"{name} ms" for name in PERCENTILES)]
     if load_test.highest_rate:
-        found = f"The highest rate that holds: {load_test.highest_rate:g} frames/s"
+        title = f"The highest rate that meets the limits: {load_test.highest_rate:g} frames/s"
     else:
-        found = "Interrupted before a rate was found" if load_test.interrupted else "No rate holds"
-    return f'<h2>{found}</h2><p class="about">The runs, in this order.</p>{table(heads, rows, texts=2)}'
+        title = "Interrupted before a rate was found" if load_test.interrupted else "No rate meets the limits"
+    return f'<h2>{title}</h2><p class="about">The runs, in this order.</p>{table(heads, rows, texts=2)}'
 
 
 def _streams(result: Result) -> str:
     heads = ["stream", "frames", "frames/s", "skipped", *(f"track {name}" for name in PERCENTILES)]
-    heads += [f"model {name}" for name in ("p50", "p99")] + ["lag", "not stored", "success", "of followed"]
+    heads += [f"model {name}" for name in ("p50", "p99")] + ["lag", "not stored", "success", "of tracked"]
     rows = [
         [
             number,
@@ -119,8 +119,9 @@ def _streams(result: Result) -> str:
         ]
         rows.append(["all", sum(stream.frames for stream in result.streams), "", "", *latencies, "", "", "", ""])
     note = (
-        '<p class="about">Milliseconds. Lag: messages that the compressor had not taken, at most. Success: share of '
-        "frames with an overlap with the truth above 0.5; a skipped frame has the box that was known before it.</p>"
+        '<p class="about">Latencies in milliseconds. Lag: maximum number of messages that the compressor had not yet '
+        "received. Success: share of frames with an overlap with the ground truth above 0.5; a skipped frame has the "
+        "last known box.</p>"
     )
     return table(heads, rows, means=several) + note
 
@@ -138,9 +139,9 @@ def _plots(result: Result) -> str:
         lag[f"stream {number}"] = reports[:, 0] - start, reports[:, 1]
     parts = [
         _percentiles("From frame to track", [measures.track for _, measures in shown]),
-        _percentiles("From frame to the model that has seen it", [measures.model for _, measures in shown]),
+        _percentiles("From frame to the model trained on it", [measures.model for _, measures in shown]),
         _lines("Latency to the track over time", seconds, "ms", over_time),
-        _lines("Frames followed", seconds, "frames/s", rates, minimum=result.plan.rate),
+        _lines("Frames tracked", seconds, "frames/s", rates, minimum=result.plan.rate),
         _lines("Lag of the compressor", seconds, "messages", lag, minimum=5),
     ]
     for title, unit, column, scale in (("Processor", "cores", 1, 1.0), ("Memory", "MB", 2, 1e-6)):
@@ -149,14 +150,14 @@ def _plots(result: Result) -> str:
 
 
 def _percentiles(title: str, streams: Iterable[Latencies]) -> str:
-    """Latency by percentile; each step to the right is a tenth of the frames."""
+    """Plot latency by percentile on a logarithmic axis: each tick to the right is a tenth of the remaining frames."""
     streams = list(streams)
-    nines = max(1, math.ceil(math.log10(max(map(len, streams)))))  # no percentile is known beyond one frame of all
+    nines = max(1, math.ceil(math.log10(max(map(len, streams)))))  # the highest percentile is that of one frame
     ticks = tuple((float(nine), f"{100 - 100 / 10**nine:g} %") for nine in range(nines + 1))
     curves = {}
     for number, latencies in enumerate(streams):
         ordered = 1000 * np.sort(latencies.seconds)
-        above = 1 - np.arange(len(ordered)) / len(ordered)  # share of the frames that waited as long, or longer
+        above = 1 - np.arange(len(ordered)) / len(ordered)  # share of the frames with this latency or a longer one
         curves[f"stream {number}"] = _thinned(-np.log10(above), ordered)
     most = max(float(ys.max()) for _, ys in curves.values())
     return plot(title, Axis("share of frames that waited less", nines, ticks), Axis.upto(most, "ms"), curves)
@@ -170,7 +171,7 @@ def _lines(
 
 
 def _thinned(xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The largest value of each of `_POINTS` stretches: no peak is lost."""
+    """Reduce a curve to the maximum of each of `_POINTS` intervals, so that no peak is lost."""
     if len(xs) <= _POINTS:
         return xs, ys
     places = np.linspace(xs[0], xs[-1], _POINTS)
@@ -182,14 +183,14 @@ def _thinned(xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rate(measures: Measures, when: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Frames a second that were followed, in each second."""
+    """Return the number of tracked frames in each second."""
     seconds = (when - when[0]).astype(int)
     share = np.bincount(seconds, measures.followed) / np.bincount(seconds)
     return np.arange(len(share)) + 0.5, rate * share
 
 
 def _kinds(result: Result, column: int, scale: float, start: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Samples of all processes of a kind, added up over the streams."""
+    """Return the readings of each kind of process, summed over the streams."""
     kinds: dict[str, list[np.ndarray]] = {}
     for name, readings in result.usage.items():
         kinds.setdefault(name.rstrip(" 0123456789"), []).append(np.array(readings, float))
@@ -218,9 +219,9 @@ def _subscribers(result: Result) -> str:
         return ""
     received, missed = result.received or [0], result.missed or [0]
     return (
-        f'<h2>Subscribers</h2><p class="about">{plan.subscribers} to each stream, of which {plan.slow} slow: '
-        f"{plan.frozen} of these frozen for {result.frozen:.0f} s. The quick ones received {min(received)} to "
-        f"{max(received)} tracks each, and missed {sum(missed)} in all, {max(missed)} at most.</p>"
+        f'<h2>Subscribers</h2><p class="about">{plan.subscribers} to each stream, of which {plan.slow} are slow; '
+        f"{plan.frozen} of these were frozen for {result.frozen:.0f} s. The fast ones received {min(received)} to "
+        f"{max(received)} tracks each, and missed {sum(missed)} in total, {max(missed)} at most.</p>"
     )
 
 

@@ -1,4 +1,4 @@
-"""One load test, from the first process to the last figure."""
+"""One run of a load test: starts the processes, runs the schedule, and collects the measurements."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from catstream.video.broadcast import Schedule
 
 __all__ = ["Recovery", "Result", "Status", "run"]
 
-_START_TIMEOUT_SECONDS = 120.0  # for all to be ready
-_LEAD_SECONDS = 0.5  # from "ready" to the first frame
-_GRACE_SECONDS = 3.0  # for the track of the last frame
-_NO_KILL_SECONDS = 5.0  # before the last frame without a kill: who was killed has time to come back
-_READING_SECONDS = 0.5  # from one reading of processor and memory to the next
+_START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
+_LEAD_SECONDS = 0.5  # from the end of the start to the first frame
+_GRACE_SECONDS = 3.0  # to wait for the track of the last frame
+_NO_KILL_SECONDS = 5.0  # no kills this long before the last frame, so that killed processes can recover
+_READING_SECONDS = 0.5  # between two readings of processor and memory use
 _LOOP_SECONDS = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """How far a run is: what it is activity, the share of that which is done, and figures of the moment."""
+    """Progress of a run: current activity, share of it that is done, and current figures."""
 
     activity: str
     share: float
@@ -45,7 +45,7 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """Seconds from a kill to the next track of a later frame, and to the next model; None where none came."""
+    """Seconds from a kill to the next track of a later frame, and to the next model; None if there was none."""
 
     kill: Kill
     track: float | None
@@ -84,39 +84,39 @@ class Result:
 
     @property
     def track(self) -> Latencies:
-        """Of the frames of all streams."""
+        """Track latencies of all streams."""
         return Latencies(np.concatenate([stream.track.seconds for stream in self.streams]))
 
     @property
     def model(self) -> Latencies:
-        """The same to the model that has observations them."""
+        """Model latencies of all streams."""
         return Latencies(np.concatenate([stream.model.seconds for stream in self.streams]))
 
     @property
     def other_load(self) -> float:
-        """Cores that were busy with what is not of the load test, on average."""
+        """Mean number of cores that were busy with processes outside the load test."""
         return summary(self.usage[REST])["cores"] if REST in self.usage else 0.0
 
     @property
     def missed_share(self) -> float:
-        """Of the tracks that quick subscribers should have received."""
+        """Share of the tracks that fast subscribers missed."""
         return sum(self.missed) / max(1, sum(self.missed) + sum(self.received))
 
 
 def run(plan: Plan, camera: Camera, report_status: Callable[[Status], None] = lambda _: None) -> Result:
-    """Run pipelines on what a camera broadcasts, and measure.
+    """Run pipelines on the streams of a camera, and measure.
 
-    Ctrl-C ends it early: what was measured so far is returned.
+    After Ctrl-C, the measurements so far are returned.
 
     Parameters
     ----------
-    camera : one that has rendered, and has as many streams
-    report_status : called ten times a second or so
+    camera : camera after `render`, with the number of streams of the plan
+    report_status : function that is called about ten times a second
 
     Raises
     ------
     CatstreamError
-        Where it could not begin.
+        If a pipeline cannot start.
     """
     camera.show_still()
     streams = [Stream(number, url, camera.box, plan.settings) for number, url in enumerate(camera.urls)]
@@ -189,7 +189,7 @@ def run(plan: Plan, camera: Camera, report_status: Callable[[Status], None] = la
 
 
 class _Monitor:
-    """What goes on while frames come: readings, chaos, and message."""
+    """Runs the loop during the schedule: readings of the processes, kills, and status reports."""
 
     def __init__(
         self, plan: Plan, camera: Camera, streams: list[Stream], groups: list[Subscribers], observer: Observer
@@ -205,7 +205,7 @@ class _Monitor:
         return self._chaos.kills if self._chaos else []
 
     def run(self, schedules: list[Schedule], report_status: Callable[[Status], None]) -> None:
-        """Until the last frame has its track, or was given up, or all streams have failed."""
+        """Run until the last frame is tracked or its grace time is over, or all streams have failed."""
         frames, last = self._plan.frames, schedules[-1].due(self._plan.frames - 1)
         while (now := monotonic()) < last + _GRACE_SECONDS and any(stream.is_alive() for stream in self._streams):
             if now > last and all(map(self._all_tracked, self._seen, schedules)):
@@ -241,7 +241,7 @@ class _Monitor:
 
 
 def _ask_to_stop(streams: list[Stream]) -> None:
-    """All of them, so that they end side by side."""
+    """Signal all pipelines first, so that they end concurrently."""
     for stream in streams:
         stream.ask_to_stop()
 
@@ -249,7 +249,7 @@ def _ask_to_stop(streams: list[Stream]) -> None:
 def _wait_until(
     condition: Callable[[], bool], streams: list[Stream], activity: str, report_status: Callable[[Status], None]
 ) -> None:
-    """Wait for something that all streams need to begin."""
+    """Wait for a condition of the start. Raises the error of a stream that failed."""
     deadline = monotonic() + _START_TIMEOUT_SECONDS
     while not condition():
         for stream in streams:

@@ -1,4 +1,4 @@
-"""Looking for the highest rate that holds."""
+"""Search for the highest rate at which a load test meets its limits."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 __all__ = ["find_highest_rate"]
 
-_LEAST, _MOST = 0.5, 1000.0  # frames a second
-_PRECISION = 0.05  # share of the rate by which it may be too low
+_LEAST, _MOST = 0.5, 1000.0  # frames per second
+_PRECISION = 0.05  # maximum relative error of the result
 
 
 def find_highest_rate(start: float, holds: Callable[[float], bool]) -> float | None:
-    """The highest rate that holds, to a twentieth; None where not even half a frame a second does.
+    """Return the highest rate for which `holds` is true, to within 5 %; None if it is false even for the lowest rate.
 
-    From a start it is doubled or halved until it lies between two rates, then bisected. `holds` is
-    called once a rate; where chance plays a part in what it says, so it does in the answer.
+    The rate is doubled or halved from `start` until the limit is between two rates, and then bisected. `holds` is
+    called once for each rate, so random variation of its result affects the answer.
 
     >>> find_highest_rate(25.0, lambda rate: rate <= 42)
     40.6

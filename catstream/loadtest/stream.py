@@ -15,19 +15,19 @@ from catstream.settings import Settings
 
 __all__ = ["Stream"]
 
-_STOP_SECONDS = 30.0
-_RETRY_SECONDS = 3.0  # one that was killed before it was told is restarted, and told then
+_STOP_SECONDS = 30.0  # time-out for a pipeline to end in order
+_RETRY_SECONDS = 3.0  # a detector that was killed before the signal is restarted, and signalled again after this time
 
 
 class Stream(threading.Thread):
-    """Runs a pipeline until it is told to `stop`: takes its results, and keeps its processes alive.
+    """Runs a pipeline until `stop` is called: consumes its tracks and supervises its processes.
 
     Attributes
     ----------
-    endpoint : where it meets, once it is `ready`
-    ready : set when its processes are started, or it has failed
-    error : why it failed, None where it has not
-    totals, restarts : as a `Pipeline` has them
+    endpoint : endpoint of the pipeline, once it is `ready`
+    ready : event that is set when the processes are started or the pipeline has failed
+    error : the error of a failed pipeline, else None
+    totals, restarts : as in `Pipeline`, set at the end
     """
 
     def __init__(self, number: int, url: str, box: Box, settings: Settings) -> None:
@@ -50,7 +50,7 @@ class Stream(threading.Thread):
                     pass
                 self.totals, self.restarts = pipeline.totals, pipeline.restarts
         except CatstreamError as error:
-            # A detector that is told to stop while it resumes has nothing to end.
+            # A detector that is signalled while it resumes exits without an end message.
             self.error = None if self._signalled else error
         finally:
             self._pipeline = None
@@ -58,20 +58,20 @@ class Stream(threading.Thread):
 
     @property
     def pids(self) -> dict[str, int]:
-        """Process id by name, of those that run now."""
+        """Ids of the running processes, by name."""
         pipeline = self._pipeline
         return pipeline.pids if pipeline is not None else {}
 
     def ask_to_stop(self) -> None:
-        """Tell the detector that no more frames are wanted: it ends when all that it sent is stored."""
+        """Send SIGTERM to the detector: it ends the run once all features that it sent are stored."""
         pid = self.pids.get("detector")
-        if pid is not None and pid not in self._signalled:  # a second signal would find it on its way out, and deaf
+        if pid is not None and pid not in self._signalled:  # a second signal could kill it during its shutdown
             self._signalled.add(pid)
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGTERM)
 
     def stop(self) -> None:
-        """End the pipeline in order, which may take a while."""
+        """End the pipeline in order, which may take some seconds."""
         deadline = monotonic() + _STOP_SECONDS
         while self.is_alive() and monotonic() < deadline:
             self.ask_to_stop()

@@ -1,4 +1,4 @@
-"""A group of subscribers: real sockets in processes of their own, most of them quick, some slow, some frozen."""
+"""Groups of fast, slow and frozen subscribers in processes of their own."""
 
 from __future__ import annotations
 
@@ -17,28 +17,30 @@ from catstream.wire.sockets import Subscriber
 
 __all__ = ["Subscribers"]
 
-_PER_PROCESS = 20  # readers in one process: a process each would be more than most machines hold
-#: Messages that a reader takes at once, at most, and seconds until it takes the next.
+_PER_PROCESS = 20  # subscribers in one process, because most machines cannot run a process for each
+#: Maximum number of messages that a subscriber reads at once, and seconds between two reads.
 _QUICK, _SLOW = (64, 0.05), (1, 0.5)
-_DRAIN_SECONDS = 20.0  # that quick readers have to take what is still on its way
+_DRAIN_SECONDS = 20.0  # time-out for fast subscribers to receive the last messages
 
 
 class Subscribers:
-    """Readers of the tracks of one pipeline, while it is open. They run where a core is idle, and the quick
-    ones take what has come twenty times a second: what is measured is the pipeline, not what readers do with a track.
+    """Subscribers to the tracks of one pipeline; a context manager.
+
+    They run with idle priority, and the fast ones read twenty times per second, so that they take little processor time
+    from the pipeline.
 
     Parameters
     ----------
-    endpoint, keys : where the pipeline is, as the settings say it
-    readers : how many in all
-    slow : of them take two messages a second
-    frozen : of them are stopped by `freeze`
+    endpoint, keys : endpoint and client keys of the pipeline
+    readers : total number of subscribers
+    slow : number of subscribers that read two messages per second
+    frozen : number of subscribers that are stopped by `freeze`
     """
 
     def __init__(self, endpoint: str, readers: int, *, slow: int = 0, frozen: int = 0, keys: str = "") -> None:
         self._quick, self._readers = readers - slow - frozen, readers
         self._received, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
-        self._frozen_since = 0.0  # when they were frozen
+        self._frozen_since = 0.0  # time of `freeze`
         self._groups: list[list[Any]] = []
         first = 0
         for size, pace in ((self._quick, _QUICK), (slow, _SLOW), (frozen, _QUICK)):
@@ -55,33 +57,33 @@ class Subscribers:
 
     @property
     def connected(self) -> bool:
-        """Whether each of them has received a track."""
+        """Whether each subscriber has received a track."""
         return all(self._received[: self._readers])
 
     @property
     def frozen_seconds(self) -> float:
-        """For how long some have been frozen."""
+        """Seconds since `freeze`, 0 before it."""
         return monotonic() - self._frozen_since if self._frozen_since else 0.0
 
     def freeze(self) -> None:
-        """Stop those that are to be frozen, once all are connected."""
+        """Stop the processes of the subscribers to be frozen, if all are connected."""
         if not self._frozen_since and self._groups[2] and self.connected:
             for process in self._groups[2]:
                 os.kill(process.pid, signal.SIGSTOP)
             self._frozen_since = monotonic()
 
     def wait(self) -> None:
-        """Until each quick reader has received the end, but not for ever."""
+        """Wait until each fast subscriber has received the end, with a time-out."""
         deadline = monotonic() + _DRAIN_SECONDS
         for process in self._groups[0]:
             process.join(max(0.0, deadline - monotonic()))
 
     def received(self) -> list[int]:
-        """Tracks that each quick reader has received."""
+        """Return the number of tracks that each fast subscriber has received."""
         return self._received[: self._quick]
 
     def missed(self) -> list[int]:
-        """Tracks that each quick reader has missed, by the gaps in `seq`."""
+        """Return the number of tracks that each fast subscriber has missed, by the gaps in `seq`."""
         return self._missed[: self._quick]
 
     def __enter__(self) -> Self:
@@ -101,7 +103,7 @@ class Subscribers:
 def _read_until_end(
     endpoint: str, keys: str, numbers: range, pace: tuple[int, float], received: Any, missed: Any, parent: int
 ) -> None:
-    """Be some of the readers, until the end."""
+    """Run some of the subscribers until the pipeline ends."""
     die_with(parent)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     readers = {number: Subscriber("tracks", Endpoint.parse(endpoint, keys)) for number in numbers}

@@ -1,4 +1,4 @@
-"""Processor and memory of processes, as time goes by."""
+"""Processor and memory use of processes over time."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import psutil
 
 __all__ = ["REST", "Usage", "UsageReading", "summary"]
 
-#: What is not ours on this machine: where it is busy, no figure is worth much.
+#: Name of the load by other processes of this machine. If it is high, the figures of a load test are unreliable.
 REST = "everything else"
 
 
 class UsageReading(NamedTuple):
-    """What a process took since the reading before.
+    """Processor and memory use of a process since the previous reading.
 
-    moment  by `time.monotonic`
-    cores   of the processor: 1.0 is one of them, all the time
-    memory  resident, in bytes
+    moment  time of the reading by `time.monotonic`
+    cores   mean number of busy cores
+    memory  resident memory in bytes
     """
 
     moment: float
@@ -28,25 +28,25 @@ class UsageReading(NamedTuple):
 
 
 class Usage:
-    """Samples of named processes; a name may stand for several, and for another one after a restart.
+    """Readings of named groups of processes; after a restart, the process ids of a group may change.
 
-    readings  of each name, oldest first, and of `REST`
+    readings  readings by name, oldest first, and those of `REST`
     """
 
     def __init__(self) -> None:
         self.readings: dict[str, list[UsageReading]] = {}
-        self._cpu_seconds: dict[int, float] = {}  # seconds of each process id
+        self._cpu_seconds: dict[int, float] = {}  # processor time by process id
         self._moment: float | None = None
 
     def read(self, moment: float, pids: Mapping[str, Iterable[int]]) -> None:
-        """Take a reading of each; the first read only says where they begin."""
+        """Add a reading of each group; the first call only initialises the processor times."""
         before, self._moment = self._moment, moment
-        # In percent of all cores, since the call before.
+        # psutil gives the percentage of all cores since its previous call.
         cores, memory = psutil.cpu_percent() / 100 * psutil.cpu_count(), psutil.virtual_memory().used
         for name, numbers in pids.items():
             busy, resident = 0.0, 0
             for pid in numbers:
-                with suppress(psutil.Error):  # it has just ended
+                with suppress(psutil.Error):  # the process has just ended
                     process = psutil.Process(pid)
                     seconds = sum(process.cpu_times()[:2])
                     busy += seconds - self._cpu_seconds.get(pid, 0.0)
@@ -61,7 +61,7 @@ class Usage:
 
 
 def summary(readings: Sequence[UsageReading]) -> dict[str, float]:
-    """Of one process: mean and most of its processor in cores, and of its memory in bytes."""
+    """Return mean and maximum of busy cores and of memory in bytes."""
     cores, memory = [reading.cores for reading in readings], [reading.memory for reading in readings]
     return {
         "cores": sum(cores) / len(cores),

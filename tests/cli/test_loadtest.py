@@ -14,10 +14,10 @@ def test_a_run_counts_every_frame_and_says_which_limit_was_broken(said, tmp_path
     code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
     assert code == 1
     assert re.fullmatch(
-        r"catstream: broken: max is .*, to be at most 0 \(seconds from a frame to its track\)", errors.strip()
+        r"catstream: broken: max is .*, limit at most 0 \(seconds from a frame to its track\)", errors.strip()
     )
     assert re.search(r"^0 +\d+\.\d +\d+\.\d %", output, re.MULTILINE)
-    assert "held: missed" in output
+    assert "met: missed" in output
 
     figures = json.loads((tmp_path / "x.json").read_text())
     (stream,) = figures["streams"]
@@ -49,7 +49,7 @@ def test_a_run_counts_every_frame_and_says_which_limit_was_broken(said, tmp_path
         (["--rate", 0], "0.5<=x<=1000"),
         (["--json", "missing/x.json"], "its folder does not exist"),
         (["--output", "/dev/null/load"], "give another folder"),
-        (["--set", "run.lockstep=true"], "leave lockstep away"),
+        (["--set", "run.lockstep=true"], "leave out lockstep"),
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_starts(said, tmp_path, arguments, message):

@@ -17,14 +17,14 @@ from catstream.settings import Settings
 
 def test_a_limit_holds_for_the_worst_stream(result):
     run = result([0.01] * 100, [0.01] * 90 + [0.2] * 10)
-    assert violations([Limit("p99", 0.1)], run) == ["p99 is 0.2, to be at most 0.1 (seconds from a frame to its track)"]
+    assert violations([Limit("p99", 0.1)], run) == ["p99 is 0.2, limit at most 0.1 (seconds from a frame to its track)"]
     assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2)], run) == []
 
 
 def test_success_is_to_be_at_least_what_is_asked(result):
     run = result([0.01], success=0.8)
     assert violations([Limit("success", 0.8)], run) == []
-    assert "to be at least 0.9" in violations([Limit("success", 0.9)], run)[0]
+    assert "limit at least 0.9" in violations([Limit("success", 0.9)], run)[0]
 
 
 def test_skipped_and_missed_are_shares(result):
@@ -60,8 +60,8 @@ def test_what_is_no_limit_is_refused(text):
     [
         ({"subscribers": 3, "slow": 4}, "4 of 3 subscribers cannot be slow"),
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
-        ({"settings": Settings(run={"lockstep": True})}, "leave lockstep away"),
-        ({"settings": Settings(run={"endpoint": "run"})}, "leave endpoint away"),
+        ({"settings": Settings(run={"lockstep": True})}, "leave out lockstep"),
+        ({"settings": Settings(run={"endpoint": "run"})}, "leave out endpoint"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_refused(facts, said):
@@ -70,7 +70,7 @@ def test_a_plan_that_makes_no_sense_is_refused(facts, said):
 
 
 @given(st.floats(0.5, 1000), st.floats(0.5, 1000))
-def test_the_highest_rate_that_holds_is_found_to_a_twentieth_and_each_is_tried_once(start, capacity):
+def test_the_search_is_within_5_percent_of_the_highest_rate_and_tries_each_rate_once(start, capacity):
     step_done = []
 
     def holds(rate):
@@ -82,5 +82,5 @@ def test_the_highest_rate_that_holds_is_found_to_a_twentieth_and_each_is_tried_o
     assert len(step_done) == len(set(step_done)) <= 18
 
 
-def test_a_rate_that_never_holds_is_none():
+def test_the_search_returns_none_if_no_rate_meets_the_limits():
     assert find_highest_rate(25.0, lambda _: False) is None

@@ -35,16 +35,16 @@ def test_a_search_shows_the_highest_rate_that_held_and_why_others_did_not(result
     load_test = is_search(at(25.0, result([0.01] * 50)), at(50.0, result([0.3] * 50)), at(37.5, result([0.02] * 50)))
     assert (load_test.highest_rate, load_test.result.plan.rate, load_test.violations) == (37.5, 37.5, [])
     page = write_report(tmp_path / "report.html", load_test).read_text()
-    assert "The highest rate that holds: 37.5 frames/s" in page
-    assert page.count(">holds<") == 2
-    assert "p99 is 0.3, to be at most 0.1" in page
+    assert "The highest rate that meets the limits: 37.5 frames/s" in page
+    assert page.count(">met<") == 2
+    assert "p99 is 0.3, limit at most 0.1" in page
     assert [step["rate"] for step in to_json(load_test)["steps"]] == [25.0, 50.0, 37.5]
 
 
 def test_a_search_without_success_says_so(result, tmp_path):
     load_test = is_search(result([0.3] * 50))
-    assert load_test.violations == ["no rate holds p99=0.1: the last one, 25, did not"]
-    assert "No rate holds" in write_report(tmp_path / "report.html", load_test).read_text()
+    assert load_test.violations == ["no rate meets p99=0.1: the lowest tried was 25"]
+    assert "No rate meets the limits" in write_report(tmp_path / "report.html", load_test).read_text()
 
 
 def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
