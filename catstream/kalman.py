@@ -57,4 +57,5 @@ def constant_velocity(
 def _imported() -> type[KalmanFilter]:
     from filterpy.kalman import KalmanFilter
 
-    return KalmanFilter
+    kind: type[KalmanFilter] = KalmanFilter
+    return kind

@@ -33,7 +33,8 @@ def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.n
     """
     centred = (background - background.mean(axis=0)) / np.float32(np.sqrt(len(background)))
     inner = _solve(centred @ centred.T, penalty, centred @ towards)
-    return (towards - centred.T @ inner) / np.float32(penalty)
+    direction: np.ndarray = (towards - centred.T @ inner) / np.float32(penalty)
+    return direction
 
 
 def fit(rows: np.ndarray, penalty: float) -> np.ndarray:
@@ -52,11 +53,13 @@ def fit(rows: np.ndarray, penalty: float) -> np.ndarray:
     x, ones, y = scaled[:, :-2], scaled[:, -2], scaled[:, -1]
     solved = _solve(x @ x.T, penalty, np.stack([y, ones], axis=1))
     bias = (ones @ solved[:, 0]) / (ones @ solved[:, 1])
-    return x.T @ (solved[:, 0] - bias * solved[:, 1])
+    weights: np.ndarray = x.T @ (solved[:, 0] - bias * solved[:, 1])
+    return weights
 
 
 def _solve(gram: np.ndarray, penalty: float, right: np.ndarray) -> np.ndarray:
     import scipy.linalg  # a restarted detector has its model, and needs none of it
 
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
-    return scipy.linalg.solve(gram, right, assume_a="pos", overwrite_a=True, check_finite=False)
+    solved: np.ndarray = scipy.linalg.solve(gram, right, assume_a="pos", overwrite_a=True, check_finite=False)
+    return solved

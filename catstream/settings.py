@@ -40,7 +40,8 @@ __all__ = [
 
 
 def _about(description: str, **bounds: float) -> Meta:
-    return Meta(description=description, **bounds)  # type: ignore[call-overload]
+    meta: Meta = Meta(description=description, **bounds)  # type: ignore[call-overload]
+    return meta
 
 
 class _Group:

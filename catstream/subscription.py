@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import select
 from time import monotonic
-from typing import Generic, Literal, Self, TypeVar, overload
+from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
@@ -171,14 +171,15 @@ class Subscription(Generic[Message]):
     def _take(self) -> Message | None:
         """Return the next message if one was received, without waiting."""
         while self._messages.pending():
-            message = self._messages.receive(0)
+            message: Any = self._messages.receive(0)
             if isinstance(message, End):
                 if self._channel.keeps == "every":  # on this channel the end is the last message
                     self.end, self._close_time = message, 0.0
                     return None
             elif message is not None and self._new(message):
                 self._withdraw_announcement()
-                return message
+                new: Message = message
+                return new
         while self._ends.pending():
             end = self._ends.receive(0)
             if self.end is None and end is not None:
@@ -256,7 +257,7 @@ def subscribe(
 def subscribe(
     endpoint: str, channel: Literal["previews"], *, timeout: float | None = ..., keys: str = ...
 ) -> Subscription[Preview]: ...
-def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> Subscription:
+def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> Subscription[Any]:
     """Subscribe to a channel of a running pipeline.
 
     Parameters

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -137,7 +138,7 @@ def _kept(output: Path | None) -> Iterator[None]:
         sys.exit(INTERRUPTED)
 
 
-def _table(numbers: dict) -> Table:
+def _table(numbers: dict[str, Any]) -> Table:
     """Rows of the sequences, then the means."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("sequence")
@@ -152,7 +153,7 @@ def _table(numbers: dict) -> Table:
     return table
 
 
-def _cells(row: dict) -> list[str]:
+def _cells(row: dict[str, Any]) -> list[str]:
     def share(measure: str) -> str:
         value, spread = row[measure], row.get(f"{measure}_spread")
         if value is None:

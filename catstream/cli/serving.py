@@ -26,7 +26,7 @@ class Address(NamedTuple):
     port: int
 
 
-class AddressType(click.ParamType):
+class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
     """[HOST:]PORT, of this machine alone if there is no host.
 
     >>> [tuple(AddressType().convert(text, None, None)) for text in ("8080", "0.0.0.0:8000", "[::]:0")]

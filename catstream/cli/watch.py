@@ -178,7 +178,7 @@ def _print_line(channel: str, message: Any) -> None:
 class _Screen:
     """A table of the newest messages, of health the newest of each process, drawn anew in a thread of its own."""
 
-    def __init__(self, channel: str, messages: Subscription) -> None:
+    def __init__(self, channel: str, messages: Subscription[Any]) -> None:
         self._cells, self._messages = _CELLS[channel], messages
         # Replaced, never changed: the thread reads them.
         self._rows: dict[object, dict[str, str]] = {}

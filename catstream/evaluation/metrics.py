@@ -70,7 +70,8 @@ def overlaps(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
     shared = np.prod(np.maximum(high - low, 0), axis=1)
     union = np.prod(boxes[:, 2:], axis=1) + np.prod(truth[:, 2:], axis=1) - shared
     ratios = np.divide(shared, union, out=np.zeros(len(boxes)), where=union > 0)
-    return np.minimum(np.nan_to_num(ratios), 1.0)  # rounding may exceed 1
+    shares: np.ndarray = np.minimum(np.nan_to_num(ratios), 1.0)  # rounding may exceed 1
+    return shares
 
 
 def distances(boxes: np.ndarray, truth: np.ndarray, *, normalised: bool = False) -> np.ndarray:
@@ -86,12 +87,14 @@ def distances(boxes: np.ndarray, truth: np.ndarray, *, normalised: bool = False)
 
 def success_plot(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return the share of frames with the object whose overlap exceeds each of `OVERLAPS`, float64 (21,)."""
-    return (overlaps(boxes, truth)[_present(truth), None] > OVERLAPS).mean(axis=0)
+    shares: np.ndarray = (overlaps(boxes, truth)[_present(truth), None] > OVERLAPS).mean(axis=0)
+    return shares
 
 
 def precision_plot(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return the share of frames with the object whose centre error is at most each of `PIXELS`, float64 (51,)."""
-    return (distances(boxes, truth)[_present(truth), None] <= PIXELS).mean(axis=0)
+    shares: np.ndarray = (distances(boxes, truth)[_present(truth), None] <= PIXELS).mean(axis=0)
+    return shares
 
 
 def long_term(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray) -> LongTerm:
@@ -152,4 +155,5 @@ def score(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray | None = 
 
 
 def _present(boxes: np.ndarray) -> np.ndarray:
-    return np.isfinite(boxes).all(axis=1)
+    present: np.ndarray = np.isfinite(boxes).all(axis=1)
+    return present

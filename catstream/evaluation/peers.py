@@ -66,7 +66,7 @@ class Peer:
 
 def _constructor(name: str) -> Callable[[], Any]:
     for home in (cv2, getattr(cv2, "legacy", None)):
-        create = getattr(home, f"{PEERS[name]}_create", None)
+        create: Callable[[], Any] | None = getattr(home, f"{PEERS[name]}_create", None)
         if create is not None:
             return create
     raise SettingsError(

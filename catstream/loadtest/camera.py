@@ -64,7 +64,8 @@ class Camera:
     def late(self) -> float:
         """Largest delay in seconds of a frame of this schedule that was not caused by a slow receiver."""
         self._pipe.send(None)
-        return self._receive()
+        seconds: float = self._receive()
+        return seconds
 
     def show_still(self) -> None:
         """Send the first image repeatedly, at the frame rate of the video."""
@@ -73,7 +74,8 @@ class Camera:
     def play(self, schedule: Schedule) -> list[Schedule]:
         """Send the video by a schedule; return the schedule of each stream."""
         self._pipe.send(schedule)
-        return self._receive()
+        schedules: list[Schedule] = self._receive()
+        return schedules
 
     def __enter__(self) -> Self:
         start(self._process)

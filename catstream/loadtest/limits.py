@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -88,7 +87,8 @@ class Limit:
 
     def is_met(self, result: Result) -> bool:
         kind = KINDS[self.name]
-        return (operator.ge if kind.minimum else operator.le)(kind.measure(result), self.value)
+        value = kind.measure(result)
+        return value >= self.value if kind.minimum else value <= self.value
 
     def describe(self, result: Result) -> str:
         """Describe the limit and the measured value."""

@@ -80,11 +80,11 @@ class Subscribers:
 
     def received(self) -> list[int]:
         """Return the number of tracks that each fast subscriber has received."""
-        return self._received[: self._quick]
+        return list(self._received[: self._quick])
 
     def missed(self) -> list[int]:
         """Return the number of tracks that each fast subscriber has missed, by the gaps in `seq`."""
-        return self._missed[: self._quick]
+        return list(self._missed[: self._quick])
 
     def __enter__(self) -> Self:
         for group in self._groups:

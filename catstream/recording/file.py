@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
-from catstream.errors import RecordingError
+from catstream.errors import ProtocolError, RecordingError
 from catstream.messages import End, Features, Health, Model, Run, Track
 from catstream.recording.container import MAGIC, Entry, Index, Topic, end_of_data, entries, entry_at, opening, pack
 from catstream.recording.container import summary as summary_of
@@ -215,7 +215,7 @@ class Recording:
         with self._open() as file:
             for entry in entries(file):
                 if entry.channel in _KINDS:
-                    yield entry.time / 1e9, _decode(entry)
+                    yield entry.time / 1e9, self._decode(entry)
                 if entry.place + entry.size >= self.size:  # the file may have grown since it was checked
                     return
 
@@ -233,7 +233,16 @@ class Recording:
                 entry = entry_at(file, place)
                 if entry is None:
                     raise RecordingError(f"{self.path} has changed since it was checked: read it again")
-                yield _decode(entry)
+                yield self._decode(entry)
+
+    def _decode(self, entry: Entry) -> Any:
+        kind = _KINDS[entry.channel]
+        try:
+            return decode_json(entry.data, kind) if TOPICS[kind].encoding == "json" else decode(entry.data, kind)
+        except ProtocolError as error:
+            raise RecordingError(
+                f"{self.path} holds a message at byte {entry.place} that this version of catstream cannot read: {error}"
+            ) from None
 
     def _open(self) -> BinaryIO:
         try:
@@ -256,13 +265,13 @@ class Recording:
             _drop_from(self._models, entry.sequence)
             self._features.append((entry.sequence, entry.place))
         elif kind is Model:  # a restarted compressor may have it trained again
-            trained = _decode(entry).frame + 1
+            trained = self._decode(entry).frame + 1
             _drop_from(self._models, trained)
             self._models.append((trained, entry.place))
         elif kind is Track:
             self._tracks.add(entry.sequence)
         elif kind is End:
-            self.end = _decode(entry)
+            self.end = self._decode(entry)
 
     def _measure_tail(self, file: BinaryIO) -> None:
         """Count the bytes after the last whole message that are not the index."""
@@ -285,8 +294,3 @@ def _drop_from(places: list[tuple[int, int]], seq: int) -> None:
 
 def _encode(message: Any) -> bytes:
     return encode_json(message) if TOPICS[type(message)].encoding == "json" else encode(message)
-
-
-def _decode(entry: Entry) -> Any:
-    kind = _KINDS[entry.channel]
-    return decode_json(entry.data, kind) if TOPICS[kind].encoding == "json" else decode(entry.data, kind)

@@ -114,4 +114,5 @@ class Feed:
                     if channel in _WATCHED and not self.viewers:
                         break
                 else:
-                    return messages.end
+                    end: End | None = messages.end
+                    return end

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from catstream.heads import APPEARANCE
 from catstream.messages import Features, Model, Preview, TrainingRows
 
 __all__ = ["Film", "Shot", "surprise"]
+
+_Kept = TypeVar("_Kept")
 
 _SHOTS = 12
 _APART_SECONDS = 1.0  # neighbours teach the same
@@ -75,7 +78,8 @@ class Film:
         self._keep(self._pictures, preview.frame, preview)
         return self._match(preview.frame)
 
-    def _keep(self, those: OrderedDict, frame: int, what: object) -> None:
+    @staticmethod
+    def _keep(those: OrderedDict[int, _Kept], frame: int, what: _Kept) -> None:
         those[frame] = what
         if len(those) > _WAIT:
             those.popitem(last=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import resource
 from pathlib import Path
@@ -18,8 +19,8 @@ from mcap.stream_reader import StreamReader
 from catstream.box import Box
 from catstream.errors import RecordingError
 from catstream.messages import End, Features, Health, Model, Run, Track, TrainingRows
-from catstream.recording.container import MAGIC
-from catstream.recording.file import Recording, RecordingWriter
+from catstream.recording.container import MAGIC, pack
+from catstream.recording.file import TOPICS, Recording, RecordingWriter
 from catstream.settings import Settings
 from catstream.wire.codec import decode, encode
 
@@ -215,6 +216,16 @@ def test_a_file_that_is_there_is_kept(written):
     ):
         written([], resume=True)
     assert len(read(path)) == 2
+
+
+def test_a_message_that_this_version_cannot_read_is_an_error_of_one_line(written):
+    path = written([])
+    with path.open("r+b") as file:
+        file.truncate(Recording(path).size)
+        file.seek(0, os.SEEK_END)
+        file.write(pack(list(TOPICS).index(Model) + 1, 1, 0, b"of another version"))
+    with pytest.raises(RecordingError, match=r"holds a message at byte .* cannot read: expected model"):
+        Recording(path)
 
 
 def test_what_is_no_recording_is_refused(tmp_path):
