@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from functools import cache
 from typing import Any, get_origin
 
@@ -40,7 +40,7 @@ def check(message: object) -> _Lengths:
         If a field breaks its schema.
     """
     lengths: _Lengths = {}
-    kind: Hashable = type(message)
+    kind: type = type(message)
     checks, rules = _compiled(kind)
     for name, check_value in checks:
         value = getattr(message, name)
