@@ -204,7 +204,7 @@ def track(
                 server = Server(
                     pipeline.endpoint, pipeline.settings.run.keys, host=view.host, port=view.port, token=token
                 )
-                stack.enter_context(server.beside())
+                stack.enter_context(server.in_background())
                 for url in server.urls:
                     console.print(f"page: {url}", highlight=False)
             if pipeline.waits:

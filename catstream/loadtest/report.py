@@ -55,8 +55,8 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
             _chaos(result),
             "<h2>Reliability</h2>",
             '<p class="about">The precision of the latencies is the largest delay that the camera itself caused: '
-            f"{_ms(result.camera_late)} ms. Other processes of this machine kept {result.other_load:.2f} cores busy; on a "
-            "quiet machine it is close to 0.</p>",
+            f"{_ms(result.camera_late)} ms. Other processes of this machine kept {result.other_load:.2f} cores busy; "
+            "on a quiet machine it is close to 0.</p>",
             "<h2>Settings that are not the default</h2>",
             f"<pre>{escape(chr(10).join(plan.settings.changed()) or 'none')}</pre>",
         ],

@@ -33,15 +33,15 @@ from catstream.steering import Control
 from catstream.video.annotate import draw_preview
 from catstream.web import metrics
 from catstream.web.feed import Feed
-from catstream.web.guard import Bucket, body_of, too_many
+from catstream.web.guard import TokenBucket, body_of, too_many
 from catstream.wire.channels import CHANNELS
 
 __all__ = ["create"]
 
 _PAGE = Path(__file__).with_name("page")
-_TURN_SECONDS = 0.1
-_ALIVE_SECONDS = 5.0  # of silence after which a stream says that it is there: so it hears that nobody is
-_VIEWERS = 64
+_UPDATE_SECONDS = 0.1
+_KEEP_ALIVE_SECONDS = 5.0  # of silence after which a stream says that it is there: so it hears that nobody is
+_MAX_VIEWERS = 64
 _COMMANDS, _COMMANDS_PER_SECOND = 20, 5
 
 
@@ -78,31 +78,31 @@ class _Pages:
 
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
-        self._commands = Bucket(_COMMANDS, _COMMANDS_PER_SECOND)
+        self._commands = TokenBucket(_COMMANDS, _COMMANDS_PER_SECOND)
 
     async def index(self, _: Request) -> Response:
         return FileResponse(_PAGE / "index.html")
 
     async def events(self, _: Request) -> Response:
-        return self._full() or StreamingResponse(self._news(), media_type="text/event-stream")
+        return self._reject_too_many() or StreamingResponse(self._event_stream(), media_type="text/event-stream")
 
     async def live(self, _: Request) -> Response:
-        return self._full() or StreamingResponse(
-            self._annotated(), media_type="multipart/x-mixed-replace; boundary=picture"
+        return self._reject_too_many() or StreamingResponse(
+            self._annotated_stream(), media_type="multipart/x-mixed-replace; boundary=picture"
         )
 
-    def _full(self) -> Response | None:
+    def _reject_too_many(self) -> Response | None:
         """The answer if too many look already."""
-        if self._feed.viewers < _VIEWERS:
+        if self._feed.viewers < _MAX_VIEWERS:
             return None
-        return PlainTextResponse(f"{_VIEWERS} pages or live pictures are open already\n", 503)
+        return PlainTextResponse(f"{_MAX_VIEWERS} pages or live pictures are open already\n", 503)
 
-    async def _annotated(self) -> AsyncIterator[bytes]:
+    async def _annotated_stream(self) -> AsyncIterator[bytes]:
         shown = None
-        with self._feed.watching():
+        with self._feed.viewer():
             yield b"--picture\r\n"
             while not self._feed.closed:
-                newest = self._feed.board.newest
+                newest = self._feed.dashboard.newest
                 if newest is not None and newest != shown:
                     shown = newest
                     jpeg = await run_in_threadpool(draw_preview, *newest)
@@ -111,25 +111,26 @@ class _Pages:
                         len(jpeg),
                         jpeg,
                     )
-                await asyncio.sleep(_TURN_SECONDS)
+                await asyncio.sleep(_UPDATE_SECONDS)
 
-    async def _news(self) -> AsyncIterator[str]:
-        seen: dict[str, int] = {}
-        spoken = monotonic()
-        with self._feed.watching():
+    async def _event_stream(self) -> AsyncIterator[str]:
+        known: dict[str, int] = {}
+        last_sent = monotonic()
+        with self._feed.viewer():
             yield "retry: 1000\n\n"
             while not self._feed.closed:
-                if parts := self._feed.board.news(seen):
-                    spoken = monotonic()
+                if parts := self._feed.dashboard.updates(known):
+                    last_sent = monotonic()
                     yield f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"
-                elif monotonic() - spoken > _ALIVE_SECONDS:
-                    spoken = monotonic()
+                elif monotonic() - last_sent > _KEEP_ALIVE_SECONDS:
+                    last_sent = monotonic()
                     yield ":\n\n"
-                await asyncio.sleep(_TURN_SECONDS)
-            yield f"data: {json.dumps(self._feed.board.news(seen) | {'closed': True}, separators=(',', ':'))}\n\n"
+                await asyncio.sleep(_UPDATE_SECONDS)
+            last = self._feed.dashboard.updates(known) | {"closed": True}
+            yield f"data: {json.dumps(last, separators=(',', ':'))}\n\n"
 
     async def picture(self, request: Request) -> Response:
-        preview = self._feed.board.picture(request.path_params["frame"])
+        preview = self._feed.dashboard.picture(request.path_params["frame"])
         if preview is None:
             return PlainTextResponse("this picture is gone\n", 404)
         return Response(preview.jpeg, media_type="image/jpeg")
@@ -146,7 +147,7 @@ class _Pages:
         except ValueError as error:
             return _refused(400, str(error))
         try:
-            answer = await run_in_threadpool(_steer, self._feed, verb, box, keep)
+            answer = await run_in_threadpool(_execute, self._feed, verb, box, keep)
         except RefusedError as error:
             return _refused(409, str(error))
         except ProtocolError as error:
@@ -164,7 +165,7 @@ class _Pages:
         return PlainTextResponse("ok\n")
 
     async def readyz(self, _: Request) -> Response:
-        silent = [name for name in CHANNELS["health"].senders if name not in self._feed.board.heard]
+        silent = [name for name in CHANNELS["health"].senders if name not in self._feed.dashboard.last_reports]
         return PlainTextResponse(f"not heard: {', '.join(silent)}\n", 503) if silent else PlainTextResponse("ok\n")
 
 
@@ -185,9 +186,9 @@ def _command(body: bytes | None) -> tuple[str, list[float] | None, bool]:
     return verb, box, keep
 
 
-def _steer(feed: Feed, verb: str, box: list[float] | None, keep: bool) -> Answer:
+def _execute(feed: Feed, verb: str, box: list[float] | None, keep: bool) -> Answer:
     """Have a command carried out; blocks until it is answered."""
-    with Control(feed.place, keys=feed.keys) as pipeline:
+    with Control(feed.attached_endpoint, keys=feed.keys) as pipeline:
         if box is not None:
             return pipeline.set_box(box, keep=keep)
         return {"pause": pipeline.pause, "resume": pipeline.resume, "stop": pipeline.stop}[verb]()

@@ -7,10 +7,10 @@ from typing import cast
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-__all__ = ["MOST", "Connection"]
+__all__ = ["MAX_CONNECTIONS", "Connection"]
 
 #: Connections that are open at once, at most.
-MOST = 256
+MAX_CONNECTIONS = 256
 
 _REQUEST_SECONDS = 5.0  # that a client may take to send a request, head and body
 _ANSWER_SECONDS = 20.0  # for which a client may read nothing of its answer
@@ -19,7 +19,7 @@ _ANSWER_SECONDS = 20.0  # for which a client may read nothing of its answer
 class Connection(H11Protocol):
     """An HTTP/1.1 connection that is closed if its client keeps the server waiting for too long.
 
-    If more than `MOST` are open, the one whose client has kept the server waiting for longest is closed to make room.
+    If more than `MAX_CONNECTIONS` are open, the one that has kept the server waiting for longest is closed.
     So a new client is always answered, however many connections others hold open, and also if all of them come from
     one address, as behind a proxy. A connection whose answer is being made is never closed to make room.
 
@@ -33,67 +33,67 @@ class Connection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._wait(_REQUEST_SECONDS)
+        self._wait_for_client(_REQUEST_SECONDS)
         others = [cast(Connection, other) for other in self.connections]
         there = [other for other in others if not other._closed]
         waiting = [other for other in there if other.waiting_since is not None]
-        if len(there) > MOST:  # there is one: this one waits for its request
-            min(waiting, key=lambda other: other.waiting_since or 0.0).drop()
+        if len(there) > MAX_CONNECTIONS:  # there is one: this one waits for its request
+            min(waiting, key=lambda other: other.waiting_since or 0.0).abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._end_wait()
+        self._stop_waiting()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         if self._timer is None and self._between_requests:
-            self._wait(_REQUEST_SECONDS)  # the first bytes of the next one
+            self._wait_for_client(_REQUEST_SECONDS)  # the first bytes of the next one
         super().data_received(data)
-        self._look()
+        self._update_wait()
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
-        self._look()
+        self._update_wait()
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._wait(_ANSWER_SECONDS)
+        self._wait_for_client(_ANSWER_SECONDS)
 
     def resume_writing(self) -> None:
         super().resume_writing()
-        self._end_wait()
-        self._look()
+        self._stop_waiting()
+        self._update_wait()
 
-    def drop(self) -> None:
+    def abort(self) -> None:
         """Close the connection at once, whatever is on its way."""
         self._closed = True
-        self._end_wait()
+        self._stop_waiting()
         self.transport.abort()
 
     @property
     def _between_requests(self) -> bool:
         return self.cycle is not None and self.cycle.response_complete and not self.cycle.more_body
 
-    def _look(self) -> None:
+    def _update_wait(self) -> None:
         """See whether the server waits for the client now."""
         if self._closed or self.flow.write_paused:
             return
         if self.cycle is not None and not self.cycle.more_body and not self.cycle.response_complete:
-            self._end_wait()
+            self._stop_waiting()
         elif (
             self._between_requests and not self.conn.trailing_data[0]
         ):  # it is kept as long as `timeout_keep_alive` says
-            self._end_wait()
+            self._stop_waiting()
             self.waiting_since = self.loop.time()
         elif self._timer is None:
-            self._wait(_REQUEST_SECONDS)
+            self._wait_for_client(_REQUEST_SECONDS)
 
-    def _wait(self, seconds: float) -> None:
+    def _wait_for_client(self, seconds: float) -> None:
         """Wait for the client, for as long as this."""
-        self._end_wait()
+        self._stop_waiting()
         self.waiting_since = self.loop.time()
-        self._timer = self.loop.call_later(seconds, self.drop)
+        self._timer = self.loop.call_later(seconds, self.abort)
 
-    def _end_wait(self) -> None:
+    def _stop_waiting(self) -> None:
         self.waiting_since = None
         if self._timer is not None:
             self._timer.cancel()

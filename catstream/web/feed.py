@@ -1,4 +1,4 @@
-"""The feed: takes the messages of a pipeline to the board, however often that comes and goes."""
+"""The feed: takes the messages of a pipeline to the dashboard, however often that comes and goes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from time import monotonic
 from catstream.errors import CatstreamError
 from catstream.messages import End
 from catstream.subscription import subscribe
-from catstream.web.board import SILENCE_SECONDS, Board
+from catstream.web.dashboard import SILENCE_SECONDS, Dashboard
 from catstream.wire.endpoint import find
 
 __all__ = ["Feed"]
@@ -19,11 +19,11 @@ __all__ = ["Feed"]
 _log = logging.getLogger(__name__)
 
 _PAUSE_SECONDS = 0.5
-_LAST_SECONDS = 2.0  # that the last messages may take after the end
+_DRAIN_SECONDS = 2.0  # that the last messages may take after the end
 
 #: What shows that a pipeline is there, what is taken once it is, and what only while somebody looks: it costs the
 #: pipeline something.
-_SIGNS, _ALWAYS, _WATCHED = ("tracks", "health"), ("models",), ("previews", "features")
+_LIVENESS, _PERMANENT, _FOR_VIEWERS = ("tracks", "health"), ("models",), ("previews", "features")
 
 
 class Feed:
@@ -36,65 +36,67 @@ class Feed:
 
     Attributes
     ----------
-    board : what was told
-    place, keys : where it is attached, and with which keys; empty while it is not
+    dashboard : what was told
+    attached_endpoint, keys : where it is attached, and with which keys; empty while it is not
     viewers : how many pages are open
     closed : whether the pages are to end
     """
 
     def __init__(self, endpoint: str = "", keys: str = "") -> None:
         self._endpoint, self._keys = endpoint, keys
-        self.board = Board()
-        self.place = self.keys = ""
+        self.dashboard = Dashboard()
+        self.attached_endpoint = self.keys = ""
         self.viewers = 0
         self.closed = False
-        self._watched, self._seen = asyncio.Event(), asyncio.Event()
+        self._has_viewers, self._is_running = asyncio.Event(), asyncio.Event()
 
     @contextlib.contextmanager
-    def watching(self) -> Iterator[None]:
+    def viewer(self) -> Iterator[None]:
         """Somebody looks: pictures and features are taken meanwhile."""
         self.viewers += 1
-        self._watched.set()
+        self._has_viewers.set()
         try:
             yield
         finally:
             self.viewers -= 1
             if not self.viewers:
-                self._watched.clear()
+                self._has_viewers.clear()
 
     async def run(self) -> None:
         """Until it is cancelled."""
         while True:
             try:
-                place = find(self._endpoint, self._keys)
-                self.place = str(place)
-                self.board.attach(self.place)
-                self.keys = str(place.keys.folder) if place.keys else ""  # the only one has its keys noted
-                await self._attached()
+                attached_endpoint = find(self._endpoint, self._keys)
+                self.attached_endpoint = str(attached_endpoint)
+                self.dashboard.attach(self.attached_endpoint)
+                self.keys = (
+                    str(attached_endpoint.keys.folder) if attached_endpoint.keys else ""
+                )  # the only one has its keys noted
+                await self._run_attached()
             except CatstreamError as error:
-                self.board.lost(str(error))
+                self.dashboard.mark_silent(str(error))
             except Exception as error:  # whatever it is: nobody would notice a feed that is gone
                 _log.exception("The page lost the pipeline, and attaches anew.")
-                self.board.lost(f"{type(error).__name__}: {error}")
-            self.place = self.keys = ""
+                self.dashboard.mark_silent(f"{type(error).__name__}: {error}")
+            self.attached_endpoint = self.keys = ""
             await asyncio.sleep(_PAUSE_SECONDS)
 
-    async def _attached(self) -> None:
+    async def _run_attached(self) -> None:
         """Until the pipeline ends, or is silent."""
-        self._seen.clear()
-        tasks = [asyncio.create_task(self._take(channel)) for channel in (*_SIGNS, *_ALWAYS, *_WATCHED)]
+        self._is_running.clear()
+        tasks = [asyncio.create_task(self._forward(channel)) for channel in (*_LIVENESS, *_PERMANENT, *_FOR_VIEWERS)]
         try:
             done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
-                self.board.take(task.result(), monotonic())
+                self.dashboard.take(task.result(), monotonic())
             # It ended: the last health, with what the trees have become, and the last picture may still come.
-            await asyncio.wait(rest, timeout=_LAST_SECONDS)
+            await asyncio.wait(rest, timeout=_DRAIN_SECONDS)
         finally:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _take(self, channel: str) -> End | None:
+    async def _forward(self, channel: str) -> End | None:
         """Until the pipeline ends; what is for viewers only while there are any.
 
         What says nothing of which pipeline it is from is taken once one is seen: until then, it may be the last message
@@ -102,16 +104,16 @@ class Feed:
         """
         timeout = SILENCE_SECONDS if channel == "health" else None
         while True:
-            if channel not in _SIGNS:
-                await self._seen.wait()
-            if channel in _WATCHED:
-                await self._watched.wait()
-            with subscribe(self.place, channel, timeout=timeout, keys=self.keys) as messages:  # type: ignore[call-overload]
+            if channel not in _LIVENESS:
+                await self._is_running.wait()
+            if channel in _FOR_VIEWERS:
+                await self._has_viewers.wait()
+            with subscribe(self.attached_endpoint, channel, timeout=timeout, keys=self.keys) as messages:  # type: ignore[call-overload]
                 async for message in messages:
-                    self.board.take(message, monotonic())
-                    if self.board.standing == "running":
-                        self._seen.set()
-                    if channel in _WATCHED and not self.viewers:
+                    self.dashboard.take(message, monotonic())
+                    if self.dashboard.phase == "running":
+                        self._is_running.set()
+                    if channel in _FOR_VIEWERS and not self.viewers:
                         break
                 else:
                     end: End | None = messages.end

@@ -18,15 +18,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from catstream.errors import ServiceError
 
-__all__ = ["Bucket", "Guard", "body_of", "is_loopback", "too_many"]
+__all__ = ["Guard", "TokenBucket", "body_of", "is_loopback", "too_many"]
 
 _COOKIE = "catstream"
-_DOOR = Path(__file__).with_name("page") / "enter.html"
-_OPEN = ("/healthz", "/readyz", "/page/")  # what tells nothing of the pipeline but whether it is there
+_LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
+_PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # what tells nothing of the pipeline but whether it is there
 
-_SHORTEST_TOKEN = 16
-_LONGEST_BODY = 4096  # bytes
-_GUESSES, _GUESSES_PER_SECOND = 8, 0.2  # of each address
+_MIN_TOKEN_LENGTH = 16
+_MAX_BODY = 4096  # bytes
+_MAX_GUESSES, _GUESSES_PER_SECOND = 8, 0.2  # of each address
 _ADDRESSES = 1024  # whose wrong guesses are remembered
 
 #: What answers are sent with. Nothing is fetched from elsewhere, no script stands in a page, nobody may frame it.
@@ -44,7 +44,7 @@ _HEADERS = {
 }
 
 
-class Bucket:
+class TokenBucket:
     """Lets `size` pass at once, and `rate` a second after that."""
 
     def __init__(self, size: float, rate: float) -> None:
@@ -67,7 +67,7 @@ class Guard:
 
     Without a token it answers to this machine's own names only, so that no other name can be made to lead
     here (DNS rebinding). With one, it answers who shows it: as `Authorization: Bearer TOKEN`, or as the
-    cookie that `POST /enter` gives for it. What changes something is taken from pages of the same origin, and
+    cookie that `POST /login` gives for it. What changes something is taken from pages of the same origin, and
     from programs, which name none (CSRF).
 
     Parameters
@@ -81,14 +81,14 @@ class Guard:
     """
 
     def __init__(self, app: ASGIApp, token: str | None, clock: Callable[[], float] = monotonic) -> None:
-        if token is not None and len(token) < _SHORTEST_TOKEN:
+        if token is not None and len(token) < _MIN_TOKEN_LENGTH:
             raise ServiceError(
-                f"a token of {len(token)} characters can be guessed: give {_SHORTEST_TOKEN} or more, "
+                f"a token of {len(token)} characters can be guessed: give {_MIN_TOKEN_LENGTH} or more, "
                 "for example VIEW_TOKEN=$(openssl rand -hex 16)"
             )
         self._app, self._clock = app, clock
-        self._secret = None if token is None else _secret(token)
-        self._guesses: OrderedDict[str, Bucket] = OrderedDict()
+        self._token_digest = None if token is None else _digest(token)
+        self._guesses: OrderedDict[str, TokenBucket] = OrderedDict()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":  # the server's start and end
@@ -101,55 +101,55 @@ class Guard:
             await send(message)
 
         request = Request(scope, receive)
-        answer: ASGIApp = self._stranger(request) or self._app
+        answer: ASGIApp = self._reject_foreign(request) or self._app
         path = scope["path"]  # which the routes go by: that of `request.url` may begin in the client's Host header
-        if answer is self._app and self._secret is not None and not path.startswith(_OPEN):
-            if (request.method, path) == ("POST", "/enter"):
-                answer = await self._enter(request)
+        if answer is self._app and self._token_digest is not None and not path.startswith(_PUBLIC_PATHS):
+            if (request.method, path) == ("POST", "/login"):
+                answer = await self._log_in(request)
             else:
-                answer = self._unknown(request) or self._app
+                answer = self._reject_without_token(request) or self._app
         await answer(scope, receive, send_with_headers)
 
-    def _stranger(self, request: Request) -> Response | None:
+    def _reject_foreign(self, request: Request) -> Response | None:
         """The answer to a name that is not ours, or to a page that is not."""
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
-        if self._secret is None and not is_loopback(_name(host)):
+        if self._token_digest is None and not is_loopback(_host_name(host)):
             return PlainTextResponse(f"this page is at http://127.0.0.1, not at {host!r}\n", 421)
         if request.method not in ("GET", "HEAD") and origin is not None and origin.partition("://")[2] != host:
             return PlainTextResponse(f"refused: the page that asks is of another origin, {origin!r}\n", 403)
         return None
 
-    def _unknown(self, request: Request) -> Response | None:
+    def _reject_without_token(self, request: Request) -> Response | None:
         """The answer to who shows no token, or a wrong one."""
-        shown = _shown(request.headers)
+        shown = _credential(request.headers)
         if shown is not None:
-            return self._wrong(shown, request)
+            return self._reject_wrong_token(shown, request)
         if request.scope["path"] == "/":
-            return FileResponse(_DOOR, 401)
+            return FileResponse(_LOGIN_PAGE, 401)
         return PlainTextResponse("a token is needed: Authorization: Bearer TOKEN\n", 401)
 
-    async def _enter(self, request: Request) -> Response:
+    async def _log_in(self, request: Request) -> Response:
         """The cookie for a token that is right, and the way to the page."""
         body = await body_of(request)
         token = parse_qs(body.decode(errors="replace")).get("token", [""])[0] if body else ""
-        wrong = self._wrong(_secret(token.strip()), request)
+        wrong = self._reject_wrong_token(_digest(token.strip()), request)
         if wrong is not None:
             return wrong
         answer = RedirectResponse("/", 303)
         secure = request.headers.get("origin", "").startswith("https:")
-        answer.set_cookie(_COOKIE, self._secret or "", httponly=True, samesite="lax", secure=secure)
+        answer.set_cookie(_COOKIE, self._token_digest or "", httponly=True, samesite="lax", secure=secure)
         return answer
 
-    def _wrong(self, shown: str, request: Request) -> Response | None:
+    def _reject_wrong_token(self, shown: str, request: Request) -> Response | None:
         """The answer to a wrong token, None for the right one.
 
         The right one always passes: behind a proxy all clients have one address, and nobody may keep others out by
         wrong tokens. The token is protected by its length; the limit only saves work.
         """
-        if hmac.compare_digest(shown.encode(), (self._secret or "").encode()):
+        if hmac.compare_digest(shown.encode(), (self._token_digest or "").encode()):
             return None
         address, now = request.client.host if request.client else "", self._clock()
-        guesses = self._guesses.setdefault(address, Bucket(_GUESSES, _GUESSES_PER_SECOND))
+        guesses = self._guesses.setdefault(address, TokenBucket(_MAX_GUESSES, _GUESSES_PER_SECOND))
         if len(self._guesses) > _ADDRESSES:
             self._guesses.popitem(last=False)
         if wait := guesses.wait(now):
@@ -163,7 +163,7 @@ async def body_of(request: Request) -> bytes | None:
     body = b""
     async for part in request.stream():
         body += part
-        if len(body) > _LONGEST_BODY:
+        if len(body) > _MAX_BODY:
             return None
     return body
 
@@ -178,7 +178,7 @@ def is_loopback(host: str) -> bool:
     return host in ("127.0.0.1", "::1", "localhost")
 
 
-def _name(host: str) -> str:
+def _host_name(host: str) -> str:
     """The host without its port."""
     try:
         return urlsplit(f"//{host}").hostname or ""
@@ -186,15 +186,15 @@ def _name(host: str) -> str:
         return ""
 
 
-def _secret(token: str) -> str:
+def _digest(token: str) -> str:
     """What a browser keeps instead of the token, and what is compared."""
     return hashlib.sha256(b"catstream view\0" + token.encode()).hexdigest()
 
 
-def _shown(headers: Headers) -> str | None:
+def _credential(headers: Headers) -> str | None:
     kind, _, token = headers.get("authorization", "").partition(" ")
     if kind.lower() == "bearer":
-        return _secret(token.strip())
+        return _digest(token.strip())
     try:
         cookie = SimpleCookie(headers.get("cookie", "")).get(_COOKIE)
     except CookieError:

@@ -41,37 +41,39 @@ class _Collector:
         self._feed = feed
 
     def collect(self) -> Iterator[Metric]:
-        board = self._feed.board
-        yield _gauge("up", "Whether the pipeline is heard.", board.standing == "running")
+        dashboard = self._feed.dashboard
+        yield _gauge("up", "Whether the pipeline is heard.", dashboard.phase == "running")
         yield _gauge("viewers", "Pages that are open.", self._feed.viewers)
         for name, process, counter, meaning in _COUNTED:
-            if (value := board.counter(process, counter)) is not None:
+            if (value := dashboard.counter(process, counter)) is not None:
                 yield CounterMetricFamily(f"catstream_{name}", meaning, value=value)
         for name, process, counter, meaning in _GAUGES:
-            if (value := board.counter(process, counter)) is not None:
+            if (value := dashboard.counter(process, counter)) is not None:
                 yield _gauge(name, meaning, value)
         yield from self._learning()
         yield from self._processes()
-        if board.track is not None:
+        if dashboard.track is not None:
             yield _gauge("score", "Score of the newest track: about 0 on background, about 1 on the object.",
-                         board.track.score)  # fmt: skip
-            yield _gauge("present", "Whether the object is there.", board.track.state != "absent")
-            yield _gauge("frames_per_second", "Frames followed a second, over the last two.", board.rate(monotonic()))
+                         dashboard.track.score)  # fmt: skip
+            yield _gauge("present", "Whether the object is there.", dashboard.track.state != "absent")
+            yield _gauge(
+                "frames_per_second", "Frames followed a second, over the last two.", dashboard.rate(monotonic())
+            )
 
     def _learning(self) -> Iterator[Metric]:
-        board = self._feed.board
-        sent, taken = board.counter("detector", "sent"), board.counter("detector", "taken")
+        dashboard = self._feed.dashboard
+        sent, taken = dashboard.counter("detector", "sent"), dashboard.counter("detector", "taken")
         if sent is not None and taken is not None:
             yield _gauge("features_waiting", "Messages of features that the compressor has not taken yet.",
                          sent - taken)  # fmt: skip
-        if board.learned_after is not None:
+        if dashboard.model_latency is not None:
             yield _gauge("learning_latency_seconds", "From a frame's track to the model that learned from it.",
-                         board.learned_after)  # fmt: skip
+                         dashboard.model_latency)  # fmt: skip
         leaves = GaugeMetricFamily(
             "catstream_tree_leaves", "Leaves ever inserted into a coreset tree.", labels=["tree"]
         )
         for tree in HEADS:
-            if (value := board.counter("compressor", f"{tree}_leaves")) is not None:
+            if (value := dashboard.counter("compressor", f"{tree}_leaves")) is not None:
                 leaves.add_metric([tree], value)
         yield leaves
 
@@ -81,9 +83,9 @@ class _Collector:
             "catstream_refused_messages", "Messages that were not what their channel carries.", labels=["process"]
         )
         for process in CHANNELS["health"].senders:
-            if process in self._feed.board.health:
-                heard.add_metric([process], max(0.0, time() - self._feed.board.health[process].time))
-                refused.add_metric([process], self._feed.board.counter(process, "refused") or 0)
+            if process in self._feed.dashboard.health:
+                heard.add_metric([process], max(0.0, time() - self._feed.dashboard.health[process].time))
+                refused.add_metric([process], self._feed.dashboard.counter(process, "refused") or 0)
         yield from (heard, refused)
 
 

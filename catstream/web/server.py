@@ -14,14 +14,14 @@ import uvicorn
 
 from catstream.errors import ServiceError
 from catstream.web.app import create
-from catstream.web.connections import MOST, Connection
+from catstream.web.connections import MAX_CONNECTIONS, Connection
 from catstream.web.feed import Feed
 from catstream.web.guard import Guard, is_loopback
 
 __all__ = ["Server"]
 
-_FAREWELL_SECONDS = 2
-_ANY = ("0.0.0.0", "::")  # hosts that stand for all addresses of this machine
+_SHUTDOWN_SECONDS = 2
+_ALL_ADDRESSES = ("0.0.0.0", "::")  # hosts that stand for all addresses of this machine
 _GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
 
 
@@ -55,10 +55,14 @@ class Server:
             )
         self._feed = Feed(endpoint, keys)
         guard = Guard(create(self._feed), token)
-        self._socket = _listening(host, port)
+        self._socket = _listen(host, port)
         bound = self._socket.getsockname()[1]
         end = f":{bound}/" + (f"#{token}" if token else "")
-        hosts = ["127.0.0.1", *_names_of_this_machine()] if host in _ANY else [f"[{host}]" if ":" in host else host]
+        hosts = (
+            ["127.0.0.1", *_addresses_of_this_machine()]
+            if host in _ALL_ADDRESSES
+            else [f"[{host}]" if ":" in host else host]
+        )
         self.urls = [f"http://{name}{end}" for name in hosts]
         self.url = self.urls[0]
         config = uvicorn.Config(
@@ -69,8 +73,8 @@ class Server:
             access_log=False,
             server_header=False,
             proxy_headers=False,
-            backlog=MOST // 2,
-            timeout_graceful_shutdown=_FAREWELL_SECONDS,
+            backlog=MAX_CONNECTIONS // 2,
+            timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
         )
         self._server = _Uvicorn(config, self._feed)
 
@@ -80,7 +84,7 @@ class Server:
             self._server.run([self._socket])
 
     @contextlib.contextmanager
-    def beside(self) -> Iterator[None]:
+    def in_background(self) -> Iterator[None]:
         """Serve in a thread of its own, meanwhile."""
         thread = threading.Thread(target=self._server.run, args=([self._socket],), name="view", daemon=True)
         thread.start()
@@ -103,20 +107,20 @@ class _Uvicorn(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _listening(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listening = socket.socket(family)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((host, port))
-        listening.listen(MOST // 2)
+        listening.listen(MAX_CONNECTIONS // 2)
     except OSError as error:
         listening.close()
         raise ServiceError(f"cannot listen on {host}:{port} ({error.strerror}): give another port or host") from None
     return listening
 
 
-def _names_of_this_machine() -> list[str]:
+def _addresses_of_this_machine() -> list[str]:
     """The host name, and the IPv4 address of each network interface but the loopback."""
     names = [socket.gethostname()]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:

@@ -50,7 +50,7 @@ def serve(folder):
 
         def start(**options):
             server = Server(str(folder), port=0, **options)
-            stack.enter_context(server.beside())
+            stack.enter_context(server.in_background())
             return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
 
         yield start

@@ -22,7 +22,7 @@ try {
   const state = page.locator("#state");
   const is = (name) => page.waitForSelector(`#state[data-state="${name}"]`, patience);
 
-  await page.waitForFunction(() => document.querySelector("#veil").textContent === "", null, patience);
+  await page.waitForFunction(() => document.querySelector("#overlay").textContent === "", null, patience);
   console.log("state", await state.innerText());
   const view = await page.locator("#picture").boundingBox();
   const scale = view.width / Number(process.argv[6]);
@@ -38,11 +38,11 @@ try {
   await is("absent");
   console.log("state", await state.innerText());
   await page.waitForSelector(".tree .node", { state: "attached", ...patience });
-  await page.waitForSelector(".film li canvas", patience);
-  console.log("film", (await page.locator(".film li").count()) > 0);
+  await page.waitForSelector(".surprising li canvas", patience);
+  console.log("surprising", (await page.locator(".surprising li").count()) > 0);
 
   console.log("kill");
-  await is("gone");
+  await is("silent");
   console.log("state", await state.innerText());
   for await (const line of createInterface({ input: process.stdin })) if (line === "restart") break;
   await is("present");

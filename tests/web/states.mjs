@@ -14,7 +14,7 @@ const PAGES = process.env.EVERY_SIZE
   ? [["light", DESKTOP], ["dark", PHONE], ["light", PHONE], ["dark", DESKTOP]] : [["light", DESKTOP], ["dark", PHONE]];
 
 const status = {
-  standing: "running", reason: "", endpoint: "/tmp/catstream-a1", source: "/videos/walk.mp4", processes: [], paused: false,
+  phase: "running", reason: "", endpoint: "/tmp/catstream-a1", source: "/videos/walk.mp4", processes: [], paused: false,
   waiting: false, lost_seconds: 0, skipped: null,
 };
 const track = (state) => ({ frame: 210, time: 8.4, state, version: 12 });
@@ -24,14 +24,14 @@ const trees = (...leaves) => leaves.map((leaves, place) => ({ title: `Tree ${pla
 const all = {
   pipeline: 1, status, track: track("present"), picture: { frame: 210, width: 320, height: 240, box }, points,
   trees: { trees: trees(13, 22, 9, 0), bytes: 4e6, rows: 5120 },
-  film: { frames: 90, shots: [20, 90, 160].map((frame) => ({ frame, time: frame / 25, taught: 1 + frame / 40, box, width: 320, height: 240 })) },
+  surprising: { measured: 90, frames: [20, 90, 160].map((frame) => ({ frame, time: frame / 25, surprise: 1 + frame / 40, box, width: 320, height: 240 })) },
 };
 const changed = (more, state = "present") => ({ status: { ...status, ...more }, track: track(state) });
 
 //: What the page is told in each state, after it was told all; what is done there; in that order.
 const STATES = {
-  "no pipeline": { pipeline: 0, status: { ...status, standing: "waiting", source: "", endpoint: "", reason: "no pipeline of yours is running" },
-    track: null, picture: null, trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, film: { frames: 0, shots: [] } },
+  "no pipeline": { pipeline: 0, status: { ...status, phase: "waiting", source: "", endpoint: "", reason: "no pipeline of yours is running" },
+    track: null, picture: null, trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, surprising: { measured: 0, frames: [] } },
   "waiting for a box": { ...all, ...changed({ waiting: true }), track: null },
   bootstrapping: { ...all, ...changed({}, "bootstrapping") },
   present: { ...all },
@@ -39,17 +39,17 @@ const STATES = {
   "paused, present": changed({ paused: true }),
   "paused, absent": changed({ paused: true }, "absent"),
   lost: changed({ lost_seconds: 12, skipped: 40 }, "absent"),
-  gone: changed({ standing: "gone" }),
+  silent: changed({ phase: "silent" }),
   "another pipeline": { pipeline: 2, status: { ...status, source: "rtsp://10.0.0.7/stream1", endpoint: "run" }, track: null, picture: null,
-    trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, film: { frames: 0, shots: [] } },
+    trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, surprising: { measured: 0, frames: [] } },
   drawing: { ...all },
   stopping: {},
-  "the end": changed({ standing: "ended", reason: "the source came to its end" }),
+  "the end": changed({ phase: "ended", reason: "the source came to its end" }),
   "the end, and of the server": { closed: true },
 };
 const doing = {
   drawing: async (page, viewport) => {
-    await page.waitForFunction(() => document.querySelector("#veil").textContent === "");
+    await page.waitForFunction(() => document.querySelector("#overlay").textContent === "");
     const view = await page.locator("#picture").boundingBox();
     const at = (part) => ({ x: view.x + view.width * part, y: view.y + view.height * part });
     if (viewport === PHONE) { // with a finger
@@ -69,7 +69,7 @@ const doing = {
     await page.click("#cancel");
     await page.click("#stop");
   },
-  "the end": (page) => page.click("#sure button:not(.danger)"),
+  "the end": (page) => page.click("#stop-dialog button:not(.danger)"),
   "the end, and of the server": (page) => page.evaluate(() => events.onerror()),
 };
 
@@ -91,9 +91,9 @@ try {
       await page.evaluate((told) => events.onmessage({ data: JSON.stringify(told) }), parts);
       await doing[name]?.(page, viewport);
       const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));
-      seen.push({ state: name, scheme, pill: await page.locator("#state").innerText(), veil: await page.locator("#veil").textContent(),
-        about: await page.locator("#about").textContent(), frame: await page.locator("#frame").textContent(),
-        shots: await page.locator(".film li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
+      seen.push({ state: name, scheme, pill: await page.locator("#state").innerText(), overlay: await page.locator("#overlay").textContent(),
+        source: await page.locator("#source").textContent(), frame: await page.locator("#frame").textContent(),
+        frames: await page.locator(".surprising li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
         wide: await page.evaluate(() => document.documentElement.scrollWidth - innerWidth),
         violations: violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html, any }) => `${html} ${any[0]?.message ?? ""}`).join("; ")}`) });
       if (screenshots) await page.screenshot({ path: `${screenshots}/${name}-${scheme}-${viewport.width}.png`, fullPage: name === "present" });

@@ -10,7 +10,7 @@ import pytest
 
 from catstream.messages import Preview
 from catstream.web import connections
-from catstream.web.board import Board
+from catstream.web.dashboard import Dashboard
 
 TOKEN = "correct-horse-battery"
 HALF = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX-"
@@ -61,7 +61,7 @@ def test_a_request_that_comes_byte_by_byte_gets_no_more_time_for_it(serve, conne
 
 def test_a_client_that_does_not_read_its_answers_is_let_go(serve, connect, monkeypatch):
     monkeypatch.setattr(connections, "_ANSWER_SECONDS", 0.05)
-    monkeypatch.setattr(Board, "picture", lambda *_: Preview(1, 64, 48, None, bytes(1 << 23)))
+    monkeypatch.setattr(Dashboard, "picture", lambda *_: Preview(1, 64, 48, None, bytes(1 << 23)))
     client = connect(serve())
     sent_until_it_is_closed(client, b"GET /pictures/1.jpg HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
 
@@ -69,7 +69,7 @@ def test_a_client_that_does_not_read_its_answers_is_let_go(serve, connect, monke
 @pytest.mark.parametrize("begun", [b"", HALF], ids=["nothing", "half a head"])
 def test_no_number_of_idle_connections_keeps_others_out(serve, connect, begun):
     page = serve(token=TOKEN)
-    for _ in range(connections.MOST + 50):
+    for _ in range(connections.MAX_CONNECTIONS + 50):
         connect(page).sendall(begun)
     assert page.get("/healthz").status_code == 200
     assert page.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
@@ -81,7 +81,7 @@ def test_a_page_that_is_open_stays_so_while_others_open_connections(serve, conne
     with page.stream("GET", "/events") as events:
         lines = events.iter_lines()
         assert next(lines) == "retry: 1000"
-        for _ in range(connections.MOST + 50):
+        for _ in range(connections.MAX_CONNECTIONS + 50):
             connect(page).sendall(HALF)
         assert page.get("/healthz").status_code == 200
         assert any(line.startswith("data: ") for line in lines)

@@ -66,7 +66,7 @@ def test_a_box_drawn_with_the_mouse_is_followed_until_it_leaves_and_after_a_rest
             boxes.append(box)
     settings = Settings(run={"endpoint": str(folder), "unstored_frames": 4})  # it goes on only as its tracks are taken
     server = Server(str(folder), port=0)
-    with server.beside():
+    with server.in_background():
         with Pipeline(str(path), None, settings) as pipeline:
             browser, lines = browse(server.url, boxes[0])
 
@@ -96,5 +96,5 @@ def test_a_box_drawn_with_the_mouse_is_followed_until_it_leaves_and_after_a_rest
                     until(lambda: "state present" in lines[seen:] and said("errors []"))
                     break
     assert lines[0] == "state waiting for a box"
-    assert "film true" in lines
+    assert "surprising true" in lines
     assert "overflow 0" in lines

@@ -18,8 +18,8 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.messages import Health
-from catstream.web.board import Board
-from catstream.web.guard import Bucket, Guard
+from catstream.web.dashboard import Dashboard
+from catstream.web.guard import Guard, TokenBucket
 from catstream.web.server import Server
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
@@ -54,7 +54,7 @@ def pipeline(folder):
         }
 
 
-def news(page, name, turn):
+def updates(page, name, turn):
     """The first part of that name that the page is told, while turns are made; fails where none is."""
     deadline = time.monotonic() + 60
 
@@ -68,7 +68,7 @@ def news(page, name, turn):
 
     with ThreadPoolExecutor(1) as pool:
         found = pool.submit(told)
-        while not found.done():  # whether the page has news or not: it listens from a moment on that nobody knows
+        while not found.done():  # whether the page has updates or not: it listens from a moment on that nobody knows
             turn()
             time.sleep(0.05)
     return found.result()
@@ -85,7 +85,9 @@ def test_the_page_needs_nothing_from_elsewhere_and_runs_no_script_of_others(page
     assert "style=" not in answer.text
 
 
-@pytest.mark.parametrize("name", ["style.css", "page.js", "stage.js", "charts.js", "trees.js", "film.js", "svg.js"])
+@pytest.mark.parametrize(
+    "name", ["style.css", "page.js", "stage.js", "charts.js", "trees.js", "surprising.js", "svg.js"]
+)
 def test_each_file_of_the_page_is_served_as_what_it_is(page, name):
     answer = page.get(f"/page/{name}")
     assert answer.headers["content-type"].startswith("text/css" if name.endswith("css") else "text/javascript")
@@ -114,7 +116,7 @@ def test_it_is_healthy_by_itself_and_ready_with_all_processes(page, pipeline, un
 
 
 def test_it_is_not_ready_where_one_process_is_silent(page, pipeline, until, monkeypatch):
-    monkeypatch.setattr("catstream.web.board.SILENCE_SECONDS", 0.5)
+    monkeypatch.setattr("catstream.web.dashboard.SILENCE_SECONDS", 0.5)
 
     def answer(*heard):
         for name in heard:
@@ -131,7 +133,7 @@ def test_tracks_come_to_the_page_as_they_are_sent(page, pipeline, facts):
         pipeline["detector"].send(Health("detector", time.monotonic(), {}))
         pipeline["tracks"].send(facts.track(5))
 
-    assert news(page, "track", turn) == {"frame": 5, "time": 0.5, "state": "present", "version": 1}
+    assert updates(page, "track", turn) == {"frame": 5, "time": 0.5, "state": "present", "version": 1}
 
 
 def test_a_message_that_it_fails_on_does_not_end_the_feed(page, pipeline, facts, monkeypatch, caplog):
@@ -143,8 +145,8 @@ def test_a_message_that_it_fails_on_does_not_end_the_feed(page, pipeline, facts,
         pipeline["detector"].send(Health("detector", time.monotonic(), {}))
         pipeline["tracks"].send(facts.track(5))
 
-    monkeypatch.setattr(Board, "take", fails)
-    assert news(page, "track", turn)["frame"] == 5
+    monkeypatch.setattr(Dashboard, "take", fails)
+    assert updates(page, "track", turn)["frame"] == 5
     assert "ArithmeticError: it cannot be" in caplog.text
 
 
@@ -158,7 +160,7 @@ def test_pictures_are_asked_of_the_pipeline_only_while_somebody_looks(page, pipe
 
     until(lambda: turn() and page.get("/metrics").text.count("\ncatstream_up 1.0\n"))
     assert not pipeline["previews"].heard
-    frame = news(page, "picture", turn)["frame"]
+    frame = updates(page, "picture", turn)["frame"]
     assert page.get(f"/pictures/{frame}.jpg").content == facts.preview(frame).jpeg
     until(lambda: turn() and not pipeline["previews"].heard)
 
@@ -279,7 +281,7 @@ def test_the_token_opens_as_a_header(locked):
 
 
 def test_the_token_opens_by_the_door_and_the_browser_does_not_keep_it(locked):
-    answer = locked.post("/enter", data={"token": TOKEN})
+    answer = locked.post("/login", data={"token": TOKEN})
     assert (answer.status_code, answer.headers["location"]) == (303, "/")
     kept = answer.headers["set-cookie"]
     assert TOKEN not in kept
@@ -289,17 +291,17 @@ def test_the_token_opens_by_the_door_and_the_browser_does_not_keep_it(locked):
 
 
 def test_wrong_tokens_become_too_many_and_the_right_one_opens_all_the_same(locked):
-    wrong = [locked.post("/enter", data={"token": f"guess {guess}"}) for guess in range(12)]
+    wrong = [locked.post("/login", data={"token": f"guess {guess}"}) for guess in range(12)]
     assert [answer.status_code for answer in wrong] == [401] * 8 + [429] * 4
     assert int(wrong[-1].headers["retry-after"]) >= 0
     assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
-    assert locked.post("/enter", data={"token": TOKEN}).status_code == 303
+    assert locked.post("/login", data={"token": TOKEN}).status_code == 303
     assert locked.get("/").status_code == 200, "the cookie opens"
     assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}x"}).status_code == 429
 
 
 def test_a_bucket_lets_as_many_through_as_it_says():
-    bucket, passed = Bucket(3, 0.5), []
+    bucket, passed = TokenBucket(3, 0.5), []
     for moment in range(20):
         if not bucket.wait(moment):
             bucket.take()
@@ -316,7 +318,7 @@ def test_where_others_can_look_a_token_is_needed(host):
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_a_page_at_all_addresses_of_this_machine_names_those_that_others_can_open(host):
     server = Server(host=host, port=0, token=TOKEN)
-    with server.beside():
+    with server.in_background():
         urls = [urlsplit(url) for url in server.urls]
     assert {url.fragment for url in urls} == {TOKEN}
     assert [url.hostname for url in urls[:2]] == ["127.0.0.1", socket.gethostname().lower()]

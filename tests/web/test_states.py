@@ -24,7 +24,7 @@ def seen(tmp_path):
         pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
     cv2.imwrite(str(tmp_path / "picture.jpg"), np.full((240, 320, 3), (200, 160, 90), np.uint8))
     server = Server(str(tmp_path / "nowhere"), port=0)
-    with server.beside():
+    with server.in_background():
         words = [node, HERE / "states.mjs", server.url, chromium, tmp_path / "profile", tmp_path / "picture.jpg"]
         run = subprocess.run(words, capture_output=True, text=True, check=False)
     assert run.stdout, run.stderr
@@ -36,20 +36,25 @@ def test_each_state_of_the_page_is_readable_for_all_and_says_what_is_so(seen):
     assert {key: state["violations"] for key, state in seen.items() if state["violations"]} == {}, "found by axe"
     assert {key for key, state in seen.items() if state["wide"] > 0} == set(), "wider than its window"
     for scheme in ("light", "dark"):
-        assert seen[scheme, "present"]["about"] == "walk.mp4"
-        assert seen[scheme, "lost"]["about"] == "walk.mp4, 40 frames skipped"
+        assert seen[scheme, "present"]["source"] == "walk.mp4"
+        assert seen[scheme, "lost"]["source"] == "walk.mp4, 40 frames skipped"
         check_another_pipeline(seen[scheme, "another pipeline"])
         check_end(seen[scheme, "the end"], seen[scheme, "the end, and of the server"])
 
 
 def check_another_pipeline(state):
     """Nothing of the pipeline before is shown."""
-    assert (state["pill"], state["about"], state["frame"]) == ("waiting", "rtsp://10.0.0.7/stream1", "")
-    assert (state["veil"], state["shots"], set(state["trees"])) == ("Waiting for a picture", 0, {"no leaf yet"})
+    assert (state["pill"], state["source"], state["frame"]) == ("waiting", "rtsp://10.0.0.7/stream1", "")
+    assert (state["overlay"], state["frames"], set(state["trees"])) == ("Waiting for a picture", 0, {"no leaf yet"})
 
 
 def check_end(before, last):
     """The page keeps what it showed, and says that its server ended too."""
-    assert before["veil"] == "The end: the source came to its end. This page waits for the next one."
-    assert last["veil"].startswith("The end: the source came to its end. The server of this page has ended too")
-    assert (last["pill"], last["frame"], last["shots"], last["trees"]) == ("ended", before["frame"], 3, before["trees"])
+    assert before["overlay"] == "The end: the source came to its end. This page waits for the next one."
+    assert last["overlay"].startswith("The end: the source came to its end. The server of this page has ended too")
+    assert (last["pill"], last["frame"], last["frames"], last["trees"]) == (
+        "ended",
+        before["frame"],
+        3,
+        before["trees"],
+    )

@@ -1,23 +1,23 @@
 // What the server tells goes to the parts of the page; what a person wants goes to the pipeline.
 
 import { Charts } from "./charts.js";
-import { Film } from "./film.js";
 import { Stage } from "./stage.js";
+import { SurprisingFrames } from "./surprising.js";
 import { Trees } from "./trees.js";
 
 const $ = (selector) => document.querySelector(selector);
 const charts = new Charts($(".charts"));
-const trees = new Trees($(".trees"), $("#kept"));
-const film = new Film($(".film"), $("#measured"));
+const trees = new Trees($(".trees"), $("#tree-summary"));
+const surprising = new SurprisingFrames($(".surprising"), $("#surprising-summary"));
 const stage = new Stage($("#stage"), $("#picture"), { pause, follow, changed: showDrawing });
-let status = { standing: "waiting" };
+let status = { phase: "waiting" };
 let track = null;
 let paused = false;
 let closed = false; // whether the server of this page said that it ends
 let silent = false; // whether it does not answer
 
 /** Have a command carried out; returns the answer, null where it was refused, which is said. */
-async function steer(verb, more = {}) {
+async function sendCommand(verb, more = {}) {
   let answer;
   try {
     const response = await fetch("/control", {
@@ -30,34 +30,34 @@ async function steer(verb, more = {}) {
   } catch {
     answer = { done: false, reason: "the server of this page does not answer" };
   }
-  say(answer.reason, !answer.done);
+  showMessage(answer.reason, !answer.done);
   if (!answer.done) return null;
   if (verb === "pause" || verb === "resume") showPaused(verb === "pause");
   return answer;
 }
 
-function say(text, wrong = false) {
-  $("#said").textContent = text;
-  $("#said").classList.toggle("wrong", wrong);
+function showMessage(text, wrong = false) {
+  $("#message").textContent = text;
+  $("#message").classList.toggle("wrong", wrong);
 }
 
 /** Stand still, for a box to be drawn: the frame that it will be in, and how to go on afterwards. */
 async function pause() {
   if (status.waiting) return { frame: Infinity, leave: null };
   const before = paused;
-  const answer = await steer("pause");
+  const answer = await sendCommand("pause");
   if (!answer) return null;
-  say("Paused for your box.");
+  showMessage("Paused for your box.");
   // The frame after the last one that was followed is held, and the box is in that.
-  return { frame: answer.frame + 1, leave: before ? null : () => steer("resume") };
+  return { frame: answer.frame + 1, leave: before ? null : () => sendCommand("resume") };
 }
 
 async function follow(box, leave) {
   const keep = $("#keep").checked && !status.waiting;
-  const answer = await steer("set-box", { box: box.map((side) => Math.round(side * 10) / 10), keep });
+  const answer = await sendCommand("set-box", { box: box.map((side) => Math.round(side * 10) / 10), keep });
   if (answer && leave) {
     await leave();
-    say(answer.reason);
+    showMessage(answer.reason);
   }
   return answer !== null;
 }
@@ -77,21 +77,21 @@ function showPaused(now) {
 }
 
 function showState() {
-  const running = status.standing === "running" && !silent;
+  const running = status.phase === "running" && !silent;
   const lost = running && status.lost_seconds > 0;
   const waiting = running && status.waiting;
-  let state = running ? (track && !waiting ? track.state : "waiting") : status.standing;
+  let state = running ? (track && !waiting ? track.state : "waiting") : status.phase;
   let words = { waiting: "waiting", gone: "pipeline gone", ended: "ended" }[state] || state;
-  if (silent && status.standing !== "ended") [state, words] = ["gone", "page stopped"];
-  else if (lost) [state, words] = ["gone", `source lost for ${Math.round(status.lost_seconds)} s`];
+  if (silent && status.phase !== "ended") [state, words] = ["silent", "page stopped"];
+  else if (lost) [state, words] = ["silent", `source lost for ${Math.round(status.lost_seconds)} s`];
   else if (waiting) words = "waiting for a box";
   else if (running && paused) words = `paused, ${words}`;
   const pill = $("#state");
   pill.dataset.state = state;
   if (pill.lastElementChild.textContent !== words) pill.lastElementChild.textContent = words;
   showSource();
-  $("#veil").textContent = veil(running);
-  $("#stage").classList.toggle("over", status.standing === "ended" && stage.hasPicture);
+  $("#overlay").textContent = overlay(running);
+  $("#stage").classList.toggle("over", status.phase === "ended" && stage.hasPicture);
   for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
 }
 
@@ -101,21 +101,21 @@ function showSource() {
   const name = source.includes("://") ? source : source.split("/").filter(Boolean).at(-1) || source;
   const shown = /^\d+$/.test(name) ? `camera ${name}` : name || status.endpoint || "";
   const skipped = status.skipped === null || status.skipped === undefined ? "" : `, ${status.skipped} frames skipped`;
-  $("#about").textContent = shown ? `${shown}${skipped}` : "";
-  $("#about").title = source && status.endpoint ? `${source}, followed by the pipeline at ${status.endpoint}` : "";
+  $("#source").textContent = shown ? `${shown}${skipped}` : "";
+  $("#source").title = source && status.endpoint ? `${source}, followed by the pipeline at ${status.endpoint}` : "";
   document.title = shown ? `${shown} – catstream` : "catstream";
 }
 
 /** What is said over the picture, and why it stands still. */
-function veil(running) {
-  if (status.standing === "ended") {
+function overlay(running) {
+  if (status.phase === "ended") {
     const page = closed ? "The server of this page has ended too" : silent ? "The server of this page does not answer" : "";
     return `The end: ${status.reason}. ${page ? `${page}: this is the last it showed.` : "This page waits for the next one."}`;
   }
   if (closed) return "The server of this page was stopped: this is the last it showed. The pipeline may go on.";
   if (silent) return "The server of this page does not answer. This page tries again.";
-  if (status.standing === "waiting") return status.reason || "Waiting for a pipeline";
-  if (status.standing === "gone") return "The pipeline is gone. This page waits for it.";
+  if (status.phase === "waiting") return status.reason || "Waiting for a pipeline";
+  if (status.phase === "silent") return "The pipeline is gone. This page waits for it.";
   return running && !stage.hasPicture ? "Waiting for a picture" : "";
 }
 
@@ -123,9 +123,9 @@ const show = {
   pipeline() { // all that is shown is of another one
     stage.clear();
     charts.clear();
-    film.clear();
+    surprising.clear();
     track = null;
-    say("");
+    showMessage("");
     $("#frame").textContent = "";
   },
   closed() {
@@ -133,7 +133,7 @@ const show = {
     showState();
   },
   status(part) {
-    if (part.standing !== "running" && status.standing === "running") stage.cancel(false);
+    if (part.phase !== "running" && status.phase === "running") stage.cancel(false);
     status = part;
     showPaused(Boolean(part.paused));
   },
@@ -148,7 +148,7 @@ const show = {
   },
   points: (part) => charts.add(part),
   trees: (part) => trees.show(part),
-  film: (part) => film.show(part),
+  surprising: (part) => surprising.show(part),
 };
 
 function listen() {
@@ -177,13 +177,13 @@ function listen() {
 $("#draw").onclick = () => { $("#stage").focus(); stage.begin(); };
 $("#follow").onclick = () => stage.accept();
 $("#cancel").onclick = () => stage.cancel();
-$("#pause").onclick = () => steer(paused ? "resume" : "pause");
-$("#stop").onclick = () => $("#sure").showModal();
-$("#sure").onclose = (event) => {
-  if (event.target.returnValue === "stop") steer("stop");
+$("#pause").onclick = () => sendCommand(paused ? "resume" : "pause");
+$("#stop").onclick = () => $("#stop-dialog").showModal();
+$("#stop-dialog").onclose = (event) => {
+  if (event.target.returnValue === "stop") sendCommand("stop");
   event.target.returnValue = "";
 };
 addEventListener("resize", () => { stage.draw(); trees.redraw(); });
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { stage.draw(); film.draw(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { stage.draw(); surprising.draw(); });
 showState();
 listen();

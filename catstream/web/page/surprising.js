@@ -1,69 +1,69 @@
-// The film: the frames that taught most, each cut out around its box.
+// The frames with the largest surprise, each cropped around its box.
 
-const AROUND = 2.6; // times the box that a picture shows
+const AROUND = 2.6; // width of a picture in box widths
 const [WIDTH, HEIGHT] = [304, 205];
 
-export class Film {
+export class SurprisingFrames {
   constructor(element, measured) {
-    Object.assign(this, { element, measured, shots: new Map() });
+    Object.assign(this, { element, measured, items: new Map() });
   }
 
   clear() {
-    this.shots = new Map();
+    this.items = new Map();
     this.element.replaceChildren();
   }
 
-  show({ frames, shots }) {
-    this.measured.textContent = frames
-      ? `The ${shots.length} most of ${frames.toLocaleString("en")} frames that came as pictures with a model to measure by, a second apart.`
-      : "Nothing yet: it takes a first model to be wrong.";
-    const most = Math.max(...shots.map((shot) => shot.taught));
+  show({ measured, frames }) {
+    this.measured.textContent = measured
+      ? `The ${frames.length} largest of ${measured.toLocaleString("en")} measured frames, at least a second apart.`
+      : "None yet: the first model is needed to measure.";
+    const most = Math.max(...frames.map((frame) => frame.surprise));
     const now = new Map();
-    for (const shot of shots) {
-      const id = `${shot.frame} ${shot.taught}`;
-      const item = this.shots.get(id) ?? this.make(shot);
-      item.share.style.width = `${(100 * shot.taught) / most}%`;
+    for (const frame of frames) {
+      const id = `${frame.frame} ${frame.surprise}`;
+      const item = this.items.get(id) ?? this.make(frame);
+      item.share.style.width = `${(100 * frame.surprise) / most}%`;
       now.set(id, item);
     }
-    this.shots = now;
+    this.items = now;
     const items = [...now.values()].map((item) => item.element);
     const shown = [...this.element.children];
     if (items.length !== shown.length || items.some((item, index) => item !== shown[index])) this.element.replaceChildren(...items);
   }
 
-  make(shot) {
+  make(frame) {
     const element = document.createElement("li");
     const canvas = Object.assign(document.createElement("canvas"), { width: WIDTH, height: HEIGHT });
     canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", `the object in frame ${shot.frame}`);
+    canvas.setAttribute("aria-label", `the object in frame ${frame.frame}`);
     const caption = document.createElement("p");
-    const [when, taught] = [document.createElement("span"), document.createElement("b")];
-    when.textContent = `frame ${shot.frame}`;
-    taught.textContent = shot.taught.toPrecision(3);
-    caption.append(when, taught);
+    const [when, surprise] = [document.createElement("span"), document.createElement("b")];
+    when.textContent = `frame ${frame.frame}`;
+    surprise.textContent = frame.surprise.toPrecision(3);
+    caption.append(when, surprise);
     const share = document.createElement("i");
     element.append(canvas, share, caption);
-    const item = { element, canvas, share, shot };
+    const item = { element, canvas, share, frame };
     this.load(item);
     return item;
   }
 
   async load(item) {
-    const response = await fetch(`/pictures/${item.shot.frame}.jpg`).catch(() => null);
+    const response = await fetch(`/pictures/${item.frame.frame}.jpg`).catch(() => null);
     item.bitmap = response?.ok ? await createImageBitmap(await response.blob()).catch(() => null) : null;
     this.paint(item);
   }
 
   draw() {
-    for (const item of this.shots.values()) this.paint(item);
+    for (const item of this.items.values()) this.paint(item);
   }
 
-  paint({ canvas, bitmap, shot }) {
+  paint({ canvas, bitmap, frame }) {
     if (!bitmap) return;
-    const scale = bitmap.width / shot.width;
-    const [x, y, w, h] = shot.box.map((side) => side * scale);
+    const scale = bitmap.width / frame.width;
+    const [x, y, w, h] = frame.box.map((side) => side * scale);
     const zoom = Math.min(WIDTH / (AROUND * w), HEIGHT / (AROUND * h));
-    // Around the box, as far as the picture goes.
+    // Centred on the box, and shifted to stay inside the picture.
     const inside = (centre, side, whole) => (side > whole ? whole / 2 : Math.min(Math.max(centre, side / 2), whole - side / 2));
     const [across, down] = [inside(x + w / 2, WIDTH / zoom, bitmap.width), inside(y + h / 2, HEIGHT / zoom, bitmap.height)];
     const context = canvas.getContext("2d");

@@ -1,4 +1,4 @@
-"""The board: what the page shows of a pipeline, from the messages it sends. No socket, no clock."""
+"""The dashboard: what the page shows of a pipeline, from the messages it sends. No socket, no clock."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any, Literal
 
 from catstream.heads import HEADS
 from catstream.messages import End, Features, Health, Model, Preview, Track
-from catstream.web.film import Film
+from catstream.web.surprising import SurprisingFrames
 
-__all__ = ["SILENCE_SECONDS", "Board", "Standing"]
+__all__ = ["SILENCE_SECONDS", "Dashboard", "Phase"]
 
 #: How the pipeline is: not heard yet, heard, silent since, at its end.
-Standing = Literal["waiting", "running", "gone", "ended"]
+Phase = Literal["waiting", "running", "silent", "ended"]
 
 #: After which who says nothing is gone: each process is heard once a second.
 SILENCE_SECONDS = 4.0
@@ -21,19 +21,19 @@ _POINT_SECONDS = 0.25
 _POINTS = 480  # two minutes
 _RATE_SECONDS = 2.0  # that frames a second are counted over
 _FRAMES = 4096  # whose arrival is remembered, until a model has learned from them
-_GROWING = ("sent", "rows")  # counters that only grow in one pipeline, of one object
-_FAREWELL_SECONDS = 3.0  # that the processes may still be heard after the end
+_MONOTONIC_COUNTERS = ("sent", "rows")  # counters that only grow in one pipeline, of one object
+_LATE_HEALTH_SECONDS = 3.0  # that the processes may still be heard after the end
 _TRACKS = 256  # that are kept until the picture of their frame is here
 _PICTURES = 8  # a page that asks for the last but one still gets it
 
 
-class Board:
+class Dashboard:
     """Takes messages, and tells each page what is new to it.
 
     What it shows is of one pipeline. At the first track or health of another one it forgets all of the one before;
     until then it keeps the last picture and figures.
 
-    standing, reason : of the pipeline
+    phase, reason : of the pipeline
     endpoint, source : where it runs, and the source that it follows
     health : what each process said last
     heard : when each was heard last, of those that are not silent since
@@ -44,64 +44,64 @@ class Board:
         self._revisions: Counter[str] = Counter(
             pipeline=1, trees=1
         )  # told first: a page clears what it shows of another
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         """Begin with a pipeline of which nothing is known."""
-        self.standing: Standing = "waiting"
+        self.phase: Phase = "waiting"
         self.reason = self.source = ""
         self.track: Track | None = None
         self.health: dict[str, Health] = {}
-        self.heard: dict[str, float] = {}
-        self.learned_after: float | None = None
-        self.film = Film()
+        self.last_reports: dict[str, float] = {}
+        self.model_latency: float | None = None
+        self.surprising = SurprisingFrames()
         self.pictures: OrderedDict[int, Preview] = OrderedDict()
         self._last: dict[str, Health] = {}  # as `health`, and kept while the pipeline is silent
         self._model: Model | None = None
         self._since = 0  # first frame of the object that is followed
         self._points: deque[tuple[float | None, ...]] = deque(maxlen=_POINTS)
-        self._pointed = self._ended = float("-inf")  # when the last point was made, and when the pipeline ended
+        self._last_point = self._ended = float("-inf")  # when the last point was made, and when the pipeline ended
         self._moments: deque[float] = deque()
-        self._arrived: OrderedDict[int, float] = OrderedDict()
+        self._arrivals: OrderedDict[int, float] = OrderedDict()
         self._tracks: OrderedDict[int, Track] = OrderedDict()  # the last ones, by frame
 
     def attach(self, endpoint: str) -> None:
         """What comes from now on comes from here; what is shown stays until something comes."""
         self._attached = endpoint
-        if self.standing == "waiting":
+        if self.phase == "waiting":
             self.endpoint = endpoint
-            self._changed("status")
+            self._mark_changed("status")
 
     def take(self, message: Any, now: float) -> None:
         """Take a message that came at a moment `now`, seconds of any clock that only goes forward."""
-        if self._is_of_another(message, now):
-            self._forget()
-            self._changed("pipeline", "status", "track", "picture", "trees", "film")
+        if self._is_from_another_pipeline(message, now):
+            self._reset()
+            self._mark_changed("pipeline", "status", "track", "picture", "trees", "surprising")
         match message:
             case Track():
-                self._follow(message, now)
+                self._add_track(message, now)
             case Model():
-                self._learn(message, now)
+                self._add_model(message, now)
             case Health():
-                self._hear(message, now)
+                self._add_health(message, now)
             case Preview():
-                self._look(message)
+                self._add_preview(message)
             case Features():
-                if self.film.learn(message):
-                    self._changed("film")
-            case End() if self.standing != "ended":
-                self.standing, self.reason, self._ended = "ended", message.reason, now
-                self._changed("status")
+                if self.surprising.add_features(message):
+                    self._mark_changed("surprising")
+            case End() if self.phase != "ended":
+                self.phase, self.reason, self._ended = "ended", message.reason, now
+                self._mark_changed("status")
 
-    def lost(self, reason: str) -> None:
+    def mark_silent(self, reason: str) -> None:
         """The pipeline is silent, or there is none."""
-        if self.standing == "running":
-            self.standing = "gone"
-        if self.standing != "ended":
+        if self.phase == "running":
+            self.phase = "silent"
+        if self.phase != "ended":
             self.reason = reason
         self.health.clear()
-        self.heard.clear()
-        self._changed("status")
+        self.last_reports.clear()
+        self._mark_changed("status")
 
     def rate(self, now: float) -> float:
         """Frames a second, over the last two."""
@@ -114,10 +114,10 @@ class Board:
         return self.health[process].counters.get(name) if process in self.health else None
 
     def picture(self, frame: int) -> Preview | None:
-        """The picture of a frame that was told of lately, or that is in the film."""
+        """The picture of a frame that was told of lately, or that is in the surprising."""
         if frame in self.pictures:
             return self.pictures[frame]
-        return next((shot.preview for shot in self.film.shots if shot.frame == frame), None)
+        return next((one.preview for one in self.surprising.frames if one.frame == frame), None)
 
     @property
     def newest(self) -> tuple[Preview, Track | None] | None:
@@ -125,7 +125,7 @@ class Board:
         preview = next(reversed(self.pictures.values()), None)
         return None if preview is None else (preview, self._tracks.get(preview.frame))
 
-    def news(self, seen: dict[str, int]) -> dict[str, Any]:
+    def updates(self, seen: dict[str, int]) -> dict[str, Any]:
         """The parts that are new to a page, ready for JSON.
 
         Parameters
@@ -139,7 +139,7 @@ class Board:
                 seen[name] = revision
         return parts
 
-    def _is_of_another(self, message: Any, now: float) -> bool:
+    def _is_from_another_pipeline(self, message: Any, now: float) -> bool:
         """Whether a message shows that another pipeline is there than the one that is shown."""
         if not isinstance(message, Track | Health):
             return False
@@ -148,85 +148,85 @@ class Board:
             return True
         if isinstance(message, Track):  # a restarted detector goes on, or began before the first model
             over = self.track is not None and message.seq < self.track.seq and not message.model_version
-            return over or self.standing == "ended"
+            return over or self.phase == "ended"
         before = self._last.get(message.process, message).counters
-        over = any(message.counters.get(name, 0.0) < before.get(name, 0.0) for name in _GROWING)
-        late = self.standing == "ended" and now - self._ended > _FAREWELL_SECONDS
-        return late or (over and self.standing in ("ended", "gone"))
+        over = any(message.counters.get(name, 0.0) < before.get(name, 0.0) for name in _MONOTONIC_COUNTERS)
+        late = self.phase == "ended" and now - self._ended > _LATE_HEALTH_SECONDS
+        return late or (over and self.phase in ("ended", "silent"))
 
-    def _hear(self, health: Health, now: float) -> None:
+    def _add_health(self, health: Health, now: float) -> None:
         self.health[health.process] = health
-        heard = self.heard | {health.process: now}
-        self.heard = {name: last for name, last in heard.items() if now - last <= SILENCE_SECONDS}
+        heard = self.last_reports | {health.process: now}
+        self.last_reports = {name: last for name, last in heard.items() if now - last <= SILENCE_SECONDS}
         self._last[health.process] = health
         self.source = health.source or self.source
-        if self.standing in ("waiting", "gone"):
-            self.standing, self.reason = "running", ""
-        self._point(now)
-        self._changed("status", "trees")
+        if self.phase in ("waiting", "silent"):
+            self.phase, self.reason = "running", ""
+        self._add_point(now)
+        self._mark_changed("status", "trees")
 
-    def _follow(self, track: Track, now: float) -> None:
-        if self.standing != "running":
-            self.standing, self.reason = "running", ""
-            self._changed("status")
+    def _add_track(self, track: Track, now: float) -> None:
+        if self.phase != "running":
+            self.phase, self.reason = "running", ""
+            self._mark_changed("status")
         if self.track is not None and track.model_version < self.track.model_version:
-            self._begin(track.frame)
+            self._begin_object(track.frame)
         self.track = self._tracks[track.frame] = track
         if len(self._tracks) > _TRACKS:
             self._tracks.popitem(last=False)
         self._moments.append(now)
-        self._arrived[track.frame] = now
-        if len(self._arrived) > _FRAMES:
-            self._arrived.popitem(last=False)
-        self._point(now)
-        self._changed("track")
+        self._arrivals[track.frame] = now
+        if len(self._arrivals) > _FRAMES:
+            self._arrivals.popitem(last=False)
+        self._add_point(now)
+        self._mark_changed("track")
 
-    def _begin(self, frame: int) -> None:
+    def _begin_object(self, frame: int) -> None:
         """Another object is followed from this frame on: what was learned before is of no meaning to it."""
-        self._since, self.film, self.learned_after = frame, Film(), None
-        self._arrived.clear()
+        self._since, self.surprising, self.model_latency = frame, SurprisingFrames(), None
+        self._arrivals.clear()
         if self._model is not None and self._model.frame >= frame:  # it came before the track
-            self.film.adopt(self._model)
-        self._changed("film")
+            self.surprising.adopt(self._model)
+        self._mark_changed("surprising")
 
-    def _learn(self, model: Model, now: float) -> None:
+    def _add_model(self, model: Model, now: float) -> None:
         if model.frame < self._since:  # of the object before
             return
         self._model = model
-        self.film.adopt(model)
-        if (arrived := self._arrived.get(model.frame)) is not None:
-            self.learned_after = now - arrived
-        while self._arrived and next(iter(self._arrived)) <= model.frame:
-            self._arrived.popitem(last=False)
+        self.surprising.adopt(model)
+        if (arrived := self._arrivals.get(model.frame)) is not None:
+            self.model_latency = now - arrived
+        while self._arrivals and next(iter(self._arrivals)) <= model.frame:
+            self._arrivals.popitem(last=False)
 
-    def _look(self, preview: Preview) -> None:
+    def _add_preview(self, preview: Preview) -> None:
         self.pictures[preview.frame] = preview
         self.pictures.move_to_end(preview.frame)
         if len(self.pictures) > _PICTURES:
             self.pictures.popitem(last=False)
-        if self.film.look(preview):
-            self._changed("film")
-        self._changed("picture")
+        if self.surprising.add_preview(preview):
+            self._mark_changed("surprising")
+        self._mark_changed("picture")
 
-    def _point(self, now: float) -> None:
-        if self.track is None or now - self._pointed < _POINT_SECONDS:
+    def _add_point(self, now: float) -> None:
+        if self.track is None or now - self._last_point < _POINT_SECONDS:
             return
-        self._pointed, present = now, self.track.state != "absent"
+        self._last_point, present = now, self.track.state != "absent"
         self._points.append(
-            (now, self.track.score, self.rate(now), self.learned_after, self.track.model_version, present)
+            (now, self.track.score, self.rate(now), self.model_latency, self.track.model_version, present)
         )
-        self._changed("points")
+        self._mark_changed("points")
 
-    def _changed(self, *parts: str) -> None:
+    def _mark_changed(self, *parts: str) -> None:
         self._revisions.update(parts)
 
     def _status_part(self, _: int) -> dict[str, Any]:
         return {
-            "standing": self.standing,
+            "phase": self.phase,
             "reason": self.reason,
             "endpoint": self.endpoint,
             "source": self.source,
-            "processes": sorted(self.heard),
+            "processes": sorted(self.last_reports),
             "paused": bool(self.counter("detector", "paused")),
             "waiting": bool(self.counter("detector", "waiting")),
             "lost_seconds": self.counter("detector", "lost_seconds"),
@@ -262,10 +262,10 @@ class Board:
             "rows": counted.get("rows"),
         }
 
-    def _film_part(self, _: int) -> dict[str, Any]:
-        shots = [
-            {"frame": shot.frame, "time": shot.time, "taught": round(shot.taught, 3), "box": shot.preview.box}
-            | {"width": shot.preview.width, "height": shot.preview.height}
-            for shot in self.film.shots
+    def _surprising_part(self, _: int) -> dict[str, Any]:
+        frames = [
+            {"frame": one.frame, "time": one.time, "surprise": round(one.surprise, 3), "box": one.preview.box}
+            | {"width": one.preview.width, "height": one.preview.height}
+            for one in self.surprising.frames
         ]
-        return {"frames": self.film.frames, "shots": shots}
+        return {"measured": self.surprising.measured, "frames": frames}

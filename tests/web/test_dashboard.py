@@ -1,0 +1,190 @@
+"""The dashboard: what a page is told of the messages of a pipeline."""
+
+from __future__ import annotations
+
+import pytest
+
+from catstream.messages import End, Health
+from catstream.web.dashboard import Dashboard
+
+
+@pytest.fixture
+def dashboard():
+    return Dashboard()
+
+
+def test_a_page_is_told_once_of_what_is_new(dashboard, facts):
+    seen = {}
+    dashboard.take(facts.track(3), 1.0)
+    assert dashboard.updates(seen)["track"] == {"frame": 3, "time": 0.3, "state": "present", "version": 1}
+    assert dashboard.updates(seen) == {}
+    dashboard.take(facts.track(4), 1.01)
+    assert set(dashboard.updates(seen)) == {"track"}
+
+
+def test_who_comes_late_gets_all_there_is(dashboard, facts):
+    for frame in range(20):
+        dashboard.take(facts.track(frame), 0.5 * frame)
+    early, late = {}, {}
+    assert len(dashboard.updates(early)["points"]) == 20
+    dashboard.take(facts.track(20), 10.0)
+    assert len(dashboard.updates(early)["points"]) == 1
+    assert len(dashboard.updates(late)["points"]) == 21
+
+
+def test_two_minutes_of_points_are_kept_however_fast_tracks_come(dashboard, facts):
+    for frame in range(20_000):
+        dashboard.take(facts.track(frame), 0.01 * frame)
+    moments = [point[0] for point in dashboard.updates({})["points"]]
+    assert len(moments) == 480
+    assert moments[-1] - moments[0] == pytest.approx(120, abs=10)
+
+
+def test_frames_a_second_are_those_of_the_last_two(dashboard, facts):
+    for frame in range(100):
+        dashboard.take(facts.track(frame), frame / 50)
+    assert dashboard.rate(2.0) == pytest.approx(50, abs=1)
+    assert dashboard.rate(3.0) == pytest.approx(25, abs=1)
+    assert dashboard.rate(9.0) == 0
+
+
+def test_latency_is_from_a_frame_to_the_model_that_learned_from_it(dashboard, facts):
+    for frame in range(10):
+        dashboard.take(facts.track(frame), float(frame))
+    dashboard.take(facts.model(1, frame=6), 9.5)
+    assert dashboard.model_latency == pytest.approx(3.5)
+
+
+def test_silence_and_the_end_are_told_apart(dashboard, facts):
+    told = {}
+    dashboard.take(Health("detector", 1.0, {"sent": 1.0}), 0.0)
+    assert dashboard.updates(told)["status"]["phase"] == "running"
+    dashboard.mark_silent("nothing came")
+    assert dashboard.updates(told)["status"]["phase"] == "silent"
+    dashboard.take(facts.track(0), 10.0)
+    dashboard.take(End(2, "the source came to its end"), 11.0)
+    dashboard.mark_silent("nothing came")
+    status = dashboard.updates(told)["status"]
+    assert (status["phase"], status["reason"]) == ("ended", "the source came to its end")
+
+
+def test_a_process_that_is_silent_is_not_among_those_that_are_heard(dashboard):
+    names, told = ("compressor", "detector", "trainer"), {}
+    for name in names:
+        dashboard.take(Health(name, 1.0, {"sent": 1.0}), 0.0)
+    assert dashboard.updates(told)["status"]["processes"] == list(names)
+    for moment in (1.0, 2.0, 3.0, 4.0, 5.0):
+        for name in names[:2]:
+            dashboard.take(Health(name, 1.0, {}), moment)
+    assert dashboard.updates(told)["status"]["processes"] == list(names[:2])
+    dashboard.take(Health("trainer", 1.0, {}), 6.0)
+    assert dashboard.updates(told)["status"]["processes"] == list(names)
+    dashboard.mark_silent("nothing came")
+    assert dashboard.updates(told)["status"]["processes"] == []
+
+
+def test_the_last_health_of_a_pipeline_is_not_taken_for_the_next_one(dashboard):
+    dashboard.take(Health("detector", 1.0, {"sent": 7.0}), 9.0)
+    dashboard.take(End(2, "the source came to its end"), 10.0)
+    dashboard.take(Health("detector", 1.0, {"sent": 8.0}), 10.5)
+    dashboard.take(Health("compressor", 1.0, {}), 10.6)
+    assert dashboard.phase == "ended"
+    dashboard.take(Health("compressor", 2.0, {}), 20.0)
+    assert dashboard.phase == "running"
+
+
+def test_the_trees_are_shown_as_the_last_health_said_after_the_end_too(dashboard):
+    dashboard.take(End(2, "the source came to its end"), 10.0)
+    dashboard.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 200.0}), 10.1)
+    dashboard.mark_silent("no pipeline is running")
+    trees = dashboard.updates({})["trees"]
+    assert (trees["trees"][0]["leaves"], trees["rows"]) == (3.0, 200.0)
+
+
+def followed(dashboard, facts, endpoint):
+    """Show a page all of a pipeline; what the page was told."""
+    told = {}
+    dashboard.attach(endpoint)
+    dashboard.take(Health("detector", 1.0, {"sent": 9.0}, source="first.mp4"), 0.0)
+    dashboard.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 90.0}), 0.0)
+    for frame in (50, 51):
+        dashboard.take(facts.track(frame, version=5), frame / 10)
+        dashboard.take(facts.model(5, frame=50), frame / 10)
+        dashboard.take(facts.features(frame, wrong=1.0), frame / 10)
+        dashboard.take(facts.preview(frame), frame / 10)
+    assert dashboard.updates(told)["surprising"]["frames"]
+    return told
+
+
+FIRST_SIGNS = {
+    "its health at another endpoint": (
+        "b",
+        False,
+        lambda _: Health("detector", 2.0, {"sent": 20.0}, source="second.mp4"),
+    ),
+    "its track at another endpoint": ("b", False, lambda facts: facts.track(70, version=9)),
+    "its track at the same endpoint after the end": ("a", True, lambda facts: facts.track(70, version=9)),
+    "its health at the same endpoint after the end": ("a", True, lambda _: Health("detector", 2.0, {"sent": 0.0})),
+    "its trees at the same endpoint after the end": ("a", True, lambda _: Health("compressor", 2.0, {"rows": 0.0})),
+    "its first track at the same endpoint": ("a", False, lambda facts: facts.track(0, version=0)),
+}
+
+
+@pytest.mark.parametrize(("endpoint", "ended", "sign"), FIRST_SIGNS.values(), ids=FIRST_SIGNS)
+def test_nothing_of_a_pipeline_is_left_once_another_one_is_seen(dashboard, facts, endpoint, ended, sign):
+    told = followed(dashboard, facts, "a")
+    if ended:
+        dashboard.take(End(52, "the source came to its end"), 6.0)
+    dashboard.attach(endpoint)
+    assert dashboard.endpoint == "a"
+    assert not set(dashboard.updates(told)) - {"status"}, "nothing goes before the other one is seen"
+    dashboard.take(sign(facts), 6.1)
+    parts = dashboard.updates(told)
+    assert next(iter(parts)) == "pipeline", "a page clears what it shows before it takes the rest"
+    assert (parts["status"]["phase"], parts["status"]["endpoint"]) == ("running", endpoint)
+    assert parts["status"]["source"] != "first.mp4"
+    assert parts["surprising"]["frames"] == []
+    assert parts["picture"] is None
+    assert not any(tree["leaves"] for tree in parts["trees"]["trees"])
+    assert len(parts.get("points", [])) <= 1
+    assert dashboard.picture(51) is None
+
+
+def test_frames_of_another_pipeline_are_not_measured_by_the_model_of_the_one_before(dashboard, facts):
+    followed(dashboard, facts, "a")
+    dashboard.attach("b")
+    dashboard.take(facts.track(0, version=0, state="bootstrapping"), 6.0)
+    dashboard.take(facts.features(0, wrong=1.0), 6.0)
+    dashboard.take(facts.preview(0), 6.0)
+    assert dashboard.surprising.measured == 0
+
+
+def test_frames_of_another_object_are_not_measured_by_the_model_of_the_one_before(dashboard, facts):
+    followed(dashboard, facts, "a")
+    dashboard.take(facts.track(60, version=0, state="bootstrapping"), 6.0)
+    dashboard.take(facts.model(6, frame=55), 6.0)
+    dashboard.take(facts.features(60, wrong=1.0), 6.0)
+    dashboard.take(facts.preview(60), 6.0)
+    assert dashboard.surprising.measured == 0
+    dashboard.take(facts.model(7, frame=61), 6.0)
+    dashboard.take(facts.features(61, wrong=1.0), 6.0)
+    dashboard.take(facts.preview(61), 6.0)
+    assert dashboard.surprising.measured == 1
+
+
+def test_another_run_begins_with_no_surprising_frames(dashboard, facts):
+    dashboard.take(facts.track(0, version=5), 0.0)
+    dashboard.take(facts.model(5, frame=0), 0.0)
+    dashboard.take(facts.features(0, wrong=1.0), 0.0)
+    dashboard.take(facts.preview(0), 0.0)
+    assert [one["frame"] for one in dashboard.updates({})["surprising"]["frames"]] == [0]
+    dashboard.take(facts.track(0, version=0, state="bootstrapping"), 5.0)
+    assert dashboard.updates({})["surprising"]["frames"] == []
+
+
+def test_pictures_that_were_told_of_lately_are_there_and_older_ones_are_not(dashboard, facts):
+    for frame in range(30):
+        dashboard.take(facts.preview(frame), 0.1 * frame)
+    assert dashboard.updates({})["picture"] == {"frame": 29, "width": 64, "height": 48, "box": (4.0, 3.0, 20.0, 10.0)}
+    assert dashboard.picture(25).jpeg.endswith(b"25")
+    assert dashboard.picture(5) is None
