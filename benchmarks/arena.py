@@ -14,12 +14,14 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic
-from typing import Any, Self
+from typing import Self
 
 from catstream.box import Box
 from catstream.errors import ServiceError
+from catstream.job import Job
 from catstream.messages import End, Position, Track
 from catstream.services.loop import REFUSED
 from catstream.services.start import service_command
@@ -246,17 +248,17 @@ class Arena:
         return "; ".join(f"{name}: {said[-1] if said else 'nothing'}" for name, said in lines.items())
 
     def _start(self, name: str) -> None:
-        command: list[Any] = service_command("--parent", str(os.getpid()), name)
-        for pair in (*self._settings.changed(), f"run.endpoint={self._places[name]}"):
-            command += ["--set", pair]
-        if name == "detector":
-            command += [self._source, "--box", ",".join(map(repr, self._first)), "--resume", "--owned"]
-        if name == "compressor":
-            command += ["--state", self.state]
+        # Each process meets the others at a link of its own, so each has a job of its own.
+        folder = self._folder / f"job-{name}"
+        folder.mkdir(exist_ok=True)
+        job = Job(self._source, self._first, settings=self._settings, owned=True, resume=True)
+        state = self.state if name == "compressor" else None
+        file = replace(job, state=state, endpoint=str(self._places[name])).save(folder)
+        command = service_command("child", name, str(file), "--parent", str(os.getpid()))
         path = os.pathsep.join([str(self._folder), *filter(None, [os.environ.get("PYTHONPATH")])])
         with (self._folder / f"{name}.log").open("ab") as log:
             self._processes[name] = subprocess.Popen(
-                [str(word) for word in command],
+                command,
                 stdin=subprocess.DEVNULL,
                 stderr=log,
                 env={**os.environ, "PYTHONPATH": path, "ARENA_CLOCK": str(self._clock)},

@@ -13,17 +13,20 @@ import time
 import warnings
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
 from catstream.features import COMPILING
+from catstream.job import Job, Results
 from catstream.learned import Learned
 from catstream.messages import End, Health, Position, Track
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.state import Origin, began, learned, locked, position
+from catstream.state import began, learned, locked, position
 from catstream.video.frames import without_password
 from catstream.video.source import ALL_FRAMES, is_live, open_source, without_scheme
 from catstream.wire.endpoint import meeting_place, private_folder
@@ -79,8 +82,8 @@ class Pipeline:
     after : Position
         With `resume`: the last track that the caller has. The run goes on with the next one. If None, it goes on after
         the last frame that was learned from: tracks of the last second may come again.
-    notes : mapping of str to str
-        Texts to keep with the state, for the program that goes on.
+    results : Results
+        The files that the program writes, to be kept with the state for the program that goes on.
     save_model : path
         File to write what was learned to once the processes have ended, however the run ended: what
         `catstream save` writes.
@@ -97,8 +100,6 @@ class Pipeline:
         Width and height of a frame.
     live : bool
         Whether the source is a camera or a stream.
-    source, part, notes
-        As they were given, or kept.
 
     Raises
     ------
@@ -129,94 +130,98 @@ class Pipeline:
         state: str | os.PathLike[str] | None = None,
         resume: str | os.PathLike[str] | None = None,
         after: Position | None = None,
-        notes: Mapping[str, str] | None = None,
+        results: Results | None = None,
         save_model: str | os.PathLike[str] | None = None,
     ) -> None:
         if state is not None and resume is not None:
             raise SettingsError("a run is begun in a folder (state) or goes on in one (resume): give one of them")
-        self._kept = Origin.load(Path(resume)) if resume is not None else None
+        self._kept = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
-        self.part, self.notes = part, dict(notes or {})
-        self._after = after
+        given = settings.changed() if isinstance(settings, Settings) else settings or {}
+        job = _with_object(self._kept or Job(started=time.time()), box, model)
+        job = replace(
+            job,
+            source=without_scheme(str(source)) if source is not None else job.source,
+            part=job.part if part == ALL_FRAMES else part,
+            settings=job.settings.but(given),
+            results=results if results is not None else job.results,
+        )
+        _check(job, _path(record), is_new=self._kept is None)
+        # The detector opens the source once more: a camera shows its picture to one program at a time.
+        image_rate, skip_damaged = job.settings.run.image_rate, job.settings.run.skip_damaged
+        with open_source(job.source, part=job.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
+            self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
+            self.live = first.live
+        if job.box is not None:
+            job.box.validated(*self.size)
+        path = job.source if self.live else str(Path(job.source).absolute())
+        self._job = replace(job, source=path, size=self.size, settings=job.settings.for_length(self.frames))
+        if self._kept is not None and self._state is not None:
+            self._kept.check_fits(self._job, self._state)
+        self._record, self._save_model = _path(record), _path(save_model)
+        self._after, self._box = after, job.box
         self._stack: ExitStack | None = None  # of all that is to be undone at the end, once it has started
         self._endpoint = ""
         self._supervisor: Supervisor | None = None
         self._checked = 0.0
-        if self._kept is not None:
-            source = source or self._kept.source
-            if box is None and model is None:
-                box, model = self._kept.box, self._kept.model or None
-            self.part = self._kept.part if part == ALL_FRAMES else part
-            self.notes = self._kept.notes | self.notes
-        given = settings.changed() if isinstance(settings, Settings) else settings or {}
-        self.settings = (self._kept.settings if self._kept is not None else Settings()).but(given)
-        if source is None:
-            raise SettingsError("a new run needs a source: give one")
-        self.source = without_scheme(str(source))
-        self._box = Box.parse(box) if box is not None else None
-        self._record = None if record is None else Path(record)
-        self._save_model = None if save_model is None else Path(save_model)
-        self._model = Path(model) if model is not None else None
-        if self._box is not None and self._model is not None:
-            raise SettingsError("a box says where the object is, with a model it is searched for: give one of them")
-        if self._model is not None:
-            Learned.load(self._model)
         self._end: End | None = None
         self._health: dict[str, Health] = {}
-        if self.settings.run.lockstep and is_live(self.source):
-            raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
-        if self._record is not None and self._record.exists() and self._kept is None:
-            raise RecordingError(f"{record} is there already: give another name, or remove it")
-        # The detector opens the source once more: a camera shows its picture to one at a time.
-        image_rate, skip_damaged = self.settings.run.image_rate, self.settings.run.skip_damaged
-        with open_source(self.source, part=self.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
-            self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
-            self.live = first.live
-        if self._box is not None:
-            self._box.validated(*self.size)
-        self.settings = self.settings.for_length(self.frames)
-        path = self.source if self.live else str(Path(self.source).absolute())
-        started = self._kept.started if self._kept else time.time()
-        kept = str(self._model.absolute()) if self._model is not None else ""
-        self._origin = Origin(path, self._box, self.part, self.settings, self.size, started, self.notes, kept)
-        if self._kept is not None and self._state is not None:
-            self._kept.check(self._state, self._origin)
+
+    @property
+    def source(self) -> str:
+        """The source, as it was given or kept; a path is absolute."""
+        return self._job.source
+
+    @property
+    def part(self) -> slice:
+        """The frames that are followed."""
+        return self._job.part
+
+    @property
+    def settings(self) -> Settings:
+        """All settings of the run."""
+        return self._job.settings
+
+    def starting_after(self, position: Position | None) -> Self:
+        """The same run, that has not started yet, with another `after`."""
+        if self._stack is not None:
+            raise ServiceError("the pipeline has started: say after which track it goes on before that")
+        other = copy(self)
+        other._after = position
+        return other
 
     def __enter__(self) -> Self:
         if self._stack is not None:
             raise ServiceError(_ONCE)
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
-            source = without_password(self._origin.source)
-            endpoint = stack.enter_context(
-                meeting_place(self.settings.run.endpoint, folder, self.settings.run.keys, source)
-            )
-            state = self._state
-            if state is not None:
-                stack.enter_context(_begun(state, self._kept, self._origin))
-            start = self._start(state) if state is not None and self._kept is not None else Position()
+            settings, shown = self.settings, without_password(self.source)
+            endpoint = stack.enter_context(meeting_place(settings.run.endpoint, folder, settings.run.keys, shown))
+            start = Position()
+            if self._state is not None:
+                stack.enter_context(_begun(self._state, self._kept, self._job))
+                start = self._start(self._state) if self._kept is not None else start
             self._box = start.box or self._box
-            self._results = stack.enter_context(Receiver("results", endpoint, start, self.settings.run.unstored_frames))
+            self._incoming = stack.enter_context(Receiver("results", endpoint, start, settings.run.unstored_frames))
             self._reports = stack.enter_context(Subscriber("health", endpoint))
-            settings = self.settings.but({"run.endpoint": str(endpoint)})
             if self._save_model is not None:  # by the compressor's last checkpoint
-                stack.enter_context(_saved(self._save_model, state or folder, settings))
-            supervisor = Supervisor(
-                self.source,
-                self._origin.box,
-                settings,
-                folder,
-                model=self._model,
-                owned=True,
-                part=self.part,
-                record=self._record,
-                state=state,
-                resume=self._kept is not None,
-                since=time.monotonic() - max(0.0, time.time() - self._origin.started),
-            )
+                stack.enter_context(_saved(self._save_model, self._state or folder, settings))
+            supervisor = Supervisor(self._started(str(endpoint)), folder)
             stack.callback(supervisor.stop)
             self._endpoint, self._supervisor, self._stack = str(endpoint), supervisor, stack.pop_all()
         return self
+
+    def _started(self, endpoint: str) -> Job:
+        """The job of this start of the run, for its processes."""
+        return replace(
+            self._job,
+            endpoint=endpoint,
+            owned=True,
+            record=self._record,
+            state=self._state and self._state.absolute(),
+            resume=self._kept is not None,
+            since=time.monotonic() - max(0.0, time.time() - self._job.started),
+        )
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -273,7 +278,7 @@ class Pipeline:
             if (track := self._take(0)) is not None:
                 yield track
             elif self._end is None:
-                await readable([self._results], _CHECK_SECONDS)
+                await readable([self._incoming], _CHECK_SECONDS)
         for _ in self._farewell():
             await asyncio.sleep(_TURN_SECONDS)
         self._raise_failure()
@@ -285,12 +290,12 @@ class Pipeline:
 
     def _take(self, seconds: float) -> Track | None:
         """The next track if it comes in time; looks after the processes too."""
-        message = self._results.receive(seconds)
+        message = self._incoming.receive(seconds)
         if isinstance(message, Track):
-            self._results.acknowledge(Position(message.seq, message.frame, message.box or self._box))
+            self._incoming.acknowledge(Position(message.seq, message.frame, message.box or self._box))
             self._box = message.box or self._box
         elif isinstance(message, End):
-            self._results.acknowledge(Position(message.seq))
+            self._incoming.acknowledge(Position(message.seq))
             self._end = message
         if time.monotonic() - self._checked > _CHECK_SECONDS:
             self._checked = time.monotonic()
@@ -313,17 +318,6 @@ class Pipeline:
         if not self._endpoint:
             raise ServiceError("a pipeline has no endpoint before it has started: use it in a `with`")
         return self._endpoint
-
-    @property
-    def after(self) -> Position | None:
-        """After which track a run that is resumed goes on: see the parameter. It is fixed once it has started."""
-        return self._after
-
-    @after.setter
-    def after(self, position: Position | None) -> None:
-        if self._stack is not None:
-            raise ServiceError("the pipeline has started: say after which track it goes on before that")
-        self._after = position
 
     @property
     def totals(self) -> dict[str, int]:
@@ -358,7 +352,7 @@ class Pipeline:
     @property
     def waits(self) -> bool:
         """Whether it begins by waiting for a box; one that goes on may have one by now."""
-        return self._box is None and self._model is None and self._kept is None
+        return self._box is None and self._job.model is None and self._kept is None
 
     @property
     def complete(self) -> bool:
@@ -402,7 +396,7 @@ class Pipeline:
         deadline = time.monotonic() + _FAREWELL_SECONDS
         while not self._children.finished and time.monotonic() < deadline:
             yield
-            self._results.receive(0)
+            self._incoming.receive(0)
             self._listen()
             self._children.check()
         self._listen()
@@ -414,17 +408,44 @@ class Pipeline:
         return self._supervisor
 
 
+def _path(path: str | os.PathLike[str] | None) -> Path | None:
+    return None if path is None else Path(path)
+
+
+def _with_object(job: Job, box: str | Iterable[float] | None, model: str | os.PathLike[str] | None) -> Job:
+    """The job with another object, if one is given."""
+    if box is None and model is None:
+        return job
+    return replace(
+        job,
+        box=None if box is None else Box.parse(box),
+        model=None if model is None else Path(model).absolute(),
+    )
+
+
+def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
+    """Raise an error if a run cannot start, before anything is opened."""
+    if not job.source:
+        raise SettingsError("a new run needs a source: give one")
+    if job.model is not None:
+        Learned.load(job.model)
+    if job.settings.run.lockstep and is_live(job.source):
+        raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
+    if record is not None and record.exists() and is_new:
+        raise RecordingError(f"{record} is there already: give another name, or remove it")
+
+
 @contextmanager
-def _begun(folder: Path, kept: Origin | None, origin: Origin) -> Iterator[None]:
-    """Hold the folder of the state, and write there how the pipeline was started if that is new."""
+def _begun(folder: Path, kept: Job | None, job: Job) -> Iterator[None]:
+    """Lock the folder of the state, and keep the job there if it is new or has changed."""
     with locked(folder):
         if kept is None and began(folder):
             raise ServiceError(
                 f"a pipeline was kept in {str(folder)!r} already: go on with it (--resume {folder}), "
                 "or give another folder"
             )
-        if origin != kept:
-            origin.save(folder)
+        if job != kept:
+            job.save(folder)
         yield
 
 

@@ -1,6 +1,7 @@
 """`python -P -m catstream.services NAME`: THE LIST of processes, a command each.
 
-Each can be started by hand, in any order, on any endpoint; `catstream track` starts them all.
+Each process can be started by hand, in any order; `catstream track` starts them all. What a process works on is its
+`catstream.job.Job`: the options of a command build one, and a parent process gives its children the file of one.
 """
 
 from __future__ import annotations
@@ -11,23 +12,23 @@ limit_process()  # before anything imports numpy
 
 import logging
 import sys
-from functools import partial
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
 from catstream.errors import CatstreamError
+from catstream.job import Job
 from catstream.services.loop import Parent, run
 from catstream.services.options import with_model, with_object, with_part, with_settings
-from catstream.settings import Settings
+
+_PATH = click.Path(path_type=Path)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
-@click.option("--parent", type=int, hidden=True, help="Process id of the one to end with.")
-@click.option("--watchdog", type=int, hidden=True, help="File descriptor of the watchdog that it watches.")
-@click.pass_context
-def main(context: click.Context, parent: int | None, watchdog: int | None) -> None:
+def main() -> None:
     """The processes of a catstream pipeline.
 
     They meet at an endpoint: a folder that holds their sockets, or tcp://127.0.0.1:PORT. All need
@@ -39,55 +40,45 @@ def main(context: click.Context, parent: int | None, watchdog: int | None) -> No
       python -P -m catstream.services trainer    --set run.endpoint=run &
       python -P -m catstream.services detector   --set run.endpoint=run walk.mp4 --box 120,80,64,48
     """
-    logging.basicConfig(format=f"{context.invoked_subcommand}: %(message)s", level=logging.INFO)
-    context.obj = None if parent is None else Parent(parent, watchdog)
 
 
 _source = click.argument("source")
+_state = click.option("--state", type=_PATH, help="Folder of the checkpoints and of what was commanded.")
+_record = click.option("--record", type=_PATH, help="File that the compressor records to; it goes on with one.")
 
 
 @main.command()
 @_source
 @click.option("--resume", is_flag=True, help="Go on where a detector before this one stopped.")
-@click.option("--owned", is_flag=True, help="Somebody takes every track from the channel `results`.")
-@click.option("--recorded", is_flag=True, help="Begin once somebody listens to the tracks: the compressor records.")
-@click.option("--state", type=click.Path(path_type=Path), help="Folder to keep in what was commanded.")
-@click.option("--since", type=float, hidden=True, help="Moment that the times of a live source count from.")
+@click.option("--owned", is_flag=True, help="Another process receives every track from the channel `results`.")
+@_record
+@_state
 @with_object
 @with_part
 @with_settings
-@click.pass_obj
-def detector(parent: Parent | None, settings: Settings, **options: Any) -> None:
-    """Frames in; tracks and features out, with the newest model there is."""
-    import cv2
+def detector(**options: Any) -> None:
+    """Frames in; tracks and features out, with the newest model.
 
-    from catstream.services import detector
-
-    cv2.setNumThreads(1)
-    sys.exit(run("detector", partial(detector.main, **options), settings, parent))
+    With --record it waits until the compressor listens to the tracks.
+    """
+    _run("detector", Job(**options))
 
 
 @main.command()
-@click.option("--state", type=click.Path(path_type=Path), help="Folder of the checkpoint to go on from.")
-@click.option("--record", type=click.Path(path_type=Path), help="File to write all that travels to, or to go on with.")
+@_state
+@_record
 @with_model
 @with_settings
-@click.pass_obj
-def compressor(parent: Parent | None, settings: Settings, **options: Any) -> None:
+def compressor(**options: Any) -> None:
     """Features in, samples out; owns the coreset trees."""
-    from catstream.services import compressor
-
-    sys.exit(run("compressor", partial(compressor.main, **options), settings, parent))
+    _run("compressor", Job(**options))
 
 
 @main.command()
 @with_settings
-@click.pass_obj
-def trainer(parent: Parent | None, settings: Settings) -> None:
+def trainer(**options: Any) -> None:
     """Samples in, models out."""
-    from catstream.services import trainer
-
-    sys.exit(run("trainer", trainer.main, settings, parent))
+    _run("trainer", Job(**options))
 
 
 @main.command()
@@ -95,15 +86,44 @@ def trainer(parent: Parent | None, settings: Settings) -> None:
 @with_object
 @with_part
 @with_settings
-def supervisor(settings: Settings, source: str, **options: Any) -> None:
+def supervisor(**options: Any) -> None:
     """Start the other three on a source, and keep them running."""
     from catstream.services import supervisor
 
-    sys.exit(supervisor.main(source, settings, **options))
+    _log_as("supervisor")
+    sys.exit(supervisor.main(Job(**options)))
+
+
+@main.command(hidden=True)
+@click.argument("name", type=click.Choice(["detector", "compressor", "trainer"]))
+@click.argument("file", type=_PATH)
+@click.option("--parent", type=int, required=True, help="Process id of the parent, with which the process ends.")
+@click.option("--watchdog", type=int, help="File descriptor of the memory that the parent watches.")
+@click.option("--restarted", is_flag=True, help="Go on where the process before this one stopped.")
+def child(name: str, file: Path, parent: int, watchdog: int | None, restarted: bool) -> None:
+    """Run one process of the job in a file."""
+    job = Job.load(file)
+    _run(name, replace(job, resume=job.resume or restarted), Parent(parent, watchdog))
+
+
+def _run(name: str, job: Job, parent: Parent | None = None) -> NoReturn:
+    """Run one of the three processes, and exit with its code."""
+    _log_as(name)
+    if name == "detector":
+        import cv2
+
+        cv2.setNumThreads(1)
+    service = import_module(f"catstream.services.{name}")
+    sys.exit(run(name, service.main, job, parent))
+
+
+def _log_as(name: str) -> None:
+    """Begin each line of the log with the name of the process, by which the supervisor finds them."""
+    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
 
 
 def start() -> None:
-    """Be the process that the command line asks for; one line for an error."""
+    """Run the command line; an error is one line, and exit code 1."""
     try:
         main(prog_name="python -P -m catstream.services")
     except CatstreamError as error:

@@ -27,7 +27,7 @@ _READ_SECONDS = 1e-7  # that it may take for a byte
 _LOCK_SECONDS = 10.0  # that a compressor before this one may take to end
 
 
-def main(process: Process, model: Path | None, state: Path | None, record: Path | None = None) -> None:
+def main(process: Process) -> None:
     """Take every message once, until the stream ends.
 
     Parameters
@@ -37,7 +37,8 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
         what was taken counts as stored
     record : file to write all that travels to, features as they are taken; one that is there is gone on with
     """
-    settings = process.settings
+    settings, job = process.settings, process.job
+    model, state, record = job.model, job.state, job.record
     with ExitStack() as stack:
         generations = None
         if state is not None:
@@ -60,8 +61,7 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
 
         recorder = None
         if record is not None:
-            read = record.stat().st_size if record.exists() else 0  # all of it, to go on after its last whole message
-            process.allow(_STORE_SECONDS + read * _READ_SECONDS)
+            process.allow(reading_seconds(record))
             writer = stack.enter_context(RecordingWriter(record, process.run, resume=True))
             recorder = stack.enter_context(Recorder(writer, process.endpoint))
 
@@ -123,3 +123,8 @@ def main(process: Process, model: Path | None, state: Path | None, record: Path 
             features.receive(0.02)  # a detector that did not hear that its end is stored asks again
             recorder.listen()
             process.beat(counters)
+
+
+def reading_seconds(file: Path) -> float:
+    """Limit for opening a recording, which is read to its last whole message."""
+    return _STORE_SECONDS + (file.stat().st_size if file.exists() else 0) * _READ_SECONDS

@@ -1,11 +1,14 @@
-"""Options that several commands take: settings, the object, and which frames of a source."""
+"""Options that several commands share: settings, the object, and the frames of a source.
+
+Each decorator adds options to a click command, and passes them on as one argument of the command's function.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import click
 
@@ -14,13 +17,15 @@ from catstream.settings import PRESETS, Settings
 
 __all__ = ["with_given", "with_model", "with_object", "with_part", "with_reading", "with_settings"]
 
+_Command = TypeVar("_Command", bound=Callable[..., None])
+
 with_model = click.option(
     "--model", type=click.Path(path_type=Path), metavar="FILE", help="What `catstream save` wrote of the object."
 )
 
 
-def with_object(command: Callable[..., None]) -> Callable[..., None]:
-    """Add `--box` and `--model`, one of them at most; the command gets a Box or None, and a path or None."""
+def with_object(command: _Command) -> _Command:
+    """Add `--box` and `--model`, of which at most one may be given, as the arguments `box` and `model`."""
 
     @click.option("--box", metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
     @with_model
@@ -30,11 +35,11 @@ def with_object(command: Callable[..., None]) -> Callable[..., None]:
             raise click.UsageError("--box says where the object is, with --model it is searched for: give one of them")
         command(box=Box.parse(box) if box is not None else None, model=model, **options)
 
-    return wrapped
+    return cast(_Command, wrapped)
 
 
-def with_part(command: Callable[..., None]) -> Callable[..., None]:
-    """Add `--start`, `--end` and `--stride`; the command gets them as one argument `part`, a slice."""
+def with_part(command: _Command) -> _Command:
+    """Add `--start`, `--end` and `--stride`, as the argument `part`, a slice."""
 
     @click.option("--start", type=click.IntRange(0), metavar="N", help="The first frame, of a file or folder.")
     @click.option("--end", type=click.IntRange(0), metavar="N", help="The frame to stop before.")
@@ -43,11 +48,11 @@ def with_part(command: Callable[..., None]) -> Callable[..., None]:
     def wrapped(start: int | None, end: int | None, stride: int | None, **options: Any) -> None:
         command(part=slice(start, end, stride), **options)
 
-    return wrapped
+    return cast(_Command, wrapped)
 
 
-def with_given(command: Callable[..., None]) -> Callable[..., None]:
-    """Add `--settings`, `--preset` and `--set`; the command gets what is given as one argument `given`, a dict."""
+def with_given(command: _Command) -> _Command:
+    """Add `--settings`, `--preset` and `--set`, as the argument `given`: a dict of the settings that were given."""
 
     @click.option("--settings", "file", type=click.Path(path_type=Path), help="TOML file of settings.")
     @click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings.")
@@ -56,11 +61,11 @@ def with_given(command: Callable[..., None]) -> Callable[..., None]:
     def wrapped(file: Path | None, preset: str | None, pairs: tuple[str, ...], **options: Any) -> None:
         command(given=Settings.given(preset=preset, file=file, overrides=pairs), **options)
 
-    return wrapped
+    return cast(_Command, wrapped)
 
 
-def with_reading(command: Callable[..., None]) -> Callable[..., None]:
-    """Add `--fps` and `--skip-damaged`, the settings of how a file is read, to what the command gets as `given`."""
+def with_reading(command: _Command) -> _Command:
+    """Add `--fps` and `--skip-damaged`, two settings of how a file is read, to the argument `given`."""
 
     @click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default.")
     @click.option("--skip-damaged", is_flag=True, help="Go on after a damaged place in a video file.")
@@ -69,15 +74,15 @@ def with_reading(command: Callable[..., None]) -> Callable[..., None]:
         rate = {} if fps is None else {"run.image_rate": fps}
         command(given=given | rate | ({"run.skip_damaged": True} if skip_damaged else {}), **options)
 
-    return wrapped
+    return cast(_Command, wrapped)
 
 
-def with_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the same; the command gets them, and the others by default, as one argument `settings`."""
+def with_settings(command: _Command) -> _Command:
+    """Add the options of `with_given`, as the argument `settings`: those that were given, the others by default."""
 
     @with_given
     @wraps(command)
     def wrapped(given: dict[str, Any], **options: Any) -> None:
         command(settings=Settings.of(given), **options)
 
-    return wrapped
+    return cast(_Command, wrapped)

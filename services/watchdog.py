@@ -1,8 +1,7 @@
-"""The watchdog of a process: turns of its loop, counted where the one that watches over it can see them.
+"""The watchdog of a process: a count of the turns of its loop, in memory that its parent can read.
 
-The two share a few bytes of memory. Nothing is sent, so that nothing can be late, full or lost; who was
-asleep sees the newest count at once; and the count stands still as soon as the loop does, whatever
-threads go on beside it.
+Parent and child share a few bytes of memory. Nothing is sent, so nothing can be late, full or lost: a parent that slept
+reads the newest count at once, and the count stops as soon as the loop does, whatever other threads go on.
 """
 
 from __future__ import annotations
@@ -13,20 +12,22 @@ import time
 
 __all__ = ["PATIENCE", "Watchdog"]
 
-#: Seconds without a turn after which a loop counts as stuck, where its turns are short.
+#: Seconds without a turn after which a loop whose turns are short counts as stuck.
 PATIENCE = 2.5
 
-_SIZE = 16  # two float64: turns, and the patience that holds
-_START_SECONDS = 120.0  # imports, kernels that are compiled
-_LONGEST_SECONDS = 60.0  # that slow turns alone may ask for
-_TURNS_LONG = 5.0  # a turn may take so many times what the slowest of late took
-_FADES = 0.99  # with each turn: what the slowest of late was
+_SIZE = 16  # two float64: turns, and patience
+_START_SECONDS = 120.0  # for imports and compiling kernels
+_LONGEST_SECONDS = 60.0  # the most patience that slow turns alone lead to
+_TURNS_LONG = 5.0  # patience as a multiple of the slowest recent turn
+_FADES = 0.99  # factor by which the slowest recent turn is forgotten with each turn
 
 
 class Watchdog:
-    """Shared by the loop, which calls `beat`, `allow` and `allow_each`, and by who watches: `turns` and `patience`.
+    """The loop calls `beat`, `allow` and `allow_each`; its parent reads `turns` and `patience`.
 
-    handle : file descriptor of the memory, inherited; None to make it
+    Parameters
+    ----------
+    handle : inherited file descriptor of the memory; None to make a new one
     least : seconds that any turn may take
     """
 
@@ -43,16 +44,16 @@ class Watchdog:
 
     @property
     def turns(self) -> float:
-        """How often the loop turned so far."""
+        """Number of turns so far."""
         return self._cells[0]
 
     @property
     def patience(self) -> float:
-        """Seconds that the turn which goes on now may take."""
+        """Seconds that the present turn may take."""
         return self._cells[1]
 
     def beat(self) -> None:
-        """Say that the loop turned. On a machine on which turns are slow, the next may be slower."""
+        """Count a turn. If turns are slow on this machine, the next ones may be slower."""
         now = time.monotonic()
         if not self._allowed:
             self._slowest = max(now - self._last, _FADES * self._slowest)
@@ -61,15 +62,15 @@ class Watchdog:
         self._cells[0] += 1
 
     def allow(self, seconds: float) -> None:
-        """Say that the turn which goes on now may take so long."""
+        """Set the time that the present turn may take."""
         self._allowed = True
         self._cells[1] = max(self._least, seconds)
         self._cells[0] += 1
 
     def allow_each(self, seconds: float) -> None:
-        """Say that each turn from now on may take so much longer."""
+        """Add to the time that each turn from now on may take."""
         self._least += seconds
 
     def close(self) -> None:
-        """Let go of the handle; the memory stays as long as the object."""
+        """Close the file descriptor; the memory stays as long as the object."""
         os.close(self.handle)

@@ -21,7 +21,7 @@ FLOORS = [
     {"messages", "settings", "ridge", "kalman", "html"},
     {"features"},
     {"paper"},
-    {"detection", "compression", "training", "wire", "video", "adapters"},
+    {"detection", "compression", "training", "wire", "video", "adapters", "job"},
     {"learned"},
     {"tracker", "subscription", "steering", "recording", "sinks", "state"},
     {"services", "web"},

@@ -14,7 +14,8 @@ import click
 from catstream.box import Box
 from catstream.cli.attach import with_endpoint
 from catstream.errors import ServiceError
-from catstream.state import Origin, learned
+from catstream.job import Job
+from catstream.state import learned
 from catstream.steering import Control, control
 
 __all__ = ["pause", "resume", "save", "set_box", "stop"]
@@ -159,7 +160,7 @@ def save(meant: _Meant, file: Path, state: Path | None) -> None:
             "--state names the folder of a run, --endpoint and --source a running pipeline: give one"
         )
     else:
-        found = learned(state, Origin.load(state).settings)
+        found = learned(state, Job.load(state).settings)
         found.save(file)
         version = found.model.version
     click.echo(f"model {version} is in {file}")

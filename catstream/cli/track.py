@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -21,13 +20,13 @@ from catstream.cli.interrupts import Interrupts
 from catstream.cli.serving import PORT, Address, AddressType, with_token
 from catstream.errors import ServiceError
 from catstream.extras import require_extra
+from catstream.job import Job, Results
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
 from catstream.services.options import with_given, with_object, with_part, with_reading
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT
-from catstream.state import Origin
 from catstream.storage import is_writable
 
 __all__ = ["track"]
@@ -143,8 +142,8 @@ def track(
         raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
     if resume is not None and overwrite:
         raise click.UsageError("--resume goes on with the results that are there, --overwrite replaces them: give one")
-    known = Origin.load(resume).notes if resume is not None else {}
-    notes = known | _notes(output, video, write, save_model)
+    known = Job.load(resume).results if resume is not None else Results()
+    results = _results(known, output, video, write, save_model)
     pipeline = Pipeline(
         source,
         box,
@@ -154,34 +153,22 @@ def track(
         state=state,
         record=record,
         resume=resume,
-        notes=notes,
-        save_model=notes.get("save_model"),
+        results=results,
+        save_model=results.save_model,
     )
     if view is not None:
         require_extra("view")
-    output = Path(notes["output"]) if "output" in notes else None
-    files = RunFiles(
-        pipeline.name,
-        pipeline.source,
-        pipeline.part,
-        output,
-        "video" in notes,
-        [*_written(notes), *([STDOUT] if STDOUT in write else [])],
-        pipeline.settings.run.image_rate,
-    )
-    if files.video and output is None:
-        raise click.UsageError("--video needs --output, the folder to write it to")
-    if pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)):
-        raise click.UsageError("a video reads the frames once more, and those of a live source are gone: leave it away")
+    files = _files(pipeline, results, STDOUT in write)
     files.check(
         overwrite=overwrite,
         resumable=state is not None or resume is not None,
-        known=[*_written(known), *([Path(known["output"])] if "output" in known else [])],
+        known=[*known.write, *([known.output] if known.output is not None else [])],
     )
     if save_model is not None:
         _check_model(save_model, overwrite)
     if resume is not None:
-        pipeline.after = files.position()
+        pipeline = pipeline.starting_after(files.position())
+    output = results.output
     console = Console(stderr=True, soft_wrap=True)
     if resume is not None and pipeline.complete:
         if box is not None:
@@ -243,25 +230,40 @@ def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
     )
 
 
-def _notes(output: Path | None, video: bool, write: tuple[Path, ...], save_model: Path | None) -> dict[str, str]:
-    """Where the results go, as it is kept for a run that is resumed from any working directory."""
-    files = [str(file.absolute()) for file in write if file != STDOUT]
-    return {
-        **({"output": str(output.absolute())} if output is not None else {}),
-        **({"video": "yes"} if video else {}),
-        **({"write": json.dumps(files)} if files else {}),
-        **({"save_model": str(save_model.absolute())} if save_model is not None else {}),
-    }
+def _results(
+    known: Results, output: Path | None, video: bool, write: tuple[Path, ...], save_model: Path | None
+) -> Results:
+    """The files of a run, those of an earlier part of it included; a run may be resumed from any working directory."""
+    files = tuple(file.absolute() for file in write if file != STDOUT)
+    return Results(
+        output=output.absolute() if output is not None else known.output,
+        video=video or known.video,
+        write=files or known.write,
+        save_model=save_model.absolute() if save_model is not None else known.save_model,
+    )
+
+
+def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
+    """The files that the tracks go to, and the standard output if it is wanted."""
+    files = RunFiles(
+        pipeline.name,
+        pipeline.source,
+        pipeline.part,
+        results.output,
+        results.video,
+        [*results.write, *([STDOUT] if stdout else [])],
+        pipeline.settings.run.image_rate,
+    )
+    if files.video and files.output is None:
+        raise click.UsageError("--video needs --output, the folder to write it to")
+    if pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)):
+        raise click.UsageError("a video reads the frames once more, and those of a live source are gone: leave it away")
+    return files
 
 
 def _shown(path: Path) -> str:
     """As it is named from the current folder."""
     return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
-
-
-def _written(notes: dict[str, str]) -> list[Path]:
-    """The files that such notes name."""
-    return [Path(path) for path in json.loads(notes.get("write", "[]"))]
 
 
 def _check_model(file: Path, overwrite: bool) -> None:

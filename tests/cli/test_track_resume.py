@@ -14,10 +14,11 @@ import psutil
 import pytest
 
 from catstream.compression.generations import Generations
+from catstream.job import Job
 from catstream.learned import Learned
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
-from catstream.state import TREES, Origin
+from catstream.state import TREES
 from catstream.video.source import open_source
 
 OFTEN = ["--set", "run.checkpoint_seconds=0.05", "--lockstep"]
@@ -169,7 +170,7 @@ def test_settings_that_are_given_again_change_and_all_others_are_kept(video, sai
         variables = {"CATSTREAM_RUN_LAG_FRAMES": "3"} if "--settings" in options else {}
         code, _, errors = said("track", "--resume", kept, *options, env=variables)
         assert code == 0, errors
-        assert Origin.load(kept).settings.changed() == changed
+        assert Job.load(kept).settings.changed() == changed
 
 
 def test_a_program_that_goes_on_gives_the_settings_that_are_others(video, tmp_path):

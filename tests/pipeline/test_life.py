@@ -67,7 +67,7 @@ def test_before_it_has_started_it_says_what_it_has_not(pipeline):
 
 def test_where_it_goes_on_is_said_before_it_starts(pipeline):
     with pipeline, pytest.raises(ServiceError, match="before that"):
-        pipeline.after = None
+        pipeline.starting_after(None)
 
 
 def test_one_that_is_never_closed_is_warned_of_and_ends(video, alive):

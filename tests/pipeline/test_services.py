@@ -13,6 +13,7 @@ import pytest
 from catstream.box import Box
 from catstream.compression.generations import Generations
 from catstream.errors import ServiceError
+from catstream.job import Job
 from catstream.messages import End, Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
@@ -88,7 +89,7 @@ def test_all_that_are_asked_to_end_at_once_do_so_in_order_and_all_is_stored(vide
     arguments = {
         "compressor": ["--state", folder, "--record", folder / "run.rec"],
         "trainer": [],
-        "detector": ["--recorded", path, "--box", ",".join(map(str, boxes[0]))],
+        "detector": ["--record", folder / "run.rec", path, "--box", ",".join(map(str, boxes[0]))],
     }
     with Subscriber("tracks", Endpoint.parse(str(folder))) as tracks:
         place = ["--set", f"run.endpoint={folder}", "--set", "run.lockstep=true"]  # in which the video is long
@@ -121,19 +122,19 @@ def test_a_compressor_that_is_asked_to_end_alone_stores_what_it_has_and_leaves(v
         taken = next(counters["taken"] for counters in told if counters["taken"])
         compressor.send_signal(signal.SIGTERM)
         assert compressor.wait(30) == 0
-        stored = until(lambda: (stored := next(told)["stored"]) >= taken and stored)
-    assert Generations(folder / TREES).load(Settings()).seq == stored
+        stored = Generations(folder / TREES).load(Settings()).seq
+        assert stored >= taken
+        until(lambda: next(told)["stored"] == stored)
     assert detector.poll() is None
 
 
 def test_a_process_whose_parent_is_gone_already_ends_at_once(folder, service):
-    assert service("--parent", 2**22 + 1, "trainer", "--set", f"run.endpoint={folder}").wait(60) == 0
+    file = Job(endpoint=str(folder)).save(folder)
+    assert service("child", "trainer", file, "--parent", 2**22 + 1).wait(60) == 0
 
 
 def test_a_process_that_would_fail_again_says_why_and_is_not_restarted(folder):
-    supervisor = Supervisor(
-        str(folder / "gone.mp4"), Box(1, 1, 9, 9), Settings(run={"endpoint": str(folder)}), folder, owned=False
-    )
+    supervisor = Supervisor(Job(str(folder / "gone.mp4"), Box(1, 1, 9, 9), endpoint=str(folder)), folder)
     try:
         with pytest.raises(ServiceError, match=r"no video or folder .*gone\.mp4"):
             check_for_a_minute(supervisor)
@@ -144,7 +145,7 @@ def test_a_process_that_would_fail_again_says_why_and_is_not_restarted(folder):
 
 def test_a_process_that_keeps_dying_is_given_up(video, folder):
     path, boxes = video
-    supervisor = Supervisor(path, boxes[0], Settings(run={"endpoint": str(folder)}), folder, owned=True)
+    supervisor = Supervisor(Job(path, boxes[0], endpoint=str(folder), owned=True), folder)
 
     def kill_trainer():
         if "trainer" in supervisor.pids:

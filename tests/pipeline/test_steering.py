@@ -15,7 +15,7 @@ import zmq
 from catstream.errors import ProtocolError, RefusedError, ServiceError, SettingsError
 from catstream.learned import Learned
 from catstream.pipeline import Pipeline
-from catstream.services.commands import DesiredState
+from catstream.services.desired import DesiredState
 from catstream.settings import Settings
 from catstream.steering import control
 from catstream.subscription import subscribe

@@ -1,0 +1,191 @@
+"""The job of a run: what is followed, with which settings, and where everything is kept.
+
+Whoever starts a run writes its job to one file, and every process of the run reads it there. A run with a state
+folder keeps a copy of the job in that folder, from which it is resumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from catstream import storage
+from catstream.box import Box
+from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.settings import Settings
+
+__all__ = ["Job", "Results"]
+
+_NAME = "job.safetensors"
+
+#: Settings that change nothing of what is learned: a run may be resumed with others.
+_FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"}
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """The files that `catstream track` writes for a run; a resumed run goes on with the same files.
+
+    output      folder of the results files, None for none
+    video       whether an annotated video is among the results files
+    write       further files of tracks
+    save_model  file for the model that was learned, None for none
+    """
+
+    output: Path | None = None
+    video: bool = False
+    write: tuple[Path, ...] = ()
+    save_model: Path | None = None
+
+    @classmethod
+    def of(cls, facts: dict[str, Any]) -> Results:
+        """The value that `asdict` and JSON made these facts of."""
+        write = tuple(Path(file) for file in facts["write"])
+        return cls(_path(facts["output"]), bool(facts["video"]), write, _path(facts["save_model"]))
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Everything that the processes of a run have to agree on.
+
+    source    the text that `catstream.video.source.open_source` takes
+    box       the object in the first frame; None if the model finds it, or if a command will give the box
+    model     file that `catstream save` wrote, in which case the object is searched for
+    part      the frames of the source that are followed
+    settings  all settings
+    size      width and height of a frame, None if that is not known yet
+    started   seconds since 1970 at which the run first started
+    results   files that `catstream track` writes
+
+    The others hold for one start of the run, and are not in the copy that is kept:
+
+    endpoint  where the processes meet; the setting of the same name if this is empty
+    state     folder of the checkpoints and of the desired state; None if nothing is kept
+    resume    whether the processes go on with that state
+    record    file that the compressor records all messages to
+    owned     whether the process that started the run receives every track on the channel `results`
+    since     value of `time.monotonic` from which the times of a live source count; None for its first frame
+    """
+
+    source: str = field(default="", repr=False)  # it may contain a password
+    box: Box | None = None
+    model: Path | None = None
+    part: slice = field(default_factory=lambda: slice(None))
+    settings: Settings = field(default_factory=Settings)
+    size: tuple[int, int] | None = None
+    started: float = 0.0
+    results: Results = Results()
+    endpoint: str = ""
+    state: Path | None = None
+    resume: bool = False
+    record: Path | None = None
+    owned: bool = False
+    since: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.box is not None and self.model is not None:
+            raise SettingsError("a box says where the object is, with a model it is searched for: give one of them")
+
+    def save(self, folder: Path) -> Path:
+        """Write the job to a folder, readable by its owner only: the source may contain a password.
+
+        Returns
+        -------
+        the file
+
+        Raises
+        ------
+        ServiceError
+            If the file cannot be written.
+        """
+        try:
+            facts = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+            storage.write(folder / _NAME, {}, facts, mode=0o600)
+        except OSError as error:
+            raise ServiceError(
+                f"cannot keep the state in {str(folder)!r} ({error.strerror}): give another folder"
+            ) from None
+        return folder / _NAME
+
+    @classmethod
+    def load(cls, path: Path) -> Job:
+        """Read the job from the file that `save` wrote, or from the folder that it is in.
+
+        Raises
+        ------
+        ServiceError
+            If there is no such file.
+        ProtocolError, SettingsError
+            If the file is damaged, or was written by another version of catstream.
+        """
+        file = path / _NAME if path.is_dir() else path
+        if not file.is_file():
+            raise ServiceError(f"no pipeline was kept in {str(path)!r}: start one with --state {path}")
+        facts: dict[str, Any] = storage.read(file)[1]
+        try:
+            read = {name: _READERS[name](facts[name]) for name in _READERS}
+            return cls(**(facts | read))
+        except (KeyError, TypeError) as error:
+            raise ProtocolError(f"{file} does not say how the pipeline was started ({error!r})") from None
+
+    @staticmethod
+    def is_in(folder: Path) -> bool:
+        """Whether a job was kept in a folder."""
+        return (folder / _NAME).exists()
+
+    def check_fits(self, other: Job, folder: Path) -> None:
+        """Raise SettingsError if another job cannot go on with what was learned by this one, kept in `folder`."""
+        if other.size != self.size or other.part != self.part:
+            raise SettingsError(
+                f"what is kept in {str(folder)!r} is of {self._frames()}, and this would be {other._frames()}: "
+                "go on with the same frames, or begin anew in another folder"
+            )
+        ours, theirs = self.settings.values(), other.settings.values()
+        for name in sorted(ours.keys() - _FREE):
+            if ours[name] != theirs[name]:
+                raise SettingsError(
+                    f"what is kept in {str(folder)!r} was learned with {name}={ours[name]}, not {theirs[name]}: "
+                    "go on with the same settings (they are kept too: give none), or begin anew in another folder"
+                )
+
+    def _frames(self) -> str:
+        """The size and the numbers of the frames, for an error."""
+        size = "" if self.size is None else f"{self.size[0]}x{self.size[1]} pixels, "
+        numbers = (self.part.start, self.part.stop, self.part.step)
+        return f"{size}frames {':'.join('' if number is None else str(number) for number in numbers)}"
+
+
+def _plain(value: object) -> object:
+    """A field of a job in the types of JSON."""
+    match value:
+        case Path():
+            return str(value)
+        case slice():
+            return [value.start, value.stop, value.step]
+        case Settings():
+            return value.values()
+        case Results():
+            return {name: _plain(item) for name, item in asdict(value).items()}
+        case tuple():
+            return [_plain(item) for item in value]
+        case _:
+            return value
+
+
+def _path(text: str | None) -> Path | None:
+    return Path(text) if text is not None else None
+
+
+#: What makes a field of the types of JSON again, for those that are of another type.
+_READERS: dict[str, Callable[[Any], object]] = {
+    "box": lambda box: box and Box(*box),
+    "model": _path,
+    "part": lambda part: slice(*part),
+    "settings": Settings.of,
+    "size": lambda size: size and tuple(size),
+    "record": _path,
+    "state": _path,
+    "results": Results.of,
+}

@@ -1,0 +1,87 @@
+"""The channels that a detector sends on."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Self
+
+import numpy as np
+
+from catstream.messages import End, Features, Track
+from catstream.services.loop import Process
+from catstream.services.previews import Previews
+from catstream.wire.announced import readers_of
+from catstream.wire.sockets import Publisher, Sender
+
+__all__ = ["Outputs"]
+
+_TURN_SECONDS = 0.02  # the longest wait for an acknowledgement in one turn of a loop
+
+
+class Outputs:
+    """The sockets that a detector sends on; a context manager.
+
+    Attributes
+    ----------
+    features : to the compressor
+    results : the tracks once more, to the owner of the run; None if it has no owner
+    senders : those of the two that exist, the features first
+    """
+
+    def __init__(self, process: Process) -> None:
+        window, endpoint = process.settings.run.unstored_frames, process.endpoint
+        with ExitStack() as stack:
+            self.features = stack.enter_context(Sender("features", endpoint, window))
+            owned = process.job.owned
+            self.results = stack.enter_context(Sender("results", endpoint, window)) if owned else None
+            self._tracks = stack.enter_context(Publisher("tracks", endpoint))
+            self._training = stack.enter_context(Publisher("lessons", endpoint, greeting=process.run))
+            self._previews = stack.enter_context(Previews(endpoint))
+            self._stack = stack.pop_all()
+        self.senders = [self.features] + ([self.results] if self.results is not None else [])
+        for channel, readers in readers_of(endpoint).items():
+            if (publisher := self._publishers.get(channel)) is not None:
+                publisher.expect(readers)
+
+    @property
+    def _publishers(self) -> dict[str, Publisher]:
+        return {"tracks": self._tracks, "lessons": self._training}
+
+    @property
+    def has_subscribers(self) -> bool:
+        """Whether anybody receives the tracks."""
+        return self._tracks.heard
+
+    @property
+    def all_connected(self) -> bool:
+        """Whether all subscribers that had announced themselves are connected."""
+        return all(publisher.complete for publisher in self._publishers.values())
+
+    def poll(self, awaited: Sender | None = None) -> None:
+        """Take in acknowledgements, waiting a short time for one of the sender that is awaited."""
+        for sender in self.senders:
+            sender.listen(_TURN_SECONDS if sender is awaited else 0)
+
+    def serve_late_joiners(self) -> None:
+        """Take in who has subscribed, and send the greeting or the newest picture to those who have just come."""
+        for publisher in self._publishers.values():
+            publisher.welcome()
+        self._previews.turn()
+
+    def publish_track(self, track: Track | End) -> None:
+        """Send a track, or the end, to all who subscribe."""
+        self._tracks.send(track)
+
+    def publish_features(self, features: Features | End) -> None:
+        """Send features, or the end, to all who subscribe."""
+        self._training.send(features)
+
+    def show(self, frame: int, image: np.ndarray, track: Track | None) -> None:
+        """Have a picture of a frame sent, with the box of its track."""
+        self._previews.show(frame, image, track.box if track is not None else None)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()

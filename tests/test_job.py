@@ -1,0 +1,80 @@
+"""The file of a job: what a run is, for its processes and for whoever resumes it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.box import Box
+from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.job import Job, Results
+from catstream.settings import Settings
+
+JOB = Job("rtsp://me:secret@10.0.0.7/one", Box(1, 2, 30, 40), part=slice(0, None, 1), size=(320, 240), started=1e9)
+
+numbers = st.none() | st.integers(0, 10**6)
+paths = st.none() | st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).map(Path)
+jobs = st.builds(
+    Job,
+    source=st.text(),
+    model=paths,
+    part=st.builds(slice, numbers, numbers, numbers),
+    settings=st.builds(lambda lag: Settings(run={"lag_frames": lag}), st.integers(0, 100)),
+    size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
+    results=st.builds(Results, paths, st.booleans(), st.lists(paths.filter(bool)).map(tuple), paths),
+    state=paths,
+    record=paths,
+    since=st.none() | st.floats(0, 1e9),
+    resume=st.booleans(),
+)
+
+
+@given(jobs)
+def test_a_job_is_read_as_it_was_written(tmp_path_factory, job):
+    folder = tmp_path_factory.mktemp("job")
+    assert Job.load(job.save(folder)) == Job.load(folder) == job
+
+
+def test_a_job_is_for_its_owner_from_the_first_byte(tmp_path, monkeypatch):
+    before = os.umask(0)
+    try:
+        (tmp_path / ".job.safetensors.part").write_text("what a power cut left of an older catstream")
+        modes, fsync = [], os.fsync
+        monkeypatch.setattr(os, "fsync", lambda handle: (modes.append(os.fstat(handle).st_mode), fsync(handle)))
+        file = JOB.save(tmp_path)
+    finally:
+        os.umask(before)
+    assert list(tmp_path.iterdir()) == [file]
+    assert {stat.S_IMODE(mode) for mode in (modes[0], file.stat().st_mode)} == {0o600}
+
+
+def test_a_job_that_is_shown_does_not_show_its_password():
+    assert "secret" not in repr(JOB)
+
+
+def test_a_job_that_is_not_there_or_damaged_is_an_error_that_names_the_file(tmp_path):
+    with pytest.raises(ServiceError, match=f"no pipeline was kept in '{tmp_path}'"):
+        Job.load(tmp_path)
+    file = JOB.save(tmp_path)
+    file.write_bytes(file.read_bytes().replace(b"320", b"321"))
+    with pytest.raises(ProtocolError, match="checksum"):
+        Job.load(tmp_path)
+
+
+def test_what_was_learned_is_gone_on_with_only_with_the_same_frames_and_settings_of_learning():
+    JOB.check_fits(replace(JOB, settings=Settings(run={"lag_frames": 3})), Path("kept"))
+    with pytest.raises(SettingsError, match="frames 3::"):
+        JOB.check_fits(replace(JOB, part=slice(3, None)), Path("kept"))
+    with pytest.raises(SettingsError, match=r"learned with coreset\.size=64, not 32"):
+        JOB.check_fits(replace(JOB, settings=Settings(coreset={"size": 32})), Path("kept"))
+
+
+def test_a_job_has_a_box_or_a_model():
+    with pytest.raises(SettingsError, match="give one of them"):
+        replace(JOB, model=Path("walker.safetensors"))
