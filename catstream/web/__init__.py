@@ -1,4 +1,4 @@
-"""The web page of a running pipeline: look at it, steer it, measure it."""
+"""The web page of a running pipeline: live view, control and metrics."""
 
 from catstream.extras import require_extra
 

@@ -1,13 +1,13 @@
-"""The application: the page, what it shows, and what it may ask of the pipeline.
+"""The web application: the page, its events and pictures, control, and metrics.
 
 /                 the page
-/events           what is new, at most ten times a second, as server-sent events
+/events           updates of the page as server-sent events, at most ten per second
 /pictures/N.jpg   the picture of frame N
-/live.mjpeg       the newest picture with its track drawn in, again and again, as MJPEG
+/live.mjpeg       the newest pictures with their tracks drawn in, as an MJPEG stream
 /control          POST {"verb": ..., "box": [x, y, w, h], "keep": ...}
-/metrics          for Prometheus
+/metrics          metrics for Prometheus
 /healthz          200 while this server runs
-/readyz           200 while all processes of the pipeline are heard
+/readyz           200 while all processes of the pipeline send health reports
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ __all__ = ["create"]
 
 _PAGE = Path(__file__).with_name("page")
 _UPDATE_SECONDS = 0.1
-_KEEP_ALIVE_SECONDS = 5.0  # of silence after which a stream says that it is there: so it hears that nobody is
+_KEEP_ALIVE_SECONDS = 5.0  # an idle stream sends a comment after this time, which detects closed connections
 _MAX_VIEWERS = 64
 _COMMANDS, _COMMANDS_PER_SECOND = 20, 5
 
 
 def create(feed: Feed) -> Starlette:
-    """The page of a feed, which runs for as long as this does; to be put behind a `Guard`."""
+    """Return the application for a feed, which runs while the application does. Wrap it in a `Guard`."""
     pages = _Pages(feed)
 
     @asynccontextmanager
@@ -74,7 +74,7 @@ def create(feed: Feed) -> Starlette:
 
 
 class _Pages:
-    """A method a route."""
+    """The handlers of the routes."""
 
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
@@ -92,7 +92,7 @@ class _Pages:
         )
 
     def _reject_too_many(self) -> Response | None:
-        """The answer if too many look already."""
+        """Return an error if too many streams are open."""
         if self._feed.viewers < _MAX_VIEWERS:
             return None
         return PlainTextResponse(f"{_MAX_VIEWERS} pages or live pictures are open already\n", 503)
@@ -106,7 +106,7 @@ class _Pages:
                 if newest is not None and newest != shown:
                     shown = newest
                     jpeg = await run_in_threadpool(draw_preview, *newest)
-                    # The line that ends a picture comes with it: many clients show a picture only after that.
+                    # The boundary after the picture is sent with it: many clients show a picture only after it.
                     yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (
                         len(jpeg),
                         jpeg,
@@ -132,11 +132,11 @@ class _Pages:
     async def picture(self, request: Request) -> Response:
         preview = self._feed.dashboard.picture(request.path_params["frame"])
         if preview is None:
-            return PlainTextResponse("this picture is gone\n", 404)
+            return PlainTextResponse("this picture is no longer available\n", 404)
         return Response(preview.jpeg, media_type="image/jpeg")
 
     async def control(self, request: Request) -> Response:
-        # No form of another page can send this type without being asked about first.
+        # A page of another origin cannot send this content type without a CORS preflight request.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return _refused(415, "expected application/json")
         if wait := self._commands.wait(monotonic()):
@@ -166,17 +166,23 @@ class _Pages:
 
     async def readyz(self, _: Request) -> Response:
         silent = [name for name in CHANNELS["health"].senders if name not in self._feed.dashboard.last_reports]
-        return PlainTextResponse(f"not heard: {', '.join(silent)}\n", 503) if silent else PlainTextResponse("ok\n")
+        return (
+            PlainTextResponse(f"no health report from: {', '.join(silent)}\n", 503)
+            if silent
+            else PlainTextResponse("ok\n")
+        )
 
 
 def _command(body: bytes | None) -> tuple[str, list[float] | None, bool]:
-    """Verb, box and whether to keep what was learned, as they were posted; ValueError where they cannot be read."""
+    """Return verb, box and `keep` of a posted command. Raises ValueError if it is not a valid command."""
     if body is None:
-        raise ValueError("expected a command, got far more")
+        raise ValueError("expected a command, got more than 4096 bytes")
     try:
-        command: Any = json.loads(body, parse_int=float)  # one of too many digits for that is infinite, and refused
+        command: Any = json.loads(
+            body, parse_int=float
+        )  # an integer that is too large becomes infinite, and is rejected
     except RecursionError:
-        raise ValueError("expected a command, got brackets within brackets") from None
+        raise ValueError("expected a command, got deeply nested JSON") from None
     if not isinstance(command, dict) or command.get("verb") not in ("set-box", "pause", "resume", "stop"):
         raise ValueError('expected {"verb": "set-box", "pause", "resume" or "stop"}')
     verb, box, keep = command["verb"], command.get("box"), command.get("keep", False)
@@ -187,7 +193,7 @@ def _command(body: bytes | None) -> tuple[str, list[float] | None, bool]:
 
 
 def _execute(feed: Feed, verb: str, box: list[float] | None, keep: bool) -> Answer:
-    """Have a command carried out; blocks until it is answered."""
+    """Send a command and wait for its answer."""
     with Control(feed.attached_endpoint, keys=feed.keys) as pipeline:
         if box is not None:
             return pipeline.set_box(box, keep=keep)

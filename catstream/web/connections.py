@@ -1,4 +1,4 @@
-"""The connections of clients: a server for the page that nobody can keep others from by holding connections open."""
+"""HTTP connections with time-outs and a limit on their number, so that one client cannot block the server."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 __all__ = ["MAX_CONNECTIONS", "Connection"]
 
-#: Connections that are open at once, at most.
+#: Maximum number of open connections.
 MAX_CONNECTIONS = 256
 
-_REQUEST_SECONDS = 5.0  # that a client may take to send a request, head and body
-_ANSWER_SECONDS = 20.0  # for which a client may read nothing of its answer
+_REQUEST_SECONDS = 5.0  # time-out for a client to send a request with its body
+_ANSWER_SECONDS = 20.0  # time-out for a client that does not read its response
 
 
 class Connection(H11Protocol):
-    """An HTTP/1.1 connection that is closed if its client keeps the server waiting for too long.
+    """An HTTP/1.1 connection with time-outs for its client.
 
     If more than `MAX_CONNECTIONS` are open, the one that has kept the server waiting for longest is closed.
-    So a new client is always answered, however many connections others hold open, and also if all of them come from
-    one address, as behind a proxy. A connection whose answer is being made is never closed to make room.
+    A new client is therefore always answered, even if many open connections come from one address, as behind a proxy. A
+    connection whose response is in preparation is never closed.
 
-    waiting_since : when the server began to wait for this client, by the clock of the loop: for a request, for the rest
-        of one, or for the client to read its answer. None while it does not wait
+    waiting_since : time at which the server began to wait for this client, by the clock of the event loop: for a
+        request, for the rest of one, or for the client to read the response. None while it does not wait
     """
 
     waiting_since: float | None = None
@@ -37,7 +37,7 @@ class Connection(H11Protocol):
         others = [cast(Connection, other) for other in self.connections]
         there = [other for other in others if not other._closed]
         waiting = [other for other in there if other.waiting_since is not None]
-        if len(there) > MAX_CONNECTIONS:  # there is one: this one waits for its request
+        if len(there) > MAX_CONNECTIONS:  # `waiting` is not empty: this new connection waits for its request
             min(waiting, key=lambda other: other.waiting_since or 0.0).abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -46,7 +46,7 @@ class Connection(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         if self._timer is None and self._between_requests:
-            self._wait_for_client(_REQUEST_SECONDS)  # the first bytes of the next one
+            self._wait_for_client(_REQUEST_SECONDS)  # the first bytes of the next request
         super().data_received(data)
         self._update_wait()
 
@@ -64,7 +64,7 @@ class Connection(H11Protocol):
         self._update_wait()
 
     def abort(self) -> None:
-        """Close the connection at once, whatever is on its way."""
+        """Close the connection at once, and drop unsent data."""
         self._closed = True
         self._stop_waiting()
         self.transport.abort()
@@ -74,7 +74,7 @@ class Connection(H11Protocol):
         return self.cycle is not None and self.cycle.response_complete and not self.cycle.more_body
 
     def _update_wait(self) -> None:
-        """See whether the server waits for the client now."""
+        """Start or stop the time-out, by whether the server waits for the client now."""
         if self._closed or self.flow.write_paused:
             return
         if self.cycle is not None and not self.cycle.more_body and not self.cycle.response_complete:
@@ -88,7 +88,7 @@ class Connection(H11Protocol):
             self._wait_for_client(_REQUEST_SECONDS)
 
     def _wait_for_client(self, seconds: float) -> None:
-        """Wait for the client, for as long as this."""
+        """Start a time-out for the client."""
         self._stop_waiting()
         self.waiting_since = self.loop.time()
         self._timer = self.loop.call_later(seconds, self.abort)

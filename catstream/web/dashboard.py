@@ -1,4 +1,4 @@
-"""The dashboard: what the page shows of a pipeline, from the messages it sends. No socket, no clock."""
+"""The state of the web page, computed from the messages of a pipeline. It uses no socket and no clock."""
 
 from __future__ import annotations
 
@@ -11,43 +11,41 @@ from catstream.web.surprising import SurprisingFrames
 
 __all__ = ["SILENCE_SECONDS", "Dashboard", "Phase"]
 
-#: How the pipeline is: not heard yet, heard, silent since, at its end.
+#: Phase of the pipeline: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
 
-#: After which who says nothing is gone: each process is heard once a second.
+#: A process without a health report for this long counts as silent; each process sends one every second.
 SILENCE_SECONDS = 4.0
 
 _POINT_SECONDS = 0.25
 _POINTS = 480  # two minutes
-_RATE_SECONDS = 2.0  # that frames a second are counted over
-_FRAMES = 4096  # whose arrival is remembered, until a model has learned from them
-_MONOTONIC_COUNTERS = ("sent", "rows")  # counters that only grow in one pipeline, of one object
-_LATE_HEALTH_SECONDS = 3.0  # that the processes may still be heard after the end
-_TRACKS = 256  # that are kept until the picture of their frame is here
-_PICTURES = 8  # a page that asks for the last but one still gets it
+_RATE_SECONDS = 2.0  # interval over which frames per second are counted
+_FRAMES = 4096  # number of frames whose arrival times are kept until a model was trained on them
+_MONOTONIC_COUNTERS = ("sent", "rows")  # counters that never decrease within a run for one object
+_LATE_HEALTH_SECONDS = 3.0  # health reports of the same run may arrive this long after its end
+_TRACKS = 256  # number of tracks that are kept until the picture of their frame arrives
+_PICTURES = 8  # number of pictures that a page may still request
 
 
 class Dashboard:
-    """Takes messages, and tells each page what is new to it.
+    """Receives messages, and returns the updates for each open page.
 
-    What it shows is of one pipeline. At the first track or health of another one it forgets all of the one before;
-    until then it keeps the last picture and figures.
+    It shows one pipeline. It keeps the last picture and figures until the first track or health report of another
+    pipeline arrives; then it drops all state of the previous one.
 
-    phase, reason : of the pipeline
-    endpoint, source : where it runs, and the source that it follows
-    health : what each process said last
-    heard : when each was heard last, of those that are not silent since
+    phase, reason : phase of the pipeline, and the reason of its end or silence
+    endpoint, source : endpoint of the pipeline, and its source of frames
+    health : last health report of each process
+    last_reports : arrival time of the last health report of each process that is not silent
     """
 
     def __init__(self) -> None:
         self.endpoint = self._attached = ""
-        self._revisions: Counter[str] = Counter(
-            pipeline=1, trees=1
-        )  # told first: a page clears what it shows of another
+        self._revisions: Counter[str] = Counter(pipeline=1, trees=1)  # `pipeline` is the first update: it clears a page
         self._reset()
 
     def _reset(self) -> None:
-        """Begin with a pipeline of which nothing is known."""
+        """Drop all state of the previous pipeline."""
         self.phase: Phase = "waiting"
         self.reason = self.source = ""
         self.track: Track | None = None
@@ -56,24 +54,24 @@ class Dashboard:
         self.model_latency: float | None = None
         self.surprising = SurprisingFrames()
         self.pictures: OrderedDict[int, Preview] = OrderedDict()
-        self._last: dict[str, Health] = {}  # as `health`, and kept while the pipeline is silent
+        self._last: dict[str, Health] = {}  # like `health`, but kept while the pipeline is silent
         self._model: Model | None = None
-        self._since = 0  # first frame of the object that is followed
+        self._since = 0  # first frame of the current object
         self._points: deque[tuple[float | None, ...]] = deque(maxlen=_POINTS)
-        self._last_point = self._ended = float("-inf")  # when the last point was made, and when the pipeline ended
+        self._last_point = self._ended = float("-inf")  # times of the last chart point and of the end
         self._moments: deque[float] = deque()
         self._arrivals: OrderedDict[int, float] = OrderedDict()
-        self._tracks: OrderedDict[int, Track] = OrderedDict()  # the last ones, by frame
+        self._tracks: OrderedDict[int, Track] = OrderedDict()  # the newest tracks, by frame
 
     def attach(self, endpoint: str) -> None:
-        """What comes from now on comes from here; what is shown stays until something comes."""
+        """Expect messages from this endpoint from now on; the state is kept until the first one arrives."""
         self._attached = endpoint
         if self.phase == "waiting":
             self.endpoint = endpoint
             self._mark_changed("status")
 
     def take(self, message: Any, now: float) -> None:
-        """Take a message that came at a moment `now`, seconds of any clock that only goes forward."""
+        """Process a message that arrived at the time `now`, in seconds of a monotonic clock."""
         if self._is_from_another_pipeline(message, now):
             self._reset()
             self._mark_changed("pipeline", "status", "track", "picture", "trees", "surprising")
@@ -94,7 +92,7 @@ class Dashboard:
                 self._mark_changed("status")
 
     def mark_silent(self, reason: str) -> None:
-        """The pipeline is silent, or there is none."""
+        """Record that the pipeline is silent or does not exist."""
         if self.phase == "running":
             self.phase = "silent"
         if self.phase != "ended":
@@ -104,33 +102,33 @@ class Dashboard:
         self._mark_changed("status")
 
     def rate(self, now: float) -> float:
-        """Frames a second, over the last two."""
+        """Return the frames per second over the last two seconds."""
         while self._moments and now - self._moments[0] > _RATE_SECONDS:
             self._moments.popleft()
         return len(self._moments) / _RATE_SECONDS
 
     def counter(self, process: str, name: str) -> float | None:
-        """What a process said last of something that it counts."""
+        """Return a counter from the last health report of a process, None if there is none."""
         return self.health[process].counters.get(name) if process in self.health else None
 
     def picture(self, frame: int) -> Preview | None:
-        """The picture of a frame that was told of lately, or that is in the surprising."""
+        """Return the picture of a recent frame or of a surprising one, None if it is not kept."""
         if frame in self.pictures:
             return self.pictures[frame]
         return next((one.preview for one in self.surprising.frames if one.frame == frame), None)
 
     @property
     def newest(self) -> tuple[Preview, Track | None] | None:
-        """The newest picture and the track of its frame, None for a track that did not come."""
+        """The newest picture, and the track of its frame or None."""
         preview = next(reversed(self.pictures.values()), None)
         return None if preview is None else (preview, self._tracks.get(preview.frame))
 
     def updates(self, seen: dict[str, int]) -> dict[str, Any]:
-        """The parts that are new to a page, ready for JSON.
+        """Return the parts that have changed since the last call for this page, as JSON values.
 
         Parameters
         ----------
-        seen : what it was told of, empty at first; brought up to date
+        seen : revisions that the page has received; empty at first, updated by this call
         """
         parts = {}
         for name, revision in self._revisions.items():
@@ -140,13 +138,13 @@ class Dashboard:
         return parts
 
     def _is_from_another_pipeline(self, message: Any, now: float) -> bool:
-        """Whether a message shows that another pipeline is there than the one that is shown."""
+        """Return whether a message shows that another pipeline runs than the one shown."""
         if not isinstance(message, Track | Health):
             return False
         if self._attached != self.endpoint:
             self.endpoint = self._attached
             return True
-        if isinstance(message, Track):  # a restarted detector goes on, or began before the first model
+        if isinstance(message, Track):  # a restarted detector continues, or starts again before the first model
             over = self.track is not None and message.seq < self.track.seq and not message.model_version
             return over or self.phase == "ended"
         before = self._last.get(message.process, message).counters
@@ -182,15 +180,15 @@ class Dashboard:
         self._mark_changed("track")
 
     def _begin_object(self, frame: int) -> None:
-        """Another object is followed from this frame on: what was learned before is of no meaning to it."""
+        """Reset what belongs to the previous object: another object is tracked from this frame on."""
         self._since, self.surprising, self.model_latency = frame, SurprisingFrames(), None
         self._arrivals.clear()
-        if self._model is not None and self._model.frame >= frame:  # it came before the track
+        if self._model is not None and self._model.frame >= frame:  # the model arrived before the track
             self.surprising.adopt(self._model)
         self._mark_changed("surprising")
 
     def _add_model(self, model: Model, now: float) -> None:
-        if model.frame < self._since:  # of the object before
+        if model.frame < self._since:  # a model of the previous object
             return
         self._model = model
         self.surprising.adopt(model)
@@ -239,7 +237,7 @@ class Dashboard:
         return {"frame": track.frame, "time": track.time, "state": track.state, "version": track.model_version}
 
     def _pipeline_part(self, _: int) -> int:
-        """Which one is shown, counted: where another is, all parts come anew."""
+        """Return the number of pipelines shown so far; if it changes, all parts are sent again."""
         return self._revisions["pipeline"]
 
     def _picture_part(self, _: int) -> dict[str, Any] | None:

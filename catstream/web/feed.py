@@ -1,4 +1,4 @@
-"""The feed: takes the messages of a pipeline to the dashboard, however often that comes and goes."""
+"""Feeds the messages of a pipeline to the dashboard, and reconnects after each end, silence or restart."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ __all__ = ["Feed"]
 _log = logging.getLogger(__name__)
 
 _PAUSE_SECONDS = 0.5
-_DRAIN_SECONDS = 2.0  # that the last messages may take after the end
+_DRAIN_SECONDS = 2.0  # time for the last messages to arrive after the end
 
-#: What shows that a pipeline is there, what is taken once it is, and what only while somebody looks: it costs the
-#: pipeline something.
+#: Channels that show that a pipeline runs; those that are read while it runs; and those that are read only while a page
+#: is open, because they cost the pipeline processor time.
 _LIVENESS, _PERMANENT, _FOR_VIEWERS = ("tracks", "health"), ("models",), ("previews", "features")
 
 
 class Feed:
-    """Attached for as long as `run` does; finds the pipeline again after each end, silence or restart.
+    """Feeds a dashboard while `run` runs.
 
     Parameters
     ----------
-    endpoint : where the pipeline runs; empty for the only one of this user, whichever that is by then
-    keys : the folder of keys of this client, where the pipeline asks for some
+    endpoint : endpoint of the pipeline; empty for the only running one of this user, looked up at each connection
+    keys : folder of the keys of this client, if the pipeline requires keys
 
     Attributes
     ----------
-    dashboard : what was told
-    attached_endpoint, keys : where it is attached, and with which keys; empty while it is not
-    viewers : how many pages are open
-    closed : whether the pages are to end
+    dashboard : the dashboard
+    attached_endpoint, keys : endpoint and keys of the current connection; empty if there is none
+    viewers : number of open pages
+    closed : whether open pages are to be closed
     """
 
     def __init__(self, endpoint: str = "", keys: str = "") -> None:
@@ -52,7 +52,7 @@ class Feed:
 
     @contextlib.contextmanager
     def viewer(self) -> Iterator[None]:
-        """Somebody looks: pictures and features are taken meanwhile."""
+        """Count a viewer inside a `with`: pictures and features are received while there is one."""
         self.viewers += 1
         self._has_viewers.set()
         try:
@@ -63,7 +63,7 @@ class Feed:
                 self._has_viewers.clear()
 
     async def run(self) -> None:
-        """Until it is cancelled."""
+        """Connect, and reconnect after each loss, until cancelled."""
         while True:
             try:
                 attached_endpoint = find(self._endpoint, self._keys)
@@ -71,25 +71,25 @@ class Feed:
                 self.dashboard.attach(self.attached_endpoint)
                 self.keys = (
                     str(attached_endpoint.keys.folder) if attached_endpoint.keys else ""
-                )  # the only one has its keys noted
+                )  # the only pipeline has its keys registered
                 await self._run_attached()
             except CatstreamError as error:
                 self.dashboard.mark_silent(str(error))
-            except Exception as error:  # whatever it is: nobody would notice a feed that is gone
-                _log.exception("The page lost the pipeline, and attaches anew.")
+            except Exception as error:  # an unexpected error must not end the feed silently
+                _log.exception("The page lost the pipeline and reconnects.")
                 self.dashboard.mark_silent(f"{type(error).__name__}: {error}")
             self.attached_endpoint = self.keys = ""
             await asyncio.sleep(_PAUSE_SECONDS)
 
     async def _run_attached(self) -> None:
-        """Until the pipeline ends, or is silent."""
+        """Receive all channels until the pipeline ends or is silent."""
         self._is_running.clear()
         tasks = [asyncio.create_task(self._forward(channel)) for channel in (*_LIVENESS, *_PERMANENT, *_FOR_VIEWERS)]
         try:
             done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 self.dashboard.take(task.result(), monotonic())
-            # It ended: the last health, with what the trees have become, and the last picture may still come.
+            # After the end, the last health report, with the final size of the trees, and the last picture may follow.
             await asyncio.wait(rest, timeout=_DRAIN_SECONDS)
         finally:
             for task in tasks:
@@ -97,10 +97,10 @@ class Feed:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _forward(self, channel: str) -> End | None:
-        """Until the pipeline ends; what is for viewers only while there are any.
+        """Feed the messages of a channel until the pipeline ends; channels for viewers only while there are viewers.
 
-        What says nothing of which pipeline it is from is taken once one is seen: until then, it may be the last message
-        of the pipeline before, at the same endpoint.
+        The other channels do not identify their pipeline. They are read only after a track or health report arrived:
+        before, they could give the last message of the previous pipeline at the same endpoint.
         """
         timeout = SILENCE_SECONDS if channel == "health" else None
         while True:

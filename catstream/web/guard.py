@@ -1,4 +1,4 @@
-"""The guard: who may ask, how often, and what a browser may do with the answers."""
+"""Access control of the web server: host, origin and token checks, rate limits, and security headers."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ __all__ = ["Guard", "TokenBucket", "body_of", "is_loopback", "too_many"]
 
 _COOKIE = "catstream"
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
-_PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # what tells nothing of the pipeline but whether it is there
+_PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline runs
 
 _MIN_TOKEN_LENGTH = 16
 _MAX_BODY = 4096  # bytes
-_MAX_GUESSES, _GUESSES_PER_SECOND = 8, 0.2  # of each address
-_ADDRESSES = 1024  # whose wrong guesses are remembered
+_MAX_GUESSES, _GUESSES_PER_SECOND = 8, 0.2  # wrong tokens from one address
+_ADDRESSES = 1024  # number of addresses with wrong tokens that are kept
 
-#: What answers are sent with. Nothing is fetched from elsewhere, no script stands in a page, nobody may frame it.
+#: Headers of all responses: no content from other hosts, no inline scripts, no frames.
 _HEADERS = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
@@ -45,39 +45,39 @@ _HEADERS = {
 
 
 class TokenBucket:
-    """Lets `size` pass at once, and `rate` a second after that."""
+    """A token bucket: allows bursts of `size` requests, and `rate` requests per second on average."""
 
     def __init__(self, size: float, rate: float) -> None:
         self._size, self._rate = size, rate
         self._level, self._moment = size, float("-inf")
 
     def wait(self, now: float) -> float:
-        """Seconds until one may pass, 0 for now."""
+        """Return the seconds until the next request is allowed, 0 if it is allowed now."""
         self._level = min(self._size, self._level + (now - self._moment) * self._rate)
         self._moment = now
         return max(0.0, 1 - self._level) / self._rate
 
     def take(self) -> None:
-        """Let one pass."""
+        """Count a request."""
         self._level -= 1
 
 
 class Guard:
-    """Stands before an application.
+    """ASGI middleware that checks each request before an application receives it.
 
-    Without a token it answers to this machine's own names only, so that no other name can be made to lead
-    here (DNS rebinding). With one, it answers who shows it: as `Authorization: Bearer TOKEN`, or as the
-    cookie that `POST /login` gives for it. What changes something is taken from pages of the same origin, and
-    from programs, which name none (CSRF).
+    Without a token, only requests to a loopback host name are answered; this prevents DNS rebinding. With a token, a
+    request must have it as `Authorization: Bearer TOKEN` or as the cookie that `POST /login` sets. Requests that change
+    something must come from a page of the same origin, or from a program, which sends no Origin header; this prevents
+    CSRF.
 
     Parameters
     ----------
-    clock : seconds
+    clock : function that returns seconds of a monotonic clock
 
     Raises
     ------
     ServiceError
-        For a token that could be guessed.
+        If the token is so short that it could be guessed.
     """
 
     def __init__(self, app: ASGIApp, token: str | None, clock: Callable[[], float] = monotonic) -> None:
@@ -91,7 +91,7 @@ class Guard:
         self._guesses: OrderedDict[str, TokenBucket] = OrderedDict()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":  # the server's start and end
+        if scope["type"] != "http":  # start-up and shutdown events of the server
             await self._app(scope, receive, send)
             return
 
@@ -102,7 +102,7 @@ class Guard:
 
         request = Request(scope, receive)
         answer: ASGIApp = self._reject_foreign(request) or self._app
-        path = scope["path"]  # which the routes go by: that of `request.url` may begin in the client's Host header
+        path = scope["path"]  # as in the routes; `request.url` depends on the client's Host header
         if answer is self._app and self._token_digest is not None and not path.startswith(_PUBLIC_PATHS):
             if (request.method, path) == ("POST", "/login"):
                 answer = await self._log_in(request)
@@ -111,16 +111,16 @@ class Guard:
         await answer(scope, receive, send_with_headers)
 
     def _reject_foreign(self, request: Request) -> Response | None:
-        """The answer to a name that is not ours, or to a page that is not."""
+        """Return an error if the host name or the origin of a request is not that of this server."""
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
         if self._token_digest is None and not is_loopback(_host_name(host)):
             return PlainTextResponse(f"this page is at http://127.0.0.1, not at {host!r}\n", 421)
         if request.method not in ("GET", "HEAD") and origin is not None and origin.partition("://")[2] != host:
-            return PlainTextResponse(f"refused: the page that asks is of another origin, {origin!r}\n", 403)
+            return PlainTextResponse(f"rejected: the request comes from a page of another origin, {origin!r}\n", 403)
         return None
 
     def _reject_without_token(self, request: Request) -> Response | None:
-        """The answer to who shows no token, or a wrong one."""
+        """Return an error if a request has no token or a wrong one."""
         shown = _credential(request.headers)
         if shown is not None:
             return self._reject_wrong_token(shown, request)
@@ -129,7 +129,7 @@ class Guard:
         return PlainTextResponse("a token is needed: Authorization: Bearer TOKEN\n", 401)
 
     async def _log_in(self, request: Request) -> Response:
-        """The cookie for a token that is right, and the way to the page."""
+        """Set the cookie and redirect to the page if the posted token is correct."""
         body = await body_of(request)
         token = parse_qs(body.decode(errors="replace")).get("token", [""])[0] if body else ""
         wrong = self._reject_wrong_token(_digest(token.strip()), request)
@@ -141,10 +141,10 @@ class Guard:
         return answer
 
     def _reject_wrong_token(self, shown: str, request: Request) -> Response | None:
-        """The answer to a wrong token, None for the right one.
+        """Return an error for a wrong token, None for the correct one.
 
-        The right one always passes: behind a proxy all clients have one address, and nobody may keep others out by
-        wrong tokens. The token is protected by its length; the limit only saves work.
+        The correct token is never rate-limited: behind a proxy all clients have the same address, and wrong tokens of
+        one client must not lock out the others. The token is protected by its length; the limit only saves work.
         """
         if hmac.compare_digest(shown.encode(), (self._token_digest or "").encode()):
             return None
@@ -159,7 +159,7 @@ class Guard:
 
 
 async def body_of(request: Request) -> bytes | None:
-    """What was posted; None where it is more than anybody needs."""
+    """Return the body of a request, None if it is longer than 4096 bytes."""
     body = b""
     async for part in request.stream():
         body += part
@@ -169,17 +169,17 @@ async def body_of(request: Request) -> bytes | None:
 
 
 def too_many(wait: float) -> Response:
-    """The answer to who asks too often."""
-    return PlainTextResponse("too many: wait\n", 429, {"retry-after": f"{wait + 0.5:.0f}"})
+    """Return the error for a client that exceeds a rate limit."""
+    return PlainTextResponse("too many requests: wait\n", 429, {"retry-after": f"{wait + 0.5:.0f}"})
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is this machine, as nobody can make another name mean."""
+    """Return whether a host is a fixed name or address of the loopback interface."""
     return host in ("127.0.0.1", "::1", "localhost")
 
 
 def _host_name(host: str) -> str:
-    """The host without its port."""
+    """Return the host of a Host header without the port."""
     try:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:
@@ -187,7 +187,7 @@ def _host_name(host: str) -> str:
 
 
 def _digest(token: str) -> str:
-    """What a browser keeps instead of the token, and what is compared."""
+    """Return the digest of a token, which is the value of the cookie and is compared in place of the token."""
     return hashlib.sha256(b"catstream view\0" + token.encode()).hexdigest()
 
 

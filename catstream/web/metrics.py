@@ -1,4 +1,4 @@
-"""What a pipeline counts, as Prometheus reads it."""
+"""The metrics of a pipeline in Prometheus's text format."""
 
 from __future__ import annotations
 
@@ -14,23 +14,28 @@ from catstream.wire.channels import CHANNELS
 
 __all__ = ["text"]
 
-#: Name of a metric, the process and the counter that it is, and what it means.
+#: Name of each metric, its process and counter in the health reports, and its help text.
 _COUNTED = (
-    ("frames", "detector", "sent", "Frames followed."),
-    ("frames_skipped", "detector", "skipped", "Frames of a live source that passed by."),
-    ("source_reopened", "detector", "reopened", "Times that a live source was lost and opened again."),
-    ("features_stored", "detector", "stored", "Messages of features that are stored in the coreset trees."),
+    ("frames", "detector", "sent", "Frames processed."),
+    ("frames_skipped", "detector", "skipped", "Frames of a live source that were skipped."),
+    ("source_reopened", "detector", "reopened", "Times that a live source was lost and reopened."),
+    ("features_stored", "detector", "stored", "Features messages stored in the coreset trees."),
     ("rows", "compressor", "rows", "Rows inserted into the coreset trees."),
 )
 _GAUGES = (
-    ("source_lost_seconds", "detector", "lost_seconds", "For how long a live source has been lost."),
+    (
+        "source_lost_seconds",
+        "detector",
+        "lost_seconds",
+        "Seconds since a live source was lost, 0 while it is available.",
+    ),
     ("model_version", "detector", "model_version", "Version of the model that the detector uses."),
     ("tree_bytes", "compressor", "bytes", "Memory of the coreset trees."),
 )
 
 
 def text(feed: Feed) -> bytes:
-    """The metrics as they are now, in Prometheus's text format."""
+    """Return the current metrics in Prometheus's text format."""
     registry = CollectorRegistry()
     registry.register(_Collector(feed))
     return generate_latest(registry)
@@ -42,8 +47,8 @@ class _Collector:
 
     def collect(self) -> Iterator[Metric]:
         dashboard = self._feed.dashboard
-        yield _gauge("up", "Whether the pipeline is heard.", dashboard.phase == "running")
-        yield _gauge("viewers", "Pages that are open.", self._feed.viewers)
+        yield _gauge("up", "Whether the pipeline sends messages.", dashboard.phase == "running")
+        yield _gauge("viewers", "Open pages.", self._feed.viewers)
         for name, process, counter, meaning in _COUNTED:
             if (value := dashboard.counter(process, counter)) is not None:
                 yield CounterMetricFamily(f"catstream_{name}", meaning, value=value)
@@ -55,19 +60,19 @@ class _Collector:
         if dashboard.track is not None:
             yield _gauge("score", "Score of the newest track: about 0 on background, about 1 on the object.",
                          dashboard.track.score)  # fmt: skip
-            yield _gauge("present", "Whether the object is there.", dashboard.track.state != "absent")
+            yield _gauge("present", "Whether the object is present.", dashboard.track.state != "absent")
             yield _gauge(
-                "frames_per_second", "Frames followed a second, over the last two.", dashboard.rate(monotonic())
+                "frames_per_second", "Frames per second over the last two seconds.", dashboard.rate(monotonic())
             )
 
     def _learning(self) -> Iterator[Metric]:
         dashboard = self._feed.dashboard
         sent, taken = dashboard.counter("detector", "sent"), dashboard.counter("detector", "taken")
         if sent is not None and taken is not None:
-            yield _gauge("features_waiting", "Messages of features that the compressor has not taken yet.",
+            yield _gauge("features_waiting", "Features messages that the compressor has not received yet.",
                          sent - taken)  # fmt: skip
         if dashboard.model_latency is not None:
-            yield _gauge("learning_latency_seconds", "From a frame's track to the model that learned from it.",
+            yield _gauge("learning_latency_seconds", "Seconds from the track of a frame to the model trained on it.",
                          dashboard.model_latency)  # fmt: skip
         leaves = GaugeMetricFamily(
             "catstream_tree_leaves", "Leaves ever inserted into a coreset tree.", labels=["tree"]
@@ -78,15 +83,17 @@ class _Collector:
         yield leaves
 
     def _processes(self) -> Iterator[Metric]:
-        heard = GaugeMetricFamily("catstream_heard_seconds", "Since a process was heard.", labels=["process"])
+        ages = GaugeMetricFamily(
+            "catstream_health_age_seconds", "Seconds since the last health report of a process.", labels=["process"]
+        )
         refused = CounterMetricFamily(
-            "catstream_refused_messages", "Messages that were not what their channel carries.", labels=["process"]
+            "catstream_refused_messages", "Messages that do not conform to the protocol.", labels=["process"]
         )
         for process in CHANNELS["health"].senders:
             if process in self._feed.dashboard.health:
-                heard.add_metric([process], max(0.0, time() - self._feed.dashboard.health[process].time))
+                ages.add_metric([process], max(0.0, time() - self._feed.dashboard.health[process].time))
                 refused.add_metric([process], self._feed.dashboard.counter(process, "refused") or 0)
-        yield from (heard, refused)
+        yield from (ages, refused)
 
 
 def _gauge(name: str, meaning: str, value: float) -> Metric:

@@ -1,4 +1,4 @@
-"""The server of the page: from its start to its end, in this thread or in one of its own."""
+"""The web server of the page; it runs in this thread or in one of its own."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from catstream.web.guard import Guard, is_loopback
 __all__ = ["Server"]
 
 _SHUTDOWN_SECONDS = 2
-_ALL_ADDRESSES = ("0.0.0.0", "::")  # hosts that stand for all addresses of this machine
+_ALL_ADDRESSES = ("0.0.0.0", "::")  # bind addresses that include all interfaces
 _GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
 
 
 class Server:
-    """Listens from its making on.
+    """The web server. Its constructor begins to listen.
 
     Parameters
     ----------
-    endpoint, keys : of the pipeline, as `Feed` takes them
-    host, port : where to listen; port 0 for any that is free
-    token : what to show to get in; needed where others can reach the host
+    endpoint, keys : endpoint and client keys of the pipeline, as in `Feed`
+    host, port : address to listen on; port 0 for a free port
+    token : token that clients must have; required unless the host is a loopback address
 
     Attributes
     ----------
-    url : of the page, for a browser on this machine
-    urls : this and, if it listens at all addresses of this machine, those that other machines can open it by
+    url : URL of the page for a browser on this machine
+    urls : `url`, and if the server listens on all interfaces, the URLs for other machines
 
     Raises
     ------
     ServiceError
-        If others could look without a token, the token could be guessed, or the port is taken.
+        If the page would be public without a token, the token is too short, or the port is in use.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Server:
     ) -> None:
         if token is None and not is_loopback(host):
             raise ServiceError(
-                f"{host} can be reached from other machines, and all who see the page may steer: give a token "
+                f"{host} can be reached from other machines, and anyone who sees the page may steer: give a token "
                 "(VIEW_TOKEN=$(openssl rand -hex 16)), or listen on 127.0.0.1"
             )
         self._feed = Feed(endpoint, keys)
@@ -80,12 +80,12 @@ class Server:
 
     def run(self) -> None:
         """Serve until Ctrl-C or SIGTERM."""
-        with contextlib.suppress(KeyboardInterrupt):  # told once the last page is served
+        with contextlib.suppress(KeyboardInterrupt):  # uvicorn raises it after its shutdown
             self._server.run([self._socket])
 
     @contextlib.contextmanager
     def in_background(self) -> Iterator[None]:
-        """Serve in a thread of its own, meanwhile."""
+        """Serve in a thread of its own inside a `with`."""
         thread = threading.Thread(target=self._server.run, args=([self._socket],), name="view", daemon=True)
         thread.start()
         try:
@@ -96,7 +96,7 @@ class Server:
 
 
 class _Uvicorn(uvicorn.Server):
-    """Ends the streams of open pages before it waits for them."""
+    """Closes the streams of open pages before the shutdown, which waits for all connections."""
 
     def __init__(self, config: uvicorn.Config, feed: Feed) -> None:
         super().__init__(config)
@@ -121,7 +121,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _addresses_of_this_machine() -> list[str]:
-    """The host name, and the IPv4 address of each network interface but the loopback."""
+    """Return the host name, and the IPv4 address of each network interface except the loopback."""
     names = [socket.gethostname()]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         for _, interface in socket.if_nameindex():

@@ -86,11 +86,11 @@ def test_a_box_drawn_with_the_mouse_is_followed_until_it_leaves_and_after_a_rest
             until(lambda: said("kill"))
             for pid in pipeline.pids.values():
                 os.kill(pid, signal.SIGKILL)
-        until(lambda: said("state pipeline gone"))
+        until(lambda: said("state pipeline silent"))
         with Pipeline(str(path), boxes[0], settings) as pipeline:
             browser.stdin.write("restart\n")
             browser.stdin.flush()
-            seen = lines.index("state pipeline gone") + 1
+            seen = lines.index("state pipeline silent") + 1
             for number, track in enumerate(pipeline):
                 if track.state == "present" and number > 5:
                     until(lambda: "state present" in lines[seen:] and said("errors []"))

@@ -125,7 +125,7 @@ def test_it_is_not_ready_where_one_process_is_silent(page, pipeline, until, monk
 
     until(lambda: answer("detector", "compressor", "trainer").status_code == 200)
     until(lambda: answer("detector", "compressor").status_code == 503)
-    assert answer("detector", "compressor").text == "not heard: trainer\n"
+    assert answer("detector", "compressor").text == "no health report from: trainer\n"
 
 
 def test_tracks_come_to_the_page_as_they_are_sent(page, pipeline, facts):

@@ -2,7 +2,7 @@
 
 import { figure, make } from "./svg.js";
 
-const [FEWEST, SECONDS] = [15, 120]; // that are shown
+const [FEWEST, SECONDS] = [15, 120]; // minimum and maximum time span of a chart
 const [LEFT, TOP, BOTTOM] = [34, 8, 18];
 
 const CHARTS = [
@@ -73,7 +73,7 @@ function round(value) {
   return Number((ten * [1, 1.2, 1.5, 2, 3, 4, 5, 6, 8, 10].find((part) => value <= part * ten * 1.000001)).toPrecision(3));
 }
 
-/** From when to when the object was absent. */
+/** Time spans in which the object was absent. */
 function spans(points) {
   const found = [];
   points.forEach((point, index) => {
@@ -85,7 +85,7 @@ function spans(points) {
   return found;
 }
 
-/** The line, broken where nothing came for seconds. */
+/** Pieces of the line, split at gaps of more than two seconds. */
 function pieces(points) {
   const found = [];
   points.forEach((point, index) => {

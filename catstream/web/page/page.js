@@ -1,4 +1,4 @@
-// What the server tells goes to the parts of the page; what a person wants goes to the pipeline.
+// Passes updates of the server to the parts of the page, and commands of the user to the pipeline.
 
 import { Charts } from "./charts.js";
 import { Stage } from "./stage.js";
@@ -13,10 +13,10 @@ const stage = new Stage($("#stage"), $("#picture"), { pause, follow, changed: sh
 let status = { phase: "waiting" };
 let track = null;
 let paused = false;
-let closed = false; // whether the server of this page said that it ends
-let silent = false; // whether it does not answer
+let closed = false; // whether the server has announced its shutdown
+let silent = false; // whether the server does not answer
 
-/** Have a command carried out; returns the answer, null where it was refused, which is said. */
+/** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
 async function sendCommand(verb, more = {}) {
   let answer;
   try {
@@ -41,14 +41,14 @@ function showMessage(text, wrong = false) {
   $("#message").classList.toggle("wrong", wrong);
 }
 
-/** Stand still, for a box to be drawn: the frame that it will be in, and how to go on afterwards. */
+/** Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. */
 async function pause() {
   if (status.waiting) return { frame: Infinity, leave: null };
   const before = paused;
   const answer = await sendCommand("pause");
   if (!answer) return null;
   showMessage("Paused for your box.");
-  // The frame after the last one that was followed is held, and the box is in that.
+  // A paused pipeline holds the frame after the last tracked one; the box applies to that frame.
   return { frame: answer.frame + 1, leave: before ? null : () => sendCommand("resume") };
 }
 
@@ -65,7 +65,7 @@ async function follow(box, leave) {
 function showDrawing(drawing, box) {
   $("#watching").hidden = drawing;
   $("#drawing").hidden = !drawing;
-  $("#keep").parentElement.hidden = Boolean(status.waiting); // nothing was learned yet
+  $("#keep").parentElement.hidden = Boolean(status.waiting); // there is nothing to keep yet
   $("#follow").disabled = !box;
 }
 
@@ -81,7 +81,7 @@ function showState() {
   const lost = running && status.lost_seconds > 0;
   const waiting = running && status.waiting;
   let state = running ? (track && !waiting ? track.state : "waiting") : status.phase;
-  let words = { waiting: "waiting", gone: "pipeline gone", ended: "ended" }[state] || state;
+  let words = { waiting: "waiting", silent: "pipeline silent", ended: "ended" }[state] || state;
   if (silent && status.phase !== "ended") [state, words] = ["silent", "page stopped"];
   else if (lost) [state, words] = ["silent", `source lost for ${Math.round(status.lost_seconds)} s`];
   else if (waiting) words = "waiting for a box";
@@ -106,21 +106,21 @@ function showSource() {
   document.title = shown ? `${shown} – catstream` : "catstream";
 }
 
-/** What is said over the picture, and why it stands still. */
+/** Text over the picture: the reason why it does not change. */
 function overlay(running) {
   if (status.phase === "ended") {
     const page = closed ? "The server of this page has ended too" : silent ? "The server of this page does not answer" : "";
-    return `The end: ${status.reason}. ${page ? `${page}: this is the last it showed.` : "This page waits for the next one."}`;
+    return `The end: ${status.reason}. ${page ? `${page}: this is the last picture.` : "This page waits for the next pipeline."}`;
   }
-  if (closed) return "The server of this page was stopped: this is the last it showed. The pipeline may go on.";
+  if (closed) return "The server of this page was stopped: this is the last picture. The pipeline may still run.";
   if (silent) return "The server of this page does not answer. This page tries again.";
   if (status.phase === "waiting") return status.reason || "Waiting for a pipeline";
-  if (status.phase === "silent") return "The pipeline is gone. This page waits for it.";
+  if (status.phase === "silent") return "The pipeline does not send messages. This page waits for it.";
   return running && !stage.hasPicture ? "Waiting for a picture" : "";
 }
 
 const show = {
-  pipeline() { // all that is shown is of another one
+  pipeline() { // another pipeline: clear everything
     stage.clear();
     charts.clear();
     surprising.clear();

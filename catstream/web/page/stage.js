@@ -1,18 +1,18 @@
-// The live picture with its box, and the box that a person draws: with mouse, finger or keyboard.
+// The live picture with the box of its track, and the box that the user draws with mouse, touch or keyboard.
 
-const STEP = 0.02; // of the picture's shorter side, that an arrow moves a box
-const SMALLEST = 6; // pixels of the frame
+const STEP = 0.02; // distance of an arrow key, as a share of the picture's shorter side
+const SMALLEST = 6; // minimum side of a box in pixels of the frame
 
 export class Stage {
   /**
-   * actions: pause() stands still and says in which frame and how to go on; follow(box, leave) has a box followed;
-   * changed(drawing, box) hears what is drawn.
+   * actions: pause() pauses the pipeline and returns {frame, leave}; follow(box, leave) sends the box; changed(drawing,
+   * box) is called whenever the drawing changes.
    */
   constructor(element, canvas, actions) {
     Object.assign(this, { element, canvas, actions });
     this.picture = this.bitmap = this.box = this.start = this.still = null;
     this.drawing = this.loading = false;
-    this.turn = 0; // how many pipelines were shown before
+    this.turn = 0; // number of pipelines shown before
     element.addEventListener("pointerdown", (event) => this.press(event));
     element.addEventListener("pointermove", (event) => this.drag(event));
     element.addEventListener("pointerup", () => this.release());
@@ -24,7 +24,7 @@ export class Stage {
     return this.bitmap !== null;
   }
 
-  /** Show nothing: another pipeline is there. */
+  /** Clear the picture, because another pipeline is shown. */
   clear() {
     this.cancel(false);
     this.bitmap?.close();
@@ -33,7 +33,7 @@ export class Stage {
     this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
   }
 
-  /** Show a picture, unless one is on its way: then it is the next. */
+  /** Load and show a picture; while another one is loading, only the newest is loaded next. */
   async show(picture) {
     this.next = picture;
     if (this.loading) return;
@@ -42,10 +42,10 @@ export class Stage {
       const [wanted, turn] = [this.next, this.turn];
       this.next = null;
       const response = await fetch(`/pictures/${wanted.frame}.jpg`).catch(() => null);
-      if (!response?.ok || (this.still && this.still.frame < wanted.frame)) continue; // it stands still
+      if (!response?.ok || (this.still && this.still.frame < wanted.frame)) continue; // the picture is frozen for drawing
       const bitmap = await createImageBitmap(await response.blob()).catch(() => null);
       if (!bitmap) continue;
-      if (turn !== this.turn) { // of the pipeline before
+      if (turn !== this.turn) { // a picture of the previous pipeline
         bitmap.close();
         continue;
       }
@@ -56,7 +56,7 @@ export class Stage {
     this.loading = false;
   }
 
-  /** Stand still for a box. */
+  /** Pause, and begin to draw a box. */
   async begin() {
     if (this.drawing || !this.picture) return;
     this.drawing = true;
@@ -67,7 +67,7 @@ export class Stage {
     else still.leave?.();
   }
 
-  /** Have the box followed. */
+  /** Send the box to the pipeline. */
   async accept() {
     if (!this.drawing || !this.box || !this.still || this.asking) return;
     this.asking = true;
@@ -77,7 +77,7 @@ export class Stage {
     if (done) this.end();
   }
 
-  /** Leave, and go on as before. */
+  /** Cancel the drawing, and resume the pipeline if this page paused it. */
   cancel(resume = true) {
     if (!this.drawing) return;
     if (resume) this.still?.leave?.();
@@ -138,7 +138,7 @@ export class Stage {
     this.tell();
   }
 
-  /** Where in the frame a pointer is. */
+  /** Position of a pointer in the frame. */
   place(event) {
     const view = this.canvas.getBoundingClientRect();
     const { width, height } = this.picture;

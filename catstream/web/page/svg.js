@@ -1,4 +1,4 @@
-// Elements of a drawing.
+// Helpers for SVG elements.
 
 export function make(name, attributes = {}, ...children) {
   const element = document.createElementNS("http://www.w3.org/2000/svg", name);
@@ -7,7 +7,7 @@ export function make(name, attributes = {}, ...children) {
   return element;
 }
 
-/** A figure with a caption of two ends, and a drawing below. */
+/** A figure with a left and a right caption, and a drawing below. */
 export function figure(kind, title, tone, drawing) {
   const element = document.createElement("figure");
   element.className = kind;
