@@ -1,14 +1,14 @@
-"""Takes down what a pipeline says: tracks, models and health as they come, and features as they are handed over."""
+"""Records a pipeline: subscribes to tracks, models and health, and is given the features."""
 
 from __future__ import annotations
 
 import logging
 from contextlib import ExitStack
-from typing import Any, Self
+from typing import Self
 
 from catstream.errors import RecordingError
 from catstream.messages import End, Health, Model
-from catstream.recording.file import RecordingWriter
+from catstream.recording.file import Recorded, RecordingWriter
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Subscriber
 
@@ -18,27 +18,29 @@ _log = logging.getLogger(__name__)
 
 
 class Recorder:
-    """Listens to a pipeline, and writes each message once; a context manager.
+    """Subscribes to a pipeline and writes each message once; a context manager.
 
-    Where the disk takes no more, it says so and writes no more: the pipeline goes on.
+    If the disk is full, this is logged once and nothing more is written; the pipeline continues.
 
     Parameters
     ----------
     writer : of the recording; the caller closes it
-    endpoint : where the pipeline runs
-    reader : name by which its subscription to the tracks was announced, empty if it was not
+    endpoint : of the pipeline
+    reader : name under which the subscription to the tracks was announced; empty if it was not
 
     Attributes
     ----------
     end : the pipeline's `End`, None before it
-    failed : why nothing is written any more; empty while all is well
+    failed : why writing has ended; empty before
     """
 
     def __init__(self, writer: RecordingWriter, endpoint: Endpoint, reader: str = "") -> None:
         self.end: End | None = None
         self.failed = ""
         self._writer = writer
-        self._last: dict[str, tuple[float, ...]] = {}  # of the models, and of each process's health
+        self._last: dict[
+            str, tuple[float, ...]
+        ] = {}  # identity of the last model, and of the last health of each process
         with ExitStack() as stack:
             known = {"tracks": reader, "models": "", "health": ""}
             self._channels = [
@@ -48,13 +50,13 @@ class Recorder:
             self._stack = stack.pop_all()
 
     def listen(self) -> None:
-        """Write what has come."""
+        """Write the messages that were received."""
         for channel in self._channels:
             for message in channel.waiting():
                 if self._new(message):
                     self.keep(message)
 
-    def keep(self, message: Any) -> None:
+    def keep(self, message: Recorded) -> None:
         """Write a message."""
         if isinstance(message, End):
             self.end = message
@@ -64,10 +66,10 @@ class Recorder:
             self._writer.write(message)
         except RecordingError as error:
             self.failed = str(error)
-            _log.error("%s: the run goes on without", error)
+            _log.error("%s: the run continues without it", error)
 
-    def _new(self, message: Any) -> bool:
-        """Whether it did not come before: a channel's last message is sent again when somebody comes."""
+    def _new(self, message: Recorded) -> bool:
+        """Return whether a message is new: a channel sends its last message again whenever a subscriber connects."""
         mark: tuple[float, ...]
         if isinstance(message, Model):
             name, mark = "", (message.version, message.frame)
@@ -80,7 +82,7 @@ class Recorder:
         return mark != known
 
     def close(self) -> None:
-        """Listen no more."""
+        """Close the subscriptions."""
         self._stack.close()
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""`catstream record`: keep what a running pipeline says, in one file."""
+"""`catstream record`: write the messages of a running pipeline to a file."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from catstream.wire.sockets import Subscriber
 
 __all__ = ["record"]
 
-_END_SECONDS = 1.0  # between the end of the tracks and that of the features
+_END_SECONDS = 1.0  # at most, between the ends of the tracks and of the features
 
 
 @click.command()
-@click.option("--output", required=True, type=click.Path(path_type=Path), help="The file; it must not be there yet.")
+@click.option("--output", required=True, type=click.Path(path_type=Path), help="The file to write; it must not exist.")
 @with_endpoint
 @with_wait
 def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
-    """Keep what a running pipeline says, in one file, until it ends or Ctrl-C.
+    """Write the messages of a running pipeline to a file, until it ends or Ctrl-C.
 
-    Features, models, tracks and health are written as they come, with the
-    settings that the pipeline runs with; about 0.4 MB a frame. A crash
-    at any moment leaves a file that can be read up to there.
+    Features, models, tracks and health are written when they arrive, with the
+    settings of the pipeline; about 0.4 MB for each frame. The file is MCAP. After
+    a crash it can be read up to the last whole message.
 
-    The pipeline does not wait: what came before this, or faster than it was
-    taken, is missing, and said at the end. For a recording from the first frame,
-    in which no features are missing: catstream track --record.
+    The pipeline does not wait for the recording. Messages that were sent before it
+    started, or that it received too slowly, are missing; their number is printed
+    at the end. catstream track --record records all features from the first frame.
 
     \b
     EXAMPLES
@@ -62,7 +62,7 @@ def _record(output: Path, place: Endpoint, lessons: Subscriber, reader: str) -> 
         status = stack.enter_context(Console(stderr=True).status("waiting for the settings of the pipeline"))
         while not isinstance(run := lessons.receive(0.1), Run):
             if isinstance(run, End):
-                raise RecordingError(f"nothing was recorded, as the pipeline has just ended: {run.reason}")
+                raise RecordingError(f"nothing was recorded, because the pipeline has ended: {run.reason}")
         writer = stack.enter_context(RecordingWriter(output, run))
         recorder = stack.enter_context(Recorder(writer, place, reader))
         seq, last, deadline = 0, None, float("inf")
@@ -70,7 +70,7 @@ def _record(output: Path, place: Endpoint, lessons: Subscriber, reader: str) -> 
             message = lessons.receive(0.05)
             if isinstance(message, End):
                 last = message
-            # What a restarted detector finds anew, the compressor has taken already.
+            # A restarted detector repeats frames whose features the compressor has already taken.
             if isinstance(message, Features) and message.seq > seq:
                 seq = message.seq
                 recorder.keep(message)
@@ -78,5 +78,5 @@ def _record(output: Path, place: Endpoint, lessons: Subscriber, reader: str) -> 
             recorder.listen()
             if recorder.failed:
                 raise RecordingError(recorder.failed)
-            if last is not None or recorder.end is not None:  # each travels by itself
+            if last is not None or recorder.end is not None:  # each channel has an end of its own
                 deadline = min(deadline, time.monotonic() + _END_SECONDS)

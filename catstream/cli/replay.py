@@ -1,4 +1,4 @@
-"""`catstream replay`: play a recording to subscribers, or learn from it once more."""
+"""`catstream replay`: play a recording to subscribers, or train from it again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.table import Table
 from catstream.errors import RecordingError
 from catstream.messages import Features, Model, Run, Track
 from catstream.recording.file import Recording, RecordingWriter
-from catstream.recording.learning import Lesson, Marks, check, learn, marks_of
+from catstream.recording.learning import Prequential, Retraining, learn, prequential_of_recorded, require_features
 from catstream.recording.player import Player
 from catstream.wire.endpoint import Endpoint, meeting_place, private_folder
 
@@ -24,17 +24,15 @@ __all__ = ["replay"]
 
 @click.command()
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--endpoint", default="", metavar="PLACE", help="Where subscribers attach; a fresh place if not given.")
-@click.option("--keys", default="", metavar="DIR", help="Folder of keys: who attaches must be let in by them.")
-@click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Times as fast as it was recorded.")
-@click.option("--fast", is_flag=True, help="As fast as it goes.")
-@click.option("--wait", is_flag=True, help="Begin once somebody listens to the tracks.")
-@click.option("--learn", "learns", is_flag=True, help="Learn from the recorded features once more.")
-@click.option("--set", "pairs", multiple=True, metavar="NAME=VALUE", help="With --learn, a setting that was another.")
-@click.option(
-    "--output", type=click.Path(path_type=Path), help="With --learn, record the models that it gives to this."
-)
-@click.option("--incomplete", is_flag=True, help="With --learn, go on where features are missing.")
+@click.option("--endpoint", default="", metavar="PLACE", help="Where subscribers connect; a new endpoint if not given.")
+@click.option("--keys", default="", metavar="DIR", help="Folder of keys; subscribers then need keys.")
+@click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Factor to the speed of recording.")
+@click.option("--fast", is_flag=True, help="Play without pauses.")
+@click.option("--wait", is_flag=True, help="Start when the tracks have a subscriber.")
+@click.option("--learn", "learns", is_flag=True, help="Train from the recorded features again.")
+@click.option("--set", "pairs", multiple=True, metavar="NAME=VALUE", help="With --learn, a setting to change.")
+@click.option("--output", type=click.Path(path_type=Path), help="With --learn, write the models to this recording.")
+@click.option("--incomplete", is_flag=True, help="With --learn, accept missing features.")
 def replay(
     recording: Path,
     endpoint: str,
@@ -47,26 +45,26 @@ def replay(
     output: Path | None,
     incomplete: bool,
 ) -> None:
-    """Play a recording to subscribers, or learn from it once more.
+    """Play a recording to subscribers, or train from it again.
 
-    Without --learn its tracks, models, features and health are sent as the
-    pipeline sent them: catstream watch, status and every subscriber work.
+    Without --learn, the recorded tracks, models, features and health are sent as
+    the pipeline sent them: catstream watch, status and every subscriber work.
 
-    With --learn its features go through a fresh compressor and trainer, without
-    the video. With the settings of then, every recorded model must come out
-    again, bit for bit; the exit code is 1 where one does not. --set shows what
-    other settings would have made of the same features.
+    With --learn, the recorded features are given to a new compressor and trainer,
+    without the video. With the recorded settings, every recorded model must be
+    reproduced bit for bit; otherwise the exit code is 1. --set shows the result of
+    other settings for the same features.
 
     \b
     The table of --learn
-      models     how many; a pipeline skips samples that are stale, the replay none
-      identical  recorded models that came out again, of those of the same version and frame
-      rows       put into the coreset trees
+      models     how many; a pipeline skips outdated samples, the replay skips none
+      identical  recorded models that were reproduced bit for bit
+      rows       inserted into the coreset trees
       levels     of the nodes of the object's tree, oldest first
       MB         of all trees in memory
       seconds    of compression and training
-      error      mean squared error of the scores of rows of frames that the model had not seen
-      apart      share of such frames in which all of the object scores above all background
+      error      mean squared error of the scores of frames that the model had not seen
+      apart      share of these frames in which the whole object scores above the background
 
     \b
     EXAMPLES
@@ -76,7 +74,7 @@ def replay(
       catstream replay walk.mcap --learn --set coreset.size=128 --output larger.mcap
     """
     if not learns and (pairs or output or incomplete):
-        raise click.UsageError("--set, --output and --incomplete go with --learn")
+        raise click.UsageError("--set, --output and --incomplete need --learn")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     found, console = Recording(recording), Console(stderr=True)
     console.print(f"{recording}: {found}", highlight=False, soft_wrap=True)
@@ -102,7 +100,7 @@ def _play(recording: Recording, place: Endpoint, speed: float | None, wait: bool
 def _learn(
     recording: Recording, pairs: tuple[str, ...], output: Path | None, incomplete: bool, console: Console
 ) -> None:
-    check(recording, incomplete=incomplete)  # before there is a file of what cannot be learned
+    require_features(recording, incomplete=incomplete)  # before the output file is created
     then, total = recording.settings, recording.counts[Features]
     trials = {"the same": then}
     if pairs:
@@ -112,37 +110,39 @@ def _learn(
     for name in ("models", "identical", "rows", "levels", "MB", "seconds", "error", "apart"):
         table.add_column(name, justify="right")
     recorded = recording.counts[Model]
-    table.add_row("as recorded", f"{recorded}", *["-"] * 5, *_shown(marks_of(recording)))
+    table.add_row("as recorded", f"{recorded}", *["-"] * 5, *_prequential_cells(prequential_of_recorded(recording)))
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn())
     with ExitStack() as stack:
         progress = stack.enter_context(Progress(*columns, console=console, transient=True))
         writer = stack.enter_context(RecordingWriter(output, Run.of(trials[newest].portable()))) if output else None
         for name, settings in trials.items():
             task = progress.add_task(name, total=total)
-            lesson = learn(
+            result = learn(
                 recording,
                 settings,
                 incomplete=incomplete,
                 keep=writer.write if writer is not None and name == newest else None,
                 step=partial(progress.advance, task),
             )
-            same = f"{lesson.identical} of {recorded}"
-            table.add_row(name, f"{lesson.models}", same, *_told(lesson), *_shown(lesson.marks))
+            same = f"{result.identical} of {recorded}"
+            table.add_row(
+                name, f"{result.models}", same, *_training_cells(result), *_prequential_cells(result.prequential)
+            )
             if settings is then:
-                differing = recorded - lesson.identical
+                differing = recorded - result.identical
     Console().print(table)
     if differing and not incomplete:
         raise RecordingError(
-            f"{differing} of {recorded} recorded models did not come out again: the machine, or the version of a "
-            f"library, is another than that of the recording by catstream {recording.run.program}"
+            f"{differing} of {recorded} recorded models were not reproduced: the machine, or the version of a "
+            f"library, differs from that of the recording by catstream {recording.run.program}"
         )
 
 
-def _told(lesson: Lesson) -> list[str]:
-    levels = " ".join(map(str, lesson.levels))
-    rows, megabytes = lesson.counters["rows"], lesson.counters["bytes"] / 1e6
-    return [f"{rows:.0f}", levels, f"{megabytes:.1f}", f"{lesson.seconds:.2f}"]
+def _training_cells(result: Retraining) -> list[str]:
+    levels = " ".join(map(str, result.levels))
+    rows, megabytes = result.counters["rows"], result.counters["bytes"] / 1e6
+    return [f"{rows:.0f}", levels, f"{megabytes:.1f}", f"{result.seconds:.2f}"]
 
 
-def _shown(marks: Marks) -> list[str]:
-    return [f"{marks.error:.4f}", f"{marks.apart:.3f}"]
+def _prequential_cells(prequential: Prequential) -> list[str]:
+    return [f"{prequential.error:.4f}", f"{prequential.separated_share:.3f}"]

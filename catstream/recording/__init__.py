@@ -1,1 +1,1 @@
-"""Recordings: what a pipeline said, in one file; played to subscribers again, or learned from once more."""
+"""Recordings: the messages of a run in one file, to be played to subscribers or to be trained from again."""

@@ -12,9 +12,9 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, Self, TypeVar
 
 from catstream.errors import ProtocolError, RecordingError
 from catstream.messages import End, Features, Health, Model, Run, Track
@@ -24,7 +24,11 @@ from catstream.settings import Settings
 from catstream.storage import lock
 from catstream.wire.codec import decode, decode_json, encode, encode_json
 
-__all__ = ["TOPICS", "Recording", "RecordingWriter"]
+__all__ = ["TOPICS", "Recorded", "Recording", "RecordingWriter"]
+
+#: The kinds of message in a recording.
+Recorded = Run | Features | Model | Track | Health | End
+_Kind = TypeVar("_Kind", bound=Recorded)
 
 _ENVELOPE = "msgpack, [version, kind, fields]; an array in fields is {dtype, shape, data: bytes row by row}"
 
@@ -40,6 +44,9 @@ TOPICS: dict[type, Topic] = {
 _TOPICS = list(TOPICS.values())
 _NUMBERS = {kind: number for number, kind in enumerate(TOPICS, 1)}
 _KINDS = {number: kind for kind, number in _NUMBERS.items()}
+
+_ENCODERS: dict[str, Callable[[Any], bytes]] = {"json": encode_json, "msgpack": encode}
+_DECODERS: dict[str, Callable[[bytes, type], Any]] = {"json": decode_json, "msgpack": decode}
 
 _NOUNS = {Features: "features", Model: "models", Track: "tracks", Health: "reports of health"}
 
@@ -90,7 +97,7 @@ class RecordingWriter:
         else:
             self._cut()
 
-    def write(self, message: Any) -> None:
+    def write(self, message: Recorded) -> None:
         """Append a message.
 
         Raises
@@ -114,10 +121,10 @@ class RecordingWriter:
             self._cut()
         self._file.close()
 
-    def _add(self, message: Any, before: bytes = b"") -> None:
+    def _add(self, message: Recorded, before: bytes = b"") -> None:
         number, now = _NUMBERS[type(message)], time.time_ns()
         sequence = getattr(message, "seq", getattr(message, "version", 0))
-        entry = pack(number, sequence, now, _encode(message))
+        entry = pack(number, sequence, now, _ENCODERS[TOPICS[type(message)].encoding](message))
         place = self._size + len(before)
         self._append(before + entry)
         self._index.add(place, len(entry), number, now)
@@ -210,35 +217,35 @@ class Recording:
         """
         return Settings.of(self.run.settings)
 
-    def messages(self) -> Iterator[tuple[float, Any]]:
+    def messages(self) -> Iterator[tuple[float, Recorded]]:
         """Each message in the order of recording, with its time in seconds since 1970."""
         with self._open() as file:
             for entry in entries(file):
                 if entry.channel in _KINDS:
-                    yield entry.time / 1e9, self._decode(entry)
+                    yield entry.time / 1e9, self._decode(entry, _KINDS[entry.channel])
                 if entry.place + entry.size >= self.size:  # the file may have grown since it was checked
                     return
 
     def features(self) -> Iterator[Features]:
         """The features that the coreset trees hold, in order of `seq`, each once."""
-        return self._at(self._features)
+        return self._at(self._features, Features)
 
     def models(self) -> Iterator[Model]:
         """The models that were trained on these features."""
-        return self._at(self._models)
+        return self._at(self._models, Model)
 
-    def _at(self, places: list[tuple[int, int]]) -> Iterator[Any]:
+    def _at(self, places: list[tuple[int, int]], kind: type[_Kind]) -> Iterator[_Kind]:
         with self._open() as file:
             for _, place in places:
                 entry = entry_at(file, place)
                 if entry is None:
                     raise RecordingError(f"{self.path} has changed since it was checked: read it again")
-                yield self._decode(entry)
+                yield self._decode(entry, kind)
 
-    def _decode(self, entry: Entry) -> Any:
-        kind = _KINDS[entry.channel]
+    def _decode(self, entry: Entry, kind: type[_Kind]) -> _Kind:
         try:
-            return decode_json(entry.data, kind) if TOPICS[kind].encoding == "json" else decode(entry.data, kind)
+            message: _Kind = _DECODERS[TOPICS[kind].encoding](entry.data, kind)
+            return message
         except ProtocolError as error:
             raise RecordingError(
                 f"{self.path} holds a message at byte {entry.place} that this version of catstream cannot read: {error}"
@@ -265,13 +272,13 @@ class Recording:
             _drop_from(self._models, entry.sequence)
             self._features.append((entry.sequence, entry.place))
         elif kind is Model:  # a restarted compressor may have it trained again
-            trained = self._decode(entry).frame + 1
+            trained = self._decode(entry, Model).frame + 1
             _drop_from(self._models, trained)
             self._models.append((trained, entry.place))
         elif kind is Track:
             self._tracks.add(entry.sequence)
         elif kind is End:
-            self.end = self._decode(entry)
+            self.end = self._decode(entry, End)
 
     def _measure_tail(self, file: BinaryIO) -> None:
         """Count the bytes after the last whole message that are not the index."""
@@ -290,7 +297,3 @@ def _drop_from(places: list[tuple[int, int]], seq: int) -> None:
     """Remove the places of a `seq` and of all later ones."""
     while places and places[-1][0] >= seq:
         places.pop()
-
-
-def _encode(message: Any) -> bytes:
-    return encode_json(message) if TOPICS[type(message)].encoding == "json" else encode(message)

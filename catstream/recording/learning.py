@@ -1,4 +1,4 @@
-"""Learn from a recording once more, without the video: with the settings of then, or with others."""
+"""Train from a recording again, without the video: with the recorded settings, or with others."""
 
 from __future__ import annotations
 
@@ -18,23 +18,26 @@ from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 from catstream.wire.codec import encode
 
-__all__ = ["Lesson", "Marks", "check", "learn", "marks_of"]
+__all__ = ["Prequential", "Retraining", "learn", "prequential_of_recorded", "require_features"]
 
 
 @dataclass(slots=True)
-class Marks:
-    """How well models tell the rows of the frames after them: each is marked on what it has not seen yet.
+class Prequential:
+    """Prequential evaluation (test, then train): each model is tested on the rows of frames that it has not seen.
 
-    A frame is scored by the newest model of a frame before it, and not before the first.
+    The rows of a frame are scored by the newest model of an earlier frame; frames before the first model are skipped.
+
+    frames     with rows of the object and of the background
+    separated  how many of them have all rows of the object scored above all rows of the background
     """
 
     frames: int = 0
-    won: int = 0
+    separated: int = 0
     _errors: float = 0.0
     _weights: float = 0.0
 
     def add(self, model: Model | None, features: Features) -> None:
-        """Mark a model on the rows of one frame."""
+        """Test a model on the rows of one frame."""
         training = features.training.get(APPEARANCE)
         if model is None or training is None:
             return
@@ -44,30 +47,30 @@ class Marks:
         objects, others = scores[training.labels == 1], scores[training.labels == 0]
         if len(objects) and len(others):
             self.frames += 1
-            self.won += bool(objects.min() > others.max())
+            self.separated += bool(objects.min() > others.max())
 
     @property
     def error(self) -> float:
-        """Mean squared difference of score and label, rows weighted; NaN where nothing was marked."""
+        """Weighted mean squared difference between score and label; NaN before the first test."""
         return self._errors / self._weights if self._weights else float("nan")
 
     @property
-    def apart(self) -> float:
-        """Share of the frames in which each row of the object scores above all of the background; NaN where none."""
-        return self.won / self.frames if self.frames else float("nan")
+    def separated_share(self) -> float:
+        """Share of separated frames; NaN if there is no frame."""
+        return self.separated / self.frames if self.frames else float("nan")
 
 
 @dataclass(slots=True)
-class Lesson:
-    """What came of learning from a recording.
+class Retraining:
+    """Result of training from a recording again.
 
-    settings   it was learned with
-    models     how many were made
-    identical  how many of them are the recorded ones of the same version, bit for bit
-    seconds    of compression and training
-    counters   of the compressor, at the end
-    levels     of the nodes of the object's tree, oldest first
-    marks      of the models
+    settings     used for compression and training
+    models       how many were trained
+    identical    how many of them equal the recorded model of the same version bit for bit
+    seconds      of compression and training
+    counters     of the compressor at the end
+    levels       of the nodes of the object's tree, oldest first
+    prequential  evaluation of the models
     """
 
     settings: Settings
@@ -76,21 +79,21 @@ class Lesson:
     seconds: float = 0.0
     counters: dict[str, float] = field(default_factory=dict)
     levels: tuple[int, ...] = ()
-    marks: Marks = field(default_factory=Marks)
+    prequential: Prequential = field(default_factory=Prequential)
 
 
-def check(recording: Recording, *, incomplete: bool = False) -> None:
-    """Raise RecordingError where features are missing that are needed to learn from it, or there are none."""
+def require_features(recording: Recording, *, incomplete: bool = False) -> None:
+    """Raise RecordingError if the recording has no features, or, unless `incomplete`, if some are missing."""
     if not recording.counts[Features]:
         raise RecordingError(f"{recording.path} holds no features to learn from: {recording}")
     if (missing := recording.missing[Features]) and not incomplete:
         raise RecordingError(
-            f"{recording.path} misses the features of {missing} frames, so no model can come out as it was: record a "
-            "whole run with `catstream track --record`, or learn from what is there (--incomplete)"
+            f"{recording.path} misses the features of {missing} frames, so the models cannot be reproduced: record a "
+            "whole run with `catstream track --record`, or train from the features that it has (--incomplete)"
         )
 
 
-@one_thread()  # as the processes have: more threads add in another order
+@one_thread()  # as in the processes: more threads add in another order, which changes the bits
 def learn(
     recording: Recording,
     settings: Settings,
@@ -98,59 +101,59 @@ def learn(
     incomplete: bool = False,
     keep: Callable[[Model], None] | None = None,
     step: Callable[[], None] | None = None,
-) -> Lesson:
+) -> Retraining:
     """Feed the recorded features to a fresh compressor, and each sample to a fresh trainer.
 
-    A model depends on the settings and on the features up to its frame, not on when it was learned. So
-    each recorded model comes out again, bit for bit, under its version, where the settings are the same: from
-    a pipeline in lockstep and any other. The trainer of a pipeline skips samples that are stale by the time
-    it is free, and misses these versions; here all are made.
+    A model depends on the settings and on the features up to its frame, not on the time of training. With the recorded
+    settings each recorded model is therefore reproduced bit for bit under its version, whether or not the pipeline ran
+    in lockstep. The trainer of a pipeline skips samples that are outdated when it becomes idle; here every sample is
+    trained on, so there may be more models.
 
     Parameters
     ----------
-    incomplete : learn though features are missing; the models are others then
+    incomplete : train although features are missing; the models then differ
     keep : called with each model
     step : called after each frame
 
     Raises
     ------
     RecordingError
-        As `check` does.
+        As `require_features` does.
     """
-    check(recording, incomplete=incomplete)
+    require_features(recording, incomplete=incomplete)
     recorded = {model.version: encode(model) for model in recording.models()}
-    compressor, trainer, lesson = Compressor(settings), Trainer(settings), Lesson(settings)
+    compressor, trainer, result = Compressor(settings), Trainer(settings), Retraining(settings)
     newest: Model | None = None
     for features in _numbered(recording):
-        lesson.marks.add(newest, features)
+        result.prequential.add(newest, features)
         started = time.perf_counter()
         sample = compressor.take(features)
         model = trainer.train(sample) if sample is not None else None
-        lesson.seconds += time.perf_counter() - started
+        result.seconds += time.perf_counter() - started
         if model is not None:
             newest = model
-            lesson.models += 1
-            lesson.identical += encode(model) == recorded.get(model.version)
+            result.models += 1
+            result.identical += encode(model) == recorded.get(model.version)
             if keep is not None:
                 keep(model)
         if step is not None:
             step()
-    lesson.counters = compressor.counters()
-    lesson.levels = tuple(node.level for node in compressor.trees["object"].nodes)
-    return lesson
+    result.counters = compressor.counters()
+    result.levels = tuple(node.level for node in compressor.trees["object"].nodes)
+    return result
 
 
-def marks_of(recording: Recording) -> Marks:
-    """Those of the recorded models themselves."""
+def prequential_of_recorded(recording: Recording) -> Prequential:
+    """Evaluate the recorded models themselves."""
     models = {model.frame: model for model in recording.models()}
-    marks, newest = Marks(), None
+    prequential, newest = Prequential(), None
     for features in recording.features():
-        marks.add(newest, features)
+        prequential.add(newest, features)
         newest = models.get(features.frame, newest)
-    return marks
+    return prequential
 
 
 def _numbered(recording: Recording) -> Iterator[Features]:
-    """The features that are there, numbered without a gap."""
+    """Yield the recorded features, numbered without gaps."""
     for seq, features in enumerate(recording.features(), start=1):
         yield features if features.seq == seq else replace(features, seq=seq)

@@ -1,4 +1,4 @@
-"""Play a recording to subscribers, on the channels on which the pipeline said it."""
+"""Publishes the messages of a recording on the channels of a pipeline."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any, Self
+from typing import Self
 
 from catstream.messages import End, Features, Health, Model, Run, Track
-from catstream.recording.file import Recording
+from catstream.recording.file import Recorded, Recording
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.sockets import Publisher
 
 __all__ = ["Player"]
 
-_TURN_SECONDS = 0.05  # between two looks for who has come
+_TURN_SECONDS = 0.05  # between two checks for new subscribers
 _CHANNEL = {Features: "lessons", Model: "models", Track: "tracks"}
 
 
 class Player:
-    """The sending side of a pipeline that is over; a context manager.
+    """Publishes a recording as the pipeline did; a context manager.
 
-    Subscribers cannot tell it from one that runs, but for commands, which nobody answers. A slow one misses
-    messages here too.
+    Subscribers receive the same messages as from a running pipeline, but commands are not answered. A slow subscriber
+    misses messages, as it does of a pipeline.
 
     Parameters
     ----------
-    recording : what is played
-    endpoint : where those who listen attach
+    recording : to be published
+    endpoint : where subscribers connect
     """
 
     def __init__(self, recording: Recording, endpoint: Endpoint) -> None:
@@ -44,16 +44,16 @@ class Player:
             self._stack = stack.pop_all()
 
     def wait(self) -> None:
-        """Wait until somebody listens to the tracks."""
+        """Wait until the tracks have a subscriber."""
         while not self._publishers["tracks"].heard:
             self._rest(_TURN_SECONDS)
 
-    def play(self, speed: float | None = 1.0) -> Iterator[Any]:
-        """Send every message, and yield it; the last is an `End`.
+    def play(self, speed: float | None = 1.0) -> Iterator[Recorded]:
+        """Send each message, then yield it; the last one is an `End`.
 
         Parameters
         ----------
-        speed : how many times as fast as it was recorded; None for as fast as it goes
+        speed : factor to the speed of recording; None for no pauses
         """
         began, first, seq = time.monotonic(), 0.0, 0
         for moment, message in self._recording.messages():
@@ -80,7 +80,7 @@ class Player:
         time.sleep(seconds)
 
     def close(self) -> None:
-        """Send what is on its way, and leave."""
+        """Send what is still queued, and close the sockets."""
         self._stack.close()
 
     def __enter__(self) -> Self:

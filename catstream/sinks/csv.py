@@ -10,15 +10,15 @@ __all__ = ["CsvSink"]
 
 
 class CsvSink(LineSink):
-    """Tracks as a table."""
+    """Tracks as rows of comma-separated values."""
 
     header = COLUMNS + "\n"
 
     def line(self, track: Track) -> str:
-        """The row of a track."""
+        """Return the row of a track."""
         return format_row(track)
 
     @classmethod
     def track(cls, line: str) -> Track:
-        """The track of a row, without the time stamp of a live stream."""
+        """Return the track of a row; `pts` is not in the file, and is None."""
         return parse_row(line)

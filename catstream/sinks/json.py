@@ -1,6 +1,7 @@
 """JSON: a track is an object, as `Track.to_dict` gives it; a box is [x, y, w, h] or null.
 
-An object a line (NDJSON), in a file or on standard output; or one array of all objects, which ends when it is closed.
+One object on each line (NDJSON), in a file or on standard output; or one array of all objects, which is complete once
+it is closed.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import IO, Any
+from typing import IO
 
 from catstream.box import Box
 from catstream.errors import VideoError
@@ -21,60 +22,60 @@ __all__ = ["JsonSink", "NdjsonSink", "StdoutSink"]
 
 
 class NdjsonSink(LineSink):
-    """Tracks as JSON, an object a line."""
+    """Tracks as JSON objects, one on each line."""
 
     def line(self, track: Track) -> str:
-        """The fields of a track."""
+        """Return the fields of a track as a JSON object."""
         return json.dumps(track.to_dict())
 
     @classmethod
     def track(cls, line: str) -> Track:
-        """The track of an object."""
+        """Return the track of a JSON object."""
         fields = json.loads(line)
         return Track(**{**fields, "box": fields["box"] and Box(*fields["box"])})
 
 
 class JsonSink(NdjsonSink):
-    """Tracks as one JSON array, a line each; the bracket at its end comes when it is closed."""
+    """Tracks as one JSON array, one on each line; `close` writes the closing bracket."""
 
     def line(self, track: Track) -> str:
-        """The fields of a track, after the mark that goes before them in the array."""
+        """Return the JSON object after the bracket or comma that precedes it in the array."""
         return ("," if self.rows else "[") + super().line(track)
 
     @classmethod
     def track(cls, line: str) -> Track:
-        """The track of an object, without the mark before it."""
+        """Return the track of a line: the object after its first character."""
         return super().track(line[1:])
 
     def close(self) -> None:
-        """End the array."""
+        """Write the closing bracket and close the file."""
         try:
-            with self._to_disk():
+            with self._translated_errors():
                 self._file.write("]\n" if self.rows else "[]\n")
         finally:
             super().close()
 
 
 class StdoutSink(NdjsonSink):
-    """Tracks as JSON, an object a line, on standard output."""
+    """Tracks as JSON objects, one on each line, on standard output."""
 
     def close(self) -> None:
-        """Leave standard output open: it is not this object's."""
+        """Do nothing: standard output belongs to the process."""
 
-    def _open(self, _: int | None) -> IO[Any]:
+    def _open(self, _: int | None) -> IO[str]:
         return sys.stdout
 
     def write(self, track: Track) -> None:
-        """Add a track."""
-        with self._to_disk():
+        """Write a track and flush it."""
+        with self._translated_errors():
             self._file.write(self.line(track) + "\n")
             self._file.flush()
 
     @contextmanager
-    def _to_disk(self) -> Iterator[None]:
+    def _translated_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            # What the reader did not take is flushed once more when the program ends: it goes nowhere then.
+            # The interpreter flushes standard output again when it exits: that must not fail a second time.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self._file.fileno())
             raise VideoError(f"cannot write to standard output any more: {error.strerror}") from None

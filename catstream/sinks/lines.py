@@ -1,4 +1,4 @@
-"""Sinks of text, a line a track."""
+"""Text files with one line for each track."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from catstream.errors import VideoError
 from catstream.messages import Track
@@ -16,11 +16,11 @@ __all__ = ["LineSink"]
 
 
 class LineSink(ABC):
-    """Writes lines, each as soon as it comes; a format says how a track reads in `line`, and in `track` the reverse.
+    """Base class of text formats: each track is written at once; `line` formats a track, and `track` parses a line.
 
     Parameters
     ----------
-    keep : go on with the file, if it is there, after its tracks of frames before this one; None for a new file
+    keep : continue an existing file after its tracks of the frames before this one; None for a new file
 
     Raises
     ------
@@ -28,26 +28,26 @@ class LineSink(ABC):
         From the constructor, if a new file is there already, or the file cannot be written.
     """
 
-    #: The first line, with its end.
+    #: The first line of a file, with its line end.
     header = ""
 
     def __init__(self, path: Path, keep: int | None = None) -> None:
         self.path = path
         self.rows = 0
-        self._file: IO[Any] = self._open(keep)
+        self._file: IO[str] = self._open(keep)
 
     @abstractmethod
     def line(self, track: Track) -> str | None:
-        """The text for a track, None where the format has none for it."""
+        """Return the line of a track, without its line end; None if the format has no line for it."""
 
     @classmethod
     def track(cls, line: str) -> Track:
-        """The track of a line; ValueError, KeyError or TypeError if it is none."""
+        """Return the track of a line; raise ValueError, KeyError or TypeError if it is none."""
         raise ValueError(line)
 
     @classmethod
     def tracks(cls, path: Path) -> Iterator[Track]:
-        """The tracks in a file, up to the first that is not whole; none if there is no file."""
+        """Yield the tracks of a file up to the first incomplete line; none if the file does not exist."""
         for _, track in cls._lines(path):
             yield track
 
@@ -56,16 +56,16 @@ class LineSink(ABC):
         text = self.line(track)
         if text is None:
             return
-        with self._to_disk():
+        with self._translated_errors():
             self._file.write(text + "\n")
         self.rows += 1
 
     def close(self) -> None:
         """Close the file."""
-        with self._to_disk():  # where a line was not taken, it is tried once more
+        with self._translated_errors():  # a line that the disk did not take is tried again
             self._file.close()
 
-    def _open(self, keep: int | None) -> IO[Any]:
+    def _open(self, keep: int | None) -> IO[str]:
         kept: list[int] = []
         if keep is not None and self.path.exists():
             kept = [end for end, track in self._lines(self.path) if track.frame < keep]
@@ -78,7 +78,7 @@ class LineSink(ABC):
 
     @classmethod
     def _lines(cls, path: Path) -> Iterator[tuple[int, Track]]:
-        """Where each whole line ends, in bytes, and its track."""
+        """Yield the end of each complete line, in bytes from the start, and its track."""
         if not path.exists():
             return
         with path.open("rb") as file:
@@ -89,11 +89,11 @@ class LineSink(ABC):
                     return
                 try:
                     yield end, cls.track(line.decode())
-                except (KeyError, TypeError, ValueError):  # what a disk holds where nothing was written yet
+                except (KeyError, TypeError, ValueError):  # a power cut can leave zeros at the end
                     return
 
     @contextmanager
-    def _to_disk(self) -> Iterator[None]:
+    def _translated_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:

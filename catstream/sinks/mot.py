@@ -1,7 +1,7 @@
 """MOT text, as the tools of MOTChallenge read results: `frame,id,x,y,w,h,conf,-1,-1,-1`.
 
-Frames and pixels count from 1 there, so each is one more than here. The one object is number 1; a frame
-without it has no line, so that a file does not tell how many frames there were.
+Frames and pixels count from 1 there, from 0 in catstream. The object has the id 1. A frame without the object has no
+line, so the file does not say how many frames there were.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class MotSink(LineSink):
     """Boxes as MOT text."""
 
     def line(self, track: Track) -> str | None:
-        """The line of a track, None where the object is absent."""
+        """Return the line of a track, None if the object is absent."""
         if track.box is None:
             return None
         x, y, w, h = track.box

@@ -1,7 +1,7 @@
 """Parquet, a column store that pyarrow, pandas, DuckDB and Spark read.
 
-Such a file can only be written at once. Until it is closed, its tracks are rows of a database beside it,
-`tracks.parquet.sqlite`, which stays if the process is killed or the disk is full.
+A Parquet file cannot be extended. Until the sink is closed, its tracks are rows of an SQLite database beside the file,
+`tracks.parquet.sqlite`, which remains if the process is killed or the disk is full.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ class ParquetSink:
 
     Parameters
     ----------
-    keep : go on with the file, if it is there, after its tracks of frames before this one; None for a new file
+    keep : continue an existing file after its tracks of the frames before this one; None for a new file
 
     Raises
     ------
     VideoError
-        From the constructor, if the place cannot be written to.
+        From the constructor, if the folder cannot be written to.
     MissingExtraError
         From the constructor, if pyarrow is not installed.
     """
@@ -48,7 +48,7 @@ class ParquetSink:
 
     @classmethod
     def tracks(cls, path: Path) -> Iterator[Track]:
-        """The tracks in a file, or in the database beside it if it was not closed; none if there is neither."""
+        """Yield the tracks of a file, or of the database beside it if it was not closed; none if neither exists."""
         if database_of(path).exists():
             yield from SqliteSink.tracks(database_of(path))
         elif path.exists():
@@ -59,14 +59,14 @@ class ParquetSink:
         self._rows.write(track)
 
     def close(self) -> None:
-        """Write the file, which gets its name when it is whole, and remove the database."""
+        """Write the file, which gets its name once it is complete, and remove the database."""
         self._rows.close()
         _export(self._database, self.path)
         self._database.unlink()
 
 
 def database_of(path: Path) -> Path:
-    """Where the tracks of a Parquet file are until it is closed."""
+    """Return the path of the database that holds the tracks of a Parquet file until it is closed."""
     return path.with_name(path.name + ".sqlite")
 
 

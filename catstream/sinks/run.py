@@ -1,4 +1,4 @@
-"""All files that one run writes its tracks to, from its start, or from where an earlier part of it ended."""
+"""All files to which a run writes its tracks, from its start or from the frame at which it was interrupted."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ __all__ = ["RunFiles"]
 
 @dataclass(frozen=True, slots=True)
 class RunFiles:
-    """Where the tracks of a run go.
+    """The files to which a run writes its tracks.
 
-    A run that is resumed goes on after the last frame that each of the files holds; rows beyond it, which a power
-    cut left in some of them, are cut off. Files that do not hold all tracks (a video, MOT text) and those
-    that are new begin again at the first frame, with the tracks that another file holds.
+    A resumed run continues after the last frame that all files hold. Rows after it, which a power cut left in some of
+    the files, are removed. New files, and formats that do not hold all tracks (video, MOT text), start at the first
+    frame again, with the tracks from another file.
 
-    name    of the results files, that of the source
-    source  that a video is drawn from
-    part    which frames of it there are
-    output  folder of the results files, None for none
-    video   whether a video is among them
-    files   for tracks, see `catstream.sinks.sink`
+    name    of the results files: that of the source
+    source  of the frames of a video
+    part    the frames of the source that are followed
+    output  folder of the results files; None for no results
+    video   whether the results include a video
+    files   further files for tracks, see `catstream.sinks.sink`
     rate    frames per second of a folder of images
     """
 
@@ -46,13 +46,13 @@ class RunFiles:
     rate: float = RATE
 
     def check(self, *, overwrite: bool, resumable: bool, known: Sequence[Path] = ()) -> None:
-        """Raise VideoError, before any work is done, if they cannot be written.
+        """Raise VideoError if one of the files cannot be written; to be called before the run starts.
 
         Parameters
         ----------
-        overwrite : whether files that are there may be replaced
-        resumable : whether the run may be resumed one day
-        known : files, and a folder of results, that an earlier part of this run wrote
+        overwrite : whether existing files may be replaced
+        resumable : whether the run can be resumed later
+        known : files, and a folder of results, that an earlier part of this run has written
         """
         if self.output is not None:
             folder = self.output.absolute()
@@ -77,18 +77,18 @@ class RunFiles:
         files = [file for file in self.files if file != STDOUT]
         if resumable and self.output is None and files and not any(map(reader, files)):
             raise VideoError(
-                f"{files[0]} does not hold all tracks, which a run that is resumed needs: add a file that does, "
+                f"{files[0]} does not hold all tracks, so the run could not be resumed: add a file that does, "
                 "--write tracks.ndjson or --output FOLDER"
             )
 
     @property
     def made(self) -> bool:
-        """Whether all files are there, and were closed."""
+        """Whether all files exist and are complete."""
         files = [file for file in self.files if file != STDOUT]
-        return all(is_closed(file) for file in [*files, *([self._film()] if self.video else [])])
+        return all(is_closed(file) for file in [*files, *([self._video_file()] if self.video else [])])
 
     def position(self) -> Position | None:
-        """After which frame a resumed run goes on: the last one that all files hold; None if none holds tracks."""
+        """Return the position of the last frame that all files hold; None if no file holds tracks."""
         if self.output is None and not any(map(reader, self.files)):
             return None
         earlier = self._earlier()
@@ -98,11 +98,11 @@ class RunFiles:
 
     @contextmanager
     def opened(self, *, resume: bool = False) -> Iterator[Callable[[Track, float], None]]:
-        """A function that writes a track, and the seconds that it took, to all files; they are closed afterwards.
+        """Yield a function that writes a track, and the seconds that it took, to all files; then close the files.
 
         Parameters
         ----------
-        resume : whether to go on with the files, as `position` said; new ones replace those that are there
+        resume : whether to continue the files after `position`; otherwise existing files are replaced
 
         Raises
         ------
@@ -113,15 +113,15 @@ class RunFiles:
         keep = min((held for held, _ in earlier), default=0) if resume else None
         rows: list[ResultsWriter] = []
         sinks: list[Sink] = []
-        begun: list[Callable[[Track], None]] = []  # of the files that begin at the first frame
+        restarted: list[Callable[[Track], None]] = []  # write to the files that start at the first frame again
         with ExitStack() as stack:
             if self.output is not None:
                 new = not (self.output / results.table_file(self.name)).exists()
-                discard(self._film())
+                discard(self._video_file())
                 writer = stack.enter_context(ResultsWriter(self.output, self.name, keep=keep))
                 rows.append(writer)
-                begun += [partial(writer.write, seconds=float("nan"))] if new else []
-            for file in (*self.files, *([self._film()] if self.video else [])):
+                restarted += [partial(writer.write, seconds=float("nan"))] if new else []
+            for file in (*self.files, *([self._video_file()] if self.video else [])):
                 new = reader(file) is None or not is_there(file)
                 if not resume:
                     discard(file)
@@ -129,10 +129,10 @@ class RunFiles:
                     closing(open_sink(file, self.source, self.part, image_rate=self.rate, keep=keep))
                 )
                 sinks.append(sink)
-                begun += [sink.write] if new and file != STDOUT else []
-            for track in self._tracks(earlier, keep or 0) if begun else ():
-                for begin in begun:
-                    begin(track)
+                restarted += [sink.write] if new and file != STDOUT else []
+            for track in self._tracks(earlier, keep or 0) if restarted else ():
+                for write_again in restarted:
+                    write_again(track)
 
             def write(track: Track, seconds: float) -> None:
                 for writer in rows:
@@ -143,16 +143,16 @@ class RunFiles:
             yield write
 
     def _results(self) -> list[Path]:
-        """The results files, the video too."""
+        """Return the results files, including the video."""
         if self.output is None:
             return []
-        return [*(self.output / file for file in results.result_files(self.name)), self._film()]
+        return [*(self.output / file for file in results.result_files(self.name)), self._video_file()]
 
-    def _film(self) -> Path:
+    def _video_file(self) -> Path:
         return (self.output or Path()) / f"{self.name}.mp4"
 
     def _earlier(self) -> list[tuple[int, Callable[[], Iterator[Track]]]]:
-        """Of each file that is there and holds all tracks: how many frames, and what reads them."""
+        """Return the number of frames in each existing file that holds all tracks, and the function that reads them."""
         found: list[tuple[int, Callable[[], Iterator[Track]]]] = []
         if self.output is not None and (self.output / results.table_file(self.name)).exists():
             held = results.complete_frames(self.output, self.name)
@@ -165,6 +165,6 @@ class RunFiles:
 
     @staticmethod
     def _tracks(earlier: list[tuple[int, Callable[[], Iterator[Track]]]], frames: int) -> Iterator[Track]:
-        """The tracks of the earlier part of the run."""
+        """Yield the tracks of the earlier part of the run."""
         read = earlier[0][1] if earlier else lambda: iter(())
         return takewhile(lambda track: track.frame < frames, read())

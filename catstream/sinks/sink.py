@@ -1,10 +1,10 @@
-"""The formats that tracks are written in: the end of a file's name says which one.
+"""The file formats of tracks, selected by the suffix of the file.
 
-tracks.ndjson    an object a line, with the fields of `Track`; also tracks.jsonl, and - for standard output
+tracks.ndjson    a JSON object on each line, with the fields of `Track`; also tracks.jsonl, and - for standard output
 tracks.json      one array of such objects
-tracks.csv       a row a frame, as in the results of `catstream track`
+tracks.csv       a row for each frame, as in the results of `catstream track`
 tracks.txt       MOT text, as the tools of MOTChallenge read it
-tracks.sqlite    a table in a database that others may read meanwhile
+tracks.sqlite    a table in a database that other programs may read meanwhile
 tracks.parquet   a column store, written when it is closed
 walk.mp4         the video with the tracks drawn in
 """
@@ -35,20 +35,20 @@ STDOUT = Path("-")
 
 
 class Sink(Protocol):
-    """Takes tracks in order, each frame once. What `write` returned from outlives this process, but for a video."""
+    """Takes the tracks in order, each frame once. A track that was written survives a crash, except in a video."""
 
     def write(self, track: Track) -> None:
-        """Add a track; raises VideoError where the file takes no more."""
+        """Add a track; raise VideoError if it cannot be written."""
 
     def close(self) -> None:
-        """Make the file whole; what was written stays. Raises VideoError where the file takes no more."""
+        """Complete the file; raise VideoError if it cannot be written. The tracks written before remain."""
 
 
 class _Format(NamedTuple):
-    """How one kind of file is made.
+    """A file format.
 
-    create  a sink of the file: `create(path, keep)`, see `open_sink`
-    tracks  what a file holds, None if it does not hold all that was written
+    create  opens a sink: `create(path, keep)`, see `open_sink`
+    tracks  reads the tracks of a file; None if the format does not hold all fields
     """
 
     create: Callable[[Path, int | None], Sink]
@@ -65,7 +65,7 @@ _FORMATS = {
     ".parquet": _Format(parquet.ParquetSink, parquet.ParquetSink.tracks),
 }
 
-#: What the name of a file may end with.
+#: The suffixes of all formats.
 SUFFIXES = (*_FORMATS, ".mp4")
 
 
@@ -74,7 +74,7 @@ def check(path: Path, *, there: bool = False) -> None:
 
     Parameters
     ----------
-    there : whether the file may be there already
+    there : whether the file may exist already
     """
     if path == STDOUT:
         return
@@ -89,17 +89,17 @@ def check(path: Path, *, there: bool = False) -> None:
 
 
 def is_there(path: Path) -> bool:
-    """Whether there is such a file, or one that belongs to it."""
+    """Return whether a file exists, or one that belongs to it."""
     return path != STDOUT and any(file.exists() for file in _files(path))
 
 
 def is_closed(path: Path) -> bool:
-    """Whether there is such a file, with nothing beside it that was to become a part of it."""
+    """Return whether a file exists and is complete: no file that belongs to it is left beside it."""
     return path.exists() and not any(file.exists() for file in _files(path)[1:])
 
 
 def reader(path: Path) -> Callable[[Path], Iterator[Track]] | None:
-    """What reads the tracks of such a file back, None if it does not hold all of them."""
+    """Return the function that reads the tracks of such a file; None if the format does not hold them all."""
     return _FORMATS[path.suffix].tracks if path.suffix in _FORMATS and path != STDOUT else None
 
 
@@ -111,25 +111,25 @@ def open_sink(
     image_rate: float = RATE,
     keep: int | None = None,
 ) -> Sink:
-    """A file for tracks, in the format that its name says.
+    """Open a file for tracks in the format of its suffix.
 
     Parameters
     ----------
-    source, part, image_rate : what the pipeline follows, as it was told; a video is read from it once more
-    keep : go on with the file, if it is there, after its tracks of frames before this one, where it holds all that was
-        written; None for a new file
+    source, part, image_rate : those of the pipeline; the frames of a video are read again from there
+    keep : continue an existing file after its tracks of the frames before this one, if its format holds all tracks;
+        None for a new file
 
     Raises
     ------
     VideoError
-        If a new file is there already or cannot be written, its name says no format, or the source cannot be read.
+        If a new file exists already or cannot be written, its suffix is unknown, or the source cannot be read.
     """
     check(path, there=keep is not None)
     if path == STDOUT:
         return StdoutSink(path)
     if path.suffix == ".mp4":
         if source is None:
-            raise VideoError(f"{path} needs the frames: say where they come from (--source)")
+            raise VideoError(f"{path} needs the frames: give their source (--source)")
         return VideoSink(path, source, part, image_rate)
     form = _FORMATS[path.suffix]
     if form.tracks is None and keep is not None:
@@ -138,11 +138,11 @@ def open_sink(
     try:
         return form.create(path, keep)
     except OSError as error:
-        raise VideoError(f"cannot write {path} ({error.strerror}): give a place that you may write to") from None
+        raise VideoError(f"cannot write {path} ({error.strerror}): give a path that you may write to") from None
 
 
 def discard(path: Path) -> None:
-    """Remove a file for tracks, and what belongs to it; nothing if it is not there.
+    """Remove a file for tracks and the files that belong to it, if they exist.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def discard(path: Path) -> None:
 
 
 def _files(path: Path) -> list[Path]:
-    """A file for tracks, and those beside it that hold a part of them until it is closed."""
+    """Return a file for tracks and the files beside it that hold some of the tracks until it is closed."""
     if path.suffix == ".sqlite":
         return [path, *(path.with_name(path.name + end) for end in ("-wal", "-shm"))]
     if path.suffix == ".parquet":

@@ -1,4 +1,4 @@
-"""A database of tracks, in write-ahead mode: others may read it while it grows, and a crash loses no whole row."""
+"""An SQLite database of tracks in write-ahead mode: others may read it meanwhile, and a crash loses no whole row."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CREATE TABLE IF NOT EXISTS tracks (
     seq           INTEGER NOT NULL,
     seconds       REAL NOT NULL,  -- since the start of the source
     state         TEXT NOT NULL,  -- bootstrapping, present, absent
-    x REAL, y REAL, w REAL, h REAL,  -- pixels; NULL where absent
+    x REAL, y REAL, w REAL, h REAL,  -- pixels; NULL if absent
     score         REAL NOT NULL,
     model_version INTEGER NOT NULL,
     pts           REAL  -- time stamp in a live stream
@@ -29,16 +29,16 @@ CREATE TABLE IF NOT EXISTS tracks (
 
 
 class SqliteSink:
-    """Tracks as rows of the table `tracks`, each committed by itself.
+    """Tracks as rows of the table `tracks`, each in a transaction of its own.
 
     Parameters
     ----------
-    keep : go on with the file, if it is there, after its tracks of frames before this one; None for a new file
+    keep : continue an existing file after its tracks of the frames before this one; None for a new file
 
     Raises
     ------
     VideoError
-        From the constructor, where the database cannot be made.
+        From the constructor, if the database cannot be created.
     """
 
     def __init__(self, path: Path, keep: int | None = None) -> None:
@@ -47,17 +47,19 @@ class SqliteSink:
             with ExitStack() as stack:
                 self._database = stack.enter_context(closing(sqlite3.connect(path, isolation_level=None)))
                 self._database.execute("PRAGMA journal_mode = WAL")
-                self._database.execute("PRAGMA synchronous = NORMAL")  # a crash of the machine may cost the last rows
+                self._database.execute("PRAGMA synchronous = NORMAL")  # a power cut may lose the last rows
                 self._database.execute(_TABLE)
                 if keep is not None:
                     self._database.execute("DELETE FROM tracks WHERE frame >= ?", (keep,))
                 stack.pop_all()
         except sqlite3.Error as error:
-            raise VideoError(f"cannot make the database {path} ({error}): give a place that you may write to") from None
+            raise VideoError(
+                f"cannot create the database {path} ({error}): give a path that you may write to"
+            ) from None
 
     @classmethod
     def tracks(cls, path: Path) -> Iterator[Track]:
-        """The tracks in a database, in order; none if there is no file.
+        """Yield the tracks of a database in order of frames; none if the file does not exist.
 
         Raises
         ------
@@ -86,11 +88,11 @@ class SqliteSink:
             raise VideoError(f"cannot write to {self.path} any more: {error}") from None
 
     def close(self) -> None:
-        """Fold the log into the database, which is then one file."""
+        """Merge the write-ahead log into the database, which is then one file."""
         self._database.close()
 
 
 def track_of(row: tuple[Any, ...]) -> Track:
-    """The track of a row of the table."""
+    """Return the track of a row of the table."""
     frame, seq, seconds, state, x, y, w, h, score, version, pts = row
     return Track(seq, frame, seconds, state, None if x is None else Box(x, y, w, h), score, version, pts)

@@ -1,4 +1,4 @@
-"""The video with its tracks drawn in, from its frames read once more."""
+"""The video with its tracks drawn in; the frames are read from the source a second time."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ __all__ = ["VideoSink"]
 
 
 class VideoSink:
-    """Frames with their tracks as MP4, which gets its name when it is closed; those without a track are left out.
+    """An MP4 of the frames that have a track, with the track drawn in; it gets its name when it is closed.
 
     Parameters
     ----------
-    source, part : as the pipeline has them, so that frames have the same numbers
+    source, part : those of the pipeline, so that frames have the same numbers
     image_rate : frames per second of a folder of images
 
     Raises
     ------
     VideoError
-        From the constructor, where the source is live or cannot be read, or the file cannot be written.
+        From the constructor, if the source is live or cannot be read, or the file cannot be written.
     """
 
     def __init__(self, path: Path, source: str, part: slice, image_rate: float = RATE) -> None:
         if is_live(source):
-            raise VideoError(f"a video of {source} needs its frames once more, and those of a live source are gone")
-        # The pipeline ends at a damaged place unless it skips those: either way these are its frames.
+            raise VideoError(
+                f"a video needs to read its frames again, but {source} is live: record it, and give the file"
+            )
+        # The pipeline either skips damaged frames or ends at the first: in both cases these are its frames.
         self._frames = open_source(source, part=part, image_rate=image_rate, skip_damaged=True)
         try:
             self._video = AnnotatedVideo(path, self._frames.rate, self._frames.size, sound=self._frames.sound)

@@ -56,7 +56,7 @@ def test_a_model_that_does_not_come_out_again_is_an_error(recorded, said, tmp_pa
     code, output, errors = said("replay", tmp_path / "other.rec", "--learn")
     assert code == 1
     assert f"0 of {recording.counts[Model]}" in output
-    assert "recorded models did not come out again" in errors
+    assert "recorded models were not reproduced" in errors
 
 
 def test_what_is_refused_leaves_no_file_and_may_be_asked_for_again(recorded, said, tmp_path):
@@ -68,7 +68,7 @@ def test_what_is_refused_leaves_no_file_and_may_be_asked_for_again(recorded, sai
     learn = ["replay", tmp_path / "gap.rec", "--learn", "--output", output]
     code, _, errors = said(*learn)
     assert code == 1
-    assert "learn from what is there (--incomplete)" in " ".join(errors.split())
+    assert "train from the features that it has (--incomplete)" in " ".join(errors.split())
     assert not output.exists()
     code, _, errors = said(*learn, "--incomplete")
     assert code == 0, errors

@@ -8,7 +8,7 @@ import pytest
 from catstream.errors import RecordingError
 from catstream.messages import Features, Model, TrainingRows
 from catstream.recording.file import Recording
-from catstream.recording.learning import Marks, learn, marks_of
+from catstream.recording.learning import Prequential, learn, prequential_of_recorded
 from catstream.wire.codec import encode
 
 
@@ -18,20 +18,20 @@ def models_of(said):
 
 def test_equal_settings_give_equal_models_bit_for_bit(said, written):
     recording, again = Recording(written(said)), []
-    lesson = learn(recording, recording.settings, keep=again.append)
+    result = learn(recording, recording.settings, keep=again.append)
     assert len(again) > 5
     assert list(map(encode, again)) == list(map(encode, models_of(said)))
-    assert lesson.models == lesson.identical == recording.counts[Model]
-    assert lesson.levels[0] > 0
-    assert lesson.marks == marks_of(recording)
+    assert result.models == result.identical == recording.counts[Model]
+    assert result.levels[0] > 0
+    assert result.prequential == prequential_of_recorded(recording)
 
 
 def test_versions_that_a_trainer_skipped_are_made_and_the_others_are_the_same(said, written):
     skipped = {model.version for model in models_of(said)[1::2]}
     kept = [message for message in said if not (isinstance(message, Model) and message.version in skipped)]
     recording = Recording(written(kept))
-    lesson = learn(recording, recording.settings)
-    assert lesson.identical == recording.counts[Model] == lesson.models - len(skipped)
+    result = learn(recording, recording.settings)
+    assert result.identical == recording.counts[Model] == result.models - len(skipped)
 
 
 @pytest.mark.parametrize("change", [{"coreset.size": 8}, {"teaching.classifier": "one-class"}], ids=str)
@@ -41,16 +41,16 @@ def test_other_settings_give_other_models_of_the_same_rows(said, written, change
     assert now.models
     assert now.identical == 0
     assert now.counters["rows"] == then.counters["rows"]
-    assert now.marks.error != then.marks.error
+    assert now.prequential.error != then.prequential.error
 
 
 def test_where_features_are_missing_nothing_is_learned_unless_that_is_wanted(said, written):
     recording = Recording(written([message for message in said if getattr(message, "seq", 0) != 4]))
     with pytest.raises(RecordingError, match="misses the features of 1 frames"):
         learn(recording, recording.settings)
-    lesson = learn(recording, recording.settings, incomplete=True)
-    assert lesson.models
-    assert lesson.counters["seq"] == sum(isinstance(message, Features) for message in said) - 1
+    result = learn(recording, recording.settings, incomplete=True)
+    assert result.models
+    assert result.counters["seq"] == sum(isinstance(message, Features) for message in said) - 1
 
 
 def test_a_recording_of_models_alone_teaches_nothing(said, written):
@@ -59,13 +59,13 @@ def test_a_recording_of_models_alone_teaches_nothing(said, written):
         learn(recording, recording.settings, incomplete=True)
 
 
-def test_marks_are_the_weighted_squared_error_and_the_share_of_frames_won(rng):
+def test_prequential_error_is_weighted_and_a_frame_is_separated_if_all_of_the_object_scores_above_the_rest(rng):
     model = Model(1, 0, rng.normal(size=4).astype(np.float32), 0.25)
     labels, weights = np.array([1, 1, 0, 0], np.float32), np.array([4, 1, 1, 1], np.float32)
-    marks, errors = Marks(), []
+    prequential, errors = Prequential(), []
     for objects in ([0.9, 0.8], [0.2, 0.9]):
         rows = np.array([*objects, 0.5, 0.1], np.float32)[:, None] * model.weights / (model.weights @ model.weights)
-        marks.add(model, Features(1, 0, 0.0, None, {"appearance": TrainingRows(rows, labels, weights)}))
+        prequential.add(model, Features(1, 0, 0.0, None, {"appearance": TrainingRows(rows, labels, weights)}))
         errors += [(float(row @ model.weights) + 0.25 - label) ** 2 for row, label in zip(rows, labels, strict=True)]
-    assert marks.error == pytest.approx(np.average(errors, weights=[*weights, *weights]), rel=1e-5)
-    assert marks.apart == 0.5
+    assert prequential.error == pytest.approx(np.average(errors, weights=[*weights, *weights]), rel=1e-5)
+    assert prequential.separated_share == 0.5

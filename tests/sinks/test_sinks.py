@@ -182,8 +182,8 @@ def test_a_file_that_is_there_is_kept(tmp_path, suffix):
         ("tracks.xls", None, "ends with .ndjson, .jsonl, .json, .csv, .txt, .sqlite, .parquet, .mp4"),
         ("none/tracks.csv", None, "a folder that exists and that you may write to"),
         ("none/tracks.sqlite", None, "a folder that exists and that you may write to"),
-        ("walk.mp4", None, "say where they come from"),
-        ("walk.mp4", "rtsp://127.0.0.1/cam", "those of a live source are gone"),
+        ("walk.mp4", None, "give their source"),
+        ("walk.mp4", "rtsp://127.0.0.1/cam", "is live"),
     ],
 )
 def test_what_cannot_be_written_is_refused_before_any_work(tmp_path, name, source, words):
