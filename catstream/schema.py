@@ -9,6 +9,7 @@ has at most `LONGEST_LIST` entries, and the width and the height of a box are ab
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -39,18 +40,23 @@ LONGEST_TEXT = 4096  # bytes
 class Array:
     """Limits of an array.
 
-    shape      lengths of its sides; a letter stands for the same length in all arrays of one message
-    low, high  its numbers are from `low` to `high`; None: no limit
-    above      its numbers are larger than this; None: no limit
+    shape       lengths of its sides; a letter stands for the same length in all arrays of one message
+    low, high   its numbers are from `low` to `high`
+    above       its numbers are larger than this
     may_be_nan  whether NaN is allowed; infinity never is
     """
 
     dtype: Literal["float32", "float64"]
     shape: tuple[int | str, ...]
-    low: float | None = None
-    high: float | None = None
-    above: float | None = None
+    low: float = -math.inf
+    high: float = math.inf
+    above: float = -math.inf
     may_be_nan: bool = False
+
+    def range(self) -> str:
+        """The range of its numbers in words, empty if there is none."""
+        between = f" from {self.low:g} to {self.high:g}" if math.isfinite(self.low) else ""
+        return between + (f" above {self.above:g}" if math.isfinite(self.above) else "")
 
 
 @dataclass(frozen=True, slots=True)

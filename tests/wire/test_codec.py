@@ -149,10 +149,8 @@ def _length(draw: st.DrawFn, side: int | str, lengths: dict[str, int]) -> int:
 
 
 def _arrays(limits: Array, shape: tuple[int, ...]) -> st.SearchStrategy[np.ndarray]:
-    low, high = limits.low, limits.high
-    if limits.above is not None:
-        low = limits.above + 0.5
-    numbers = st.floats(-1000 if low is None else low, 1000 if high is None else high, width=32)
+    low = max(limits.low, limits.above + 0.5, -1000)
+    numbers = st.floats(low, min(limits.high, 1000), width=32)
     return arrays.arrays(limits.dtype, shape, elements=numbers | st.just(np.nan) if limits.may_be_nan else numbers)
 
 

@@ -61,7 +61,7 @@ def kind_of(field):
     if dataclasses.is_dataclass(field.type):
         return f"`{field.type.__name__.lower()}`"
     if array := field.limit(Array):
-        return f"{array.dtype} ({', '.join(map(str, array.shape))}){range_of(array)}"
+        return f"{array.dtype} ({', '.join(map(str, array.shape))}){array.range()}{', may be NaN' if array.may_be_nan else ''}"
     if limits := field.limit(Bytes):
         return f"bytes, {limits.kind} of at most {limits.longest}"
     if get_origin(field.type) is Literal:
@@ -76,13 +76,6 @@ def names_of(named):
     if named is None:
         return "text"
     return ", ".join(f"`{name}`" + (" (always)" if name in named.required else "") for name in named.columns)
-
-
-def range_of(array):
-    """The range of the numbers of an array."""
-    between = f", from {array.low} to {array.high}" if array.low is not None else ""
-    above = f", above {array.above}" if array.above is not None else ""
-    return between + above + (", may be NaN" if array.may_be_nan else "")
 
 
 def heads_table():
