@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 from unittest.mock import patch
@@ -80,7 +79,7 @@ def value(field: Field, full: bool, d: int) -> Any:
         named = field.limit(Named) or Named({"sent": 0, "stored": 0})
         names = [name for name in named.columns if full or name in named.required]
         return {name: value(field.values, full, d + named.columns[name]) for name in names}
-    if is_dataclass(field.type):
+    if field.is_message:
         return message(field.type, full, d)
     if array := field.limit(Array):
         shape = [side if isinstance(side, int) else d if side == "d" else 3 * full for side in array.shape]

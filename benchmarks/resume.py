@@ -19,7 +19,7 @@ import psutil
 from sequences import scratch
 from table import Table, command, publish
 
-from catstream.compression.generations import Generations
+from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
 from catstream.settings import Settings
 from catstream.state import TREES
@@ -43,7 +43,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     seconds.append(watched(go_on, out, None))
 
     rows = [track.frame for track in read_tracks(out, video.stem)]
-    stored = Generations(kept / TREES).load(Settings()).seq
+    stored = CheckpointStore(kept / TREES).load(Settings()).seq
     columns = ("killed", "frames", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")
     row = (moments, frames, frames - len(set(rows)), len(rows) - len(set(rows)), stored)
     yield Table("Resume", columns, [(*row, float(np.median(seconds)), max(seconds))], f"seed {options.seed}")

@@ -14,14 +14,14 @@ import numpy as np
 
 from catstream import storage
 from catstream.box import Box
-from catstream.compression import checkpoint
 from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import Model, Sample
+from catstream.packing import pack, unpack
 from catstream.wire.checks import check
 
 __all__ = ["Learned"]
 
-_KIND = "learned 1"  # and the version of what the file holds
+_KIND = "learned 2"  # and the version of what the file holds
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +45,11 @@ class Learned:
         ServiceError
             Where it cannot be written.
         """
-        arrays, told = checkpoint.sample_state(self.sample)
-        model, _ = checkpoint.model_state(self.model)
-        facts = {"kind": _KIND, "bias": self.model.bias, "box": list(self.box), "sample": told}
+        sample_arrays, sample_facts = pack(self.sample, "sample")
+        model_arrays, model_facts = pack(self.model, "model")
+        facts: dict[str, object] = {"kind": _KIND, "box": list(self.box), "sample": sample_facts, "model": model_facts}
         try:
-            storage.write(path, arrays | model, facts)
+            storage.write(path, sample_arrays | model_arrays, facts)
         except OSError as error:
             raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another file") from None
 
@@ -82,8 +82,6 @@ class Learned:
 
     @classmethod
     def _of(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Self:
-        sample = checkpoint.sample_of(arrays, facts["sample"])
-        if sample is None:
-            raise ValueError("it holds no sample")
-        model = checkpoint.model_of(arrays, {"version": sample.version, "frame": 0, "bias": facts["bias"]})
-        return cls(model, replace(sample, frame=0), Box(*map(float, facts["box"])))
+        sample = unpack(Sample, arrays, facts["sample"], "sample")
+        model = unpack(Model, arrays, facts["model"], "model")
+        return cls(replace(model, frame=0), replace(sample, frame=0), Box(*map(float, facts["box"])))

@@ -111,14 +111,23 @@ class Field:
     limits: tuple[Any, ...]
     values: Field | None = None
 
+    @property
+    def is_message(self) -> bool:
+        """Whether its values are messages themselves."""
+        return dataclasses.is_dataclass(self.type)
+
     def limit(self, kind: type[Limit]) -> Limit | None:
         """The metadata of a kind, None if there is none."""
         return next((limit for limit in self.limits if isinstance(limit, kind)), None)
 
 
-@cache
 def fields(kind: type) -> tuple[Field, ...]:
     """The fields of a message, in their order."""
+    return _fields(kind)
+
+
+@cache
+def _fields(kind: type) -> tuple[Field, ...]:
     hints = get_type_hints(kind, include_extras=True)
     return tuple(_field(field.name, hints[field.name]) for field in dataclasses.fields(kind))
 

@@ -2,7 +2,7 @@
 
     DIR/job.safetensors     the job of the run, readable by its owner only: see `catstream.job`
     DIR/desired_state.json  what was commanded: see `catstream.services.desired`
-    DIR/trees/              the compressor's checkpoints: see `catstream.compression.generations`
+    DIR/trees/              the compressor's checkpoints: see `catstream.compression.checkpoint_store`
 
 A pipeline locks DIR, and its compressor DIR/trees. The kernel releases a lock when its process ends, however that
 happens.
@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from catstream import storage
-from catstream.compression.generations import Generations
+from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
 from catstream.job import Job
 from catstream.learned import Learned
@@ -40,7 +40,7 @@ def began(folder: Path) -> bool:
 
 def position(folder: Path, settings: Settings) -> Position:
     """Where the newest whole checkpoint is."""
-    return Generations(folder / TREES).load(settings).position
+    return CheckpointStore(folder / TREES).load(settings).position
 
 
 def learned(folder: Path, settings: Settings) -> Learned:
@@ -51,7 +51,7 @@ def learned(folder: Path, settings: Settings) -> Learned:
     ServiceError
         If there is no checkpoint, or nothing was learned before the newest one.
     """
-    compressor = Generations(folder / TREES).load(settings)
+    compressor = CheckpointStore(folder / TREES).load(settings)
     if compressor.last_sample is None or compressor.box is None or not compressor.sampled:
         raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
     trainer = Trainer(settings)

@@ -18,13 +18,13 @@ import numpy as np
 
 from catstream import kalman, storage
 from catstream.box import Box
-from catstream.compression import checkpoint
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
 from catstream.errors import BoxError, FrameError, ProtocolError, ServiceError
 from catstream.features.cells import row_length
 from catstream.image import as_bgr
-from catstream.messages import Features, Track
+from catstream.messages import Features, Model, Track
+from catstream.packing import pack, unpack
 from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
@@ -32,7 +32,7 @@ from catstream.wire.checks import check
 
 __all__ = ["Tracker"]
 
-_KIND = "tracker 1"  # and the version of what the file holds
+_KIND = "tracker 2"  # and the version of what the file holds
 
 
 class Tracker:
@@ -147,14 +147,14 @@ class Tracker:
         """
         track = self.track
         arrays, facts = self.compressor.state()
-        model, model_facts = checkpoint.model_state(self.detector.model)
+        model, model_facts = pack(self.detector.model, "model")
         start, start_facts = self.detector.bootstrap_state()
         told: dict[str, object] = {
             "kind": _KIND,
             "program": version("catstream"),
             "settings": self.settings.texts(),
             "size": list(self._size),
-            "track": [track.time, track.state, track.box and list(track.box), track.score, track.model_version],
+            "track": pack(track, "track")[1],
             "compressor": facts,
             "model": model_facts,
             "bootstrap": start_facts,
@@ -190,7 +190,7 @@ class Tracker:
         self = cls(Settings.of(facts["settings"]))
         self.compressor = Compressor.from_state(arrays, facts["compressor"], self.settings)
         self.trainer, self.detector = Trainer(self.settings), Detector(self.settings)
-        model = checkpoint.model_of(arrays, facts["model"])
+        model = unpack(Model, arrays, facts["model"], "model")
         if len(model.weights) != row_length():
             raise ValueError(
                 f"its model has {len(model.weights)} weights, the features of this catstream are {row_length()}: "
@@ -203,8 +203,7 @@ class Tracker:
         self.detector.resume_bootstrap(arrays, facts["bootstrap"])
         height, width = facts["size"]
         self._size = int(height), int(width)
-        time, state, box, score, model_version = facts["track"]
-        self._track = Track(seq, seq - 1, float(time), state, box and Box(*box), float(score), int(model_version))
+        self._track = unpack(Track, arrays, facts["track"], "track")
         for message in (model, self._track):
             check(message)
         kalman.prepare()

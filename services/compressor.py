@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from catstream.compression import reduce
+from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
-from catstream.compression.generations import Generations
 from catstream.learned import Learned
 from catstream.messages import End, Features, Position
 from catstream.recording.file import RecordingWriter
@@ -40,10 +40,10 @@ def main(process: Process) -> None:
     settings, job = process.settings, process.job
     model, state, record = job.model, job.state, job.record
     with ExitStack() as stack:
-        generations = None
+        checkpoints = None
         if state is not None:
-            generations = Generations(stack.enter_context(locked(state / TREES, _LOCK_SECONDS)))
-        compressor = generations.load(settings) if generations else Compressor(settings)
+            checkpoints = CheckpointStore(stack.enter_context(locked(state / TREES, _LOCK_SECONDS)))
+        compressor = checkpoints.load(settings) if checkpoints else Compressor(settings)
         if model is not None and not compressor.seq:
             compressor = Compressor.of(Learned.load(model).sample, settings)
         stored, tried, settled = compressor.seq, time.monotonic(), compressor.position
@@ -52,7 +52,7 @@ def main(process: Process) -> None:
             """Write a checkpoint. Where the disk takes none and it is needed, memory has to do: learning goes on."""
             nonlocal stored, tried, settled
             process.allow(_STORE_SECONDS)
-            if generations is None or generations.save(compressor):
+            if checkpoints is None or checkpoints.save(compressor):
                 stored, needed = compressor.seq, True
             tried = time.monotonic()
             if needed:
@@ -97,7 +97,7 @@ def main(process: Process) -> None:
                 if sample is not None:
                     samples.send(sample)
             before, waiting = settled, compressor.seq - settled.seq
-            needed = generations is None or end or 2 * waiting >= settings.run.unstored_frames
+            needed = checkpoints is None or end or 2 * waiting >= settings.run.unstored_frames
             overdue = time.monotonic() - tried >= settings.run.checkpoint_seconds
             if compressor.seq > stored and (needed or overdue):
                 store(needed)
@@ -109,7 +109,7 @@ def main(process: Process) -> None:
                     now = replace(now, seq=message.seq, unsaved=now.unsaved and now.unsaved + 1)
                 features.acknowledge(now)
             samples.welcome()
-            process.trouble = generations.trouble if generations else ""
+            process.trouble = checkpoints.trouble if checkpoints else ""
             process.beat(counters, now=end)
             if end:
                 process.broken = message.failed

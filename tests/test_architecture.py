@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"errors", "threads"},
     {"box", "heads", "image", "schema", "storage", "extras"},
-    {"messages", "settings", "ridge", "kalman", "html"},
+    {"messages", "packing", "settings", "ridge", "kalman", "html"},
     {"features"},
     {"paper"},
     {"detection", "compression", "training", "wire", "video", "adapters", "job"},

@@ -202,7 +202,7 @@ def test_a_file_that_is_no_saved_tracker_is_refused(video, tmp_path):
     with pytest.raises(ServiceError, match="there is no saved tracker"):
         Tracker.load(kept)
     storage.write(kept, {"weights": np.zeros(3)}, {"kind": "learned 1"})
-    with pytest.raises(ProtocolError, match="of kind 'learned 1', not 'tracker 1'"):
+    with pytest.raises(ProtocolError, match="of kind 'learned 1', not 'tracker 2'"):
         Tracker.load(kept)
     tracker = Tracker()
     tracker.init(video[0][0], video[1][0])
@@ -222,7 +222,7 @@ def test_a_tracker_of_other_features_is_refused(video, tmp_path):
     tracker.init(video[0][0], video[1][0])
     tracker.save(tmp_path / "kept")
     arrays, facts = storage.read(tmp_path / "kept")
-    storage.write(tmp_path / "kept", arrays | {"weights": arrays["weights"][:-1].copy()}, facts)
+    storage.write(tmp_path / "kept", arrays | {"model.weights": arrays["model.weights"][:-1].copy()}, facts)
     with pytest.raises(ProtocolError, match="its model has 2463 weights, the features of this catstream are 2464"):
         Tracker.load(tmp_path / "kept")
 

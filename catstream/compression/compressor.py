@@ -12,15 +12,16 @@ import numpy as np
 
 from catstream import storage
 from catstream.box import Box
-from catstream.compression import checkpoint
 from catstream.compression.tree import CoresetTree
-from catstream.errors import ProtocolError, SettingsError
+from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.heads import HEADS, Head
 from catstream.messages import DetectorState, Features, Position, Sample, TrainingRows
+from catstream.packing import pack, unpack
 from catstream.settings import Settings
 
 __all__ = ["Compressor"]
 
+_KIND = "compressor 2"  # and the version of what a checkpoint holds
 _GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between
 
 
@@ -149,7 +150,8 @@ class Compressor:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one file, whole or not at all."""
-        storage.write(path, *self.state())
+        arrays, facts = self.state()
+        storage.write(path, arrays, facts | {"kind": _KIND})
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Arrays and facts that `from_state` goes on from."""
@@ -161,9 +163,12 @@ class Compressor:
             "sampled_leaves": self._sampled_leaves,
             "trees": {},
         }
-        sample, facts["sample"] = checkpoint.sample_state(self.last_sample)
-        detector, facts["detector"] = checkpoint.detector_facts(self.detector)
-        arrays |= sample | detector
+        # The trees grow on after a sample. The sample itself is kept too: from it, a trainer that starts anew learns
+        # the model that the detector goes by.
+        for name, message in (("sample", self.last_sample), ("detector", self.detector)):
+            if message is not None:
+                own, facts[name] = pack(message, name)
+                arrays |= own
         for name, tree in self.trees.items():
             own, facts["trees"][name] = tree.state()
             arrays |= {f"{name}.{key}": array for key, array in own.items()}
@@ -176,11 +181,18 @@ class Compressor:
         Raises
         ------
         ProtocolError
-            Where the file is torn, damaged or another one.
+            If the file is damaged.
+        ServiceError
+            If it is not a checkpoint, or one of another version of catstream.
         SettingsError
-            Where it was made with another coreset size.
+            If it was made with another coreset size.
         """
         arrays, facts = storage.read(path)
+        if (kind := facts.get("kind")) != _KIND:
+            raise ServiceError(
+                f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: go on with the catstream that wrote it, "
+                "or begin anew in another folder"
+            )
         try:
             self = cls.from_state(arrays, facts, settings)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -198,8 +210,10 @@ class Compressor:
         self = cls(settings)
         self.seq, self.frame = int(facts["seq"]), int(facts["frame"])
         self.box = Box(*facts["box"]) if facts["box"] else None
-        self.detector = checkpoint.detector_of(arrays, facts["detector"])
-        self.last_sample = checkpoint.sample_of(arrays, facts["sample"])
+        if "detector" in facts:
+            self.detector = unpack(DetectorState, arrays, facts["detector"], "detector")
+        if "sample" in facts:
+            self.last_sample = unpack(Sample, arrays, facts["sample"], "sample")
         self._sampled_leaves = int(facts["sampled_leaves"])
         self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]
         for name, tree_facts in facts["trees"].items():

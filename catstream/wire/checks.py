@@ -5,7 +5,6 @@ The checks of a kind of message are compiled once: reading its annotations takes
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from functools import cache
@@ -72,7 +71,7 @@ def _check_of(field: Field, where: str) -> _Check | None:
     if get_origin(field.type) is tuple:
         whole = _whole(where, 0)
         return lambda values, lengths: [whole(value, lengths) for value in values]
-    if dataclasses.is_dataclass(field.type):
+    if field.is_message:
         return lambda message, _: check(message)
     if array := field.limit(Array):
         return _array(array, where)

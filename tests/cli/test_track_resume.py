@@ -13,7 +13,7 @@ from functools import partial
 import psutil
 import pytest
 
-from catstream.compression.generations import Generations
+from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.job import Job
 from catstream.learned import Learned
 from catstream.pipeline import Pipeline
@@ -78,12 +78,12 @@ def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed
     for file in RESULTS:
         assert (out / file).read_bytes() == (whole_run / "out" / file).read_bytes()
     assert "60 messages sent, 60 stored" in errors
-    assert Generations(kept / TREES).load(Settings()).seq == 60
+    assert CheckpointStore(kept / TREES).load(Settings()).seq == 60
     code, output, errors = said("save", tmp_path / "one", "--state", kept)
     assert code == 0, errors
     saved = Learned.load(tmp_path / "one")
     assert output == f"model {saved.model.version} is in {tmp_path / 'one'}\n"
-    assert saved.model.version == Generations(kept / TREES).load(Settings()).version
+    assert saved.model.version == CheckpointStore(kept / TREES).load(Settings()).version
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
     assert frames(out) == list(range(60)), "a run that is complete gets no row more"

@@ -11,9 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from catstream import storage
 from catstream.box import Box
+from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
-from catstream.errors import ProtocolError, SettingsError
+from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.heads import APPEARANCE, EXTENT
 from catstream.messages import DetectorState, Features, Motion, Sample, TrainingRows
 from catstream.settings import Settings
@@ -227,8 +228,18 @@ def test_a_forged_state_is_refused(energy, level, settings, messages, tmp_path):
 
 def test_a_tree_is_no_compressor(settings, tmp_path):
     Compressor(settings).trees["object"].save(tmp_path / "tree")
-    with pytest.raises(ProtocolError, match="use an older copy"):
+    with pytest.raises(ServiceError, match="is of kind None, this catstream reads 'compressor 2'"):
         Compressor.load(tmp_path / "tree", settings)
+
+
+def test_a_checkpoint_of_another_version_is_refused_with_one_line(settings, messages, tmp_path):
+    compressor, path = Compressor(settings), tmp_path / "000000000001.safetensors"
+    take(compressor, messages, 37)
+    arrays, facts = compressor.state()
+    storage.write(path, arrays, facts | {"kind": "compressor 1"})
+    with pytest.raises(ServiceError, match="is of kind 'compressor 1', this catstream reads 'compressor 2'") as error:
+        CheckpointStore(tmp_path).load(settings)
+    assert "\n" not in str(error.value)
 
 
 def test_a_state_of_another_coreset_size_is_refused(settings, messages, tmp_path):

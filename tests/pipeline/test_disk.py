@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from catstream.compression.generations import Generations
+from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.state import TREES
@@ -63,9 +63,9 @@ def test_a_disk_that_takes_nothing_stops_nothing_and_is_said(video, disk, until,
             if track.frame == 40:
                 with subscribe(pipeline.endpoint, "health", timeout=60) as reports:
                     said = next(report.trouble for report in reports if report.trouble)
-                assert 0 < Generations(state / TREES).load(SETTINGS).seq < 40, "what was kept before is whole"
+                assert 0 < CheckpointStore(state / TREES).load(SETTINGS).seq < 40, "what was kept before is whole"
                 mend(disk)
     assert reason in said
     assert tracks == list(range(len(boxes)))
     assert pipeline.totals == {"sent": len(boxes), "stored": len(boxes)}, "checkpoints went on once there was room"
-    assert Generations(state / TREES).load(SETTINGS).seq == len(boxes)
+    assert CheckpointStore(state / TREES).load(SETTINGS).seq == len(boxes)

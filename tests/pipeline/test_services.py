@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from catstream.box import Box
-from catstream.compression.generations import Generations
+from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
 from catstream.job import Job
 from catstream.messages import End, Track
@@ -41,7 +41,7 @@ def test_started_by_hand_in_any_order_they_complete_a_run(video, folder, tcp, se
     assert end.totals == {"sent": len(boxes), "stored": len(boxes)}
     assert not end.failed
     assert [process.wait(30) for process in processes] == [0, 0, 0]
-    assert Generations(folder / TREES).load(Settings()).seq == len(boxes)
+    assert CheckpointStore(folder / TREES).load(Settings()).seq == len(boxes)
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, f
     errors = [process.communicate(timeout=60)[1] for process in processes]
     assert [process.returncode for process in processes] == [3, 3, 3], errors
     assert "5.png' (frame 5): replace or remove it" in errors[-1]
-    assert Generations(folder / TREES).load(Settings()).seq == 5
+    assert CheckpointStore(folder / TREES).load(Settings()).seq == 5
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGKILL, -9)])
@@ -122,7 +122,7 @@ def test_a_compressor_that_is_asked_to_end_alone_stores_what_it_has_and_leaves(v
         taken = next(counters["taken"] for counters in told if counters["taken"])
         compressor.send_signal(signal.SIGTERM)
         assert compressor.wait(30) == 0
-        stored = Generations(folder / TREES).load(Settings()).seq
+        stored = CheckpointStore(folder / TREES).load(Settings()).seq
         assert stored >= taken
         until(lambda: next(told)["stored"] == stored)
     assert detector.poll() is None

@@ -125,7 +125,7 @@ def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
         return None
     if field.values is not None:
         return _map(draw, field, lengths)
-    if dataclasses.is_dataclass(field.type):
+    if field.is_message:
         return draw(messages(field.type))
     if array := field.limit(Array):
         return draw(_arrays(array, tuple(_length(draw, side, lengths) for side in array.shape)))
@@ -139,7 +139,7 @@ def _map(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> dict[str, An
     if named is None:
         return {name: _value(draw, field.values, lengths) for name in draw(st.sets(st.text(max_size=8), max_size=3))}
     names = [name for name in named.columns if name in named.required or draw(st.booleans())]
-    if dataclasses.is_dataclass(field.values.type):
+    if field.values.is_message:
         return {name: draw(messages(field.values.type, lengths["d"] + named.columns[name])) for name in names}
     return {name: _value(draw, field.values, lengths) for name in names}
 

@@ -5,7 +5,6 @@ Run as a program, it writes the tables of the messages and of the heads anew: `m
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import re
 import select
@@ -58,10 +57,11 @@ def described(field):
 def kind_of(field):
     if field.values is not None:
         return f"map of {names_of(field.limit(Named))} to {kind_of(field.values)}"
-    if dataclasses.is_dataclass(field.type):
+    if field.is_message:
         return f"`{field.type.__name__.lower()}`"
     if array := field.limit(Array):
-        return f"{array.dtype} ({', '.join(map(str, array.shape))}){array.range()}{', may be NaN' if array.may_be_nan else ''}"
+        nan = ", may be NaN" if array.may_be_nan else ""
+        return f"{array.dtype} ({', '.join(map(str, array.shape))}){array.range()}{nan}"
     if limits := field.limit(Bytes):
         return f"bytes, {limits.kind} of at most {limits.longest}"
     if get_origin(field.type) is Literal:

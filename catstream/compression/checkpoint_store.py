@@ -10,7 +10,7 @@ from catstream.compression.compressor import Compressor
 from catstream.errors import ProtocolError
 from catstream.settings import Settings
 
-__all__ = ["Generations"]
+__all__ = ["CheckpointStore"]
 
 _KEPT = 2
 _DAMAGED = "damaged"  # the newest of these is kept, for whoever wants to know why
@@ -18,7 +18,7 @@ _DAMAGED = "damaged"  # the newest of these is kept, for whoever wants to know w
 _log = logging.getLogger(__name__)
 
 
-class Generations:
+class CheckpointStore:
     """Checkpoints in a folder: the newest `_KEPT`, one that was found damaged, and nothing else.
 
     A file appears there whole or not at all, and is on disk before the call returns. None is

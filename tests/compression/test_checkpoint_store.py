@@ -8,8 +8,8 @@ import os
 import numpy as np
 import pytest
 
+from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
-from catstream.compression.generations import Generations
 from catstream.errors import SettingsError
 from catstream.heads import GROUPS
 from catstream.messages import Features, TrainingRows
@@ -34,10 +34,10 @@ def grow(rng):
 
 @pytest.fixture
 def kept(grow, tmp_path):
-    """A folder with generations of 40, 50 and 60 messages, of which the first is gone."""
-    compressor, generations = grow(Compressor(SETTINGS), 30), Generations(tmp_path)
+    """A folder of three checkpoints, after 40, 50 and 60 messages; the store has removed the first."""
+    compressor, store = grow(Compressor(SETTINGS), 30), CheckpointStore(tmp_path)
     for _ in range(3):
-        assert generations.save(grow(compressor, 10))
+        assert store.save(grow(compressor, 10))
     return tmp_path
 
 
@@ -51,20 +51,20 @@ def newest(folder):
 
 def test_the_newest_two_are_kept_and_the_newest_is_used(kept):
     assert files(kept) == ["000000000002.safetensors", "000000000003.safetensors"]
-    assert Generations(kept).load(SETTINGS).seq == 60
+    assert CheckpointStore(kept).load(SETTINGS).seq == 60
 
 
 def test_a_folder_without_any_begins_anew(tmp_path):
-    assert Generations(tmp_path).load(SETTINGS).seq == 0
+    assert CheckpointStore(tmp_path).load(SETTINGS).seq == 0
 
 
 @pytest.mark.parametrize("share", [0, 0.001, 0.5, 0.999])
 def test_a_torn_file_is_noticed_and_the_one_before_is_used(kept, share, caplog):
     whole = newest(kept).read_bytes()
     newest(kept).write_bytes(whole[: int(share * len(whole))])
-    generations = Generations(kept)
-    assert generations.load(SETTINGS).seq == 50
-    assert "damaged checkpoints: 1, the one of frame 49 was used" in generations.trouble
+    store = CheckpointStore(kept)
+    assert store.load(SETTINGS).seq == 50
+    assert "damaged checkpoints: 1, the one of frame 49 was used" in store.trouble
     assert "cannot be used" in caplog.text
 
 
@@ -80,7 +80,7 @@ def test_no_flipped_bit_goes_unnoticed(kept, rng):
         flipped = bytearray(whole)
         flipped[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(flipped)
-        loaded = Generations(kept).load(SETTINGS)
+        loaded = CheckpointStore(kept).load(SETTINGS)
         assert loaded.counters() == right[loaded.seq]
         noticed += loaded.seq == 50
     assert noticed > 100
@@ -88,40 +88,40 @@ def test_no_flipped_bit_goes_unnoticed(kept, rng):
 
 def test_after_a_damaged_one_the_next_is_kept_beside_the_good_one(kept, grow):
     newest(kept).write_bytes(b"torn")
-    generations = Generations(kept)
-    assert generations.save(grow(generations.load(SETTINGS), 5))
+    store = CheckpointStore(kept)
+    assert store.save(grow(store.load(SETTINGS), 5))
     assert files(kept) == ["000000000002.safetensors", "000000000004.safetensors", "damaged"]
     newest(kept).write_bytes(b"torn")
-    assert Generations(kept).load(SETTINGS).seq == 50
+    assert CheckpointStore(kept).load(SETTINGS).seq == 50
 
 
 def test_where_none_is_whole_all_is_learned_anew_and_said(kept):
     for path in kept.iterdir():
         path.write_bytes(b"")
-    generations = Generations(kept)
-    assert generations.load(SETTINGS).seq == 0
-    assert "damaged checkpoints: 2, all is learned anew" in generations.trouble
+    store = CheckpointStore(kept)
+    assert store.load(SETTINGS).seq == 0
+    assert "damaged checkpoints: 2, all is learned anew" in store.trouble
 
 
 def test_a_full_disk_is_said_and_costs_nothing_that_was_kept(kept, grow, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    before, generations = files(kept), Generations(kept)
-    compressor = grow(generations.load(SETTINGS), 5)
+    before, store = files(kept), CheckpointStore(kept)
+    compressor = grow(store.load(SETTINGS), 5)
     with monkeypatch.context() as disk:
         disk.setattr(os, "fsync", full)
-        assert not generations.save(compressor)
-    assert generations.failing
-    assert "No space left on device" in generations.trouble
+        assert not store.save(compressor)
+    assert store.failing
+    assert "No space left on device" in store.trouble
     assert files(kept) == before
-    assert Generations(kept).load(SETTINGS).seq == 60
-    assert generations.save(compressor)
-    assert not generations.failing
-    assert not generations.trouble
-    assert Generations(kept).load(SETTINGS).seq == 65
+    assert CheckpointStore(kept).load(SETTINGS).seq == 60
+    assert store.save(compressor)
+    assert not store.failing
+    assert not store.trouble
+    assert CheckpointStore(kept).load(SETTINGS).seq == 65
 
 
 def test_another_coreset_size_is_refused_and_not_taken_for_damage(kept):
     with pytest.raises(SettingsError, match="same settings"):
-        Generations(kept).load(SETTINGS.but({"coreset.size": 16}))
+        CheckpointStore(kept).load(SETTINGS.but({"coreset.size": 16}))

@@ -1,0 +1,86 @@
+"""A message as arrays and facts, as `catstream.storage` keeps them, and back: derived from its schema."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+import numpy as np
+
+from catstream.box import Box
+from catstream.schema import Array, Field, fields
+
+__all__ = ["pack", "unpack"]
+
+Message = TypeVar("Message")
+Arrays = dict[str, np.ndarray]
+
+
+def pack(message: object, name: str) -> tuple[Arrays, dict[str, Any]]:
+    """Arrays, their names beginning with `name`, and facts for JSON.
+
+    Examples
+    --------
+    >>> from catstream.messages import Motion
+    >>> arrays, facts = pack(Motion(np.eye(4), np.eye(2)), "motion")
+    >>> list(arrays), facts
+    (['motion.process', 'motion.observation'], {})
+    >>> unpack(Motion, arrays, facts, "motion").observation.tolist()
+    [[1.0, 0.0], [0.0, 1.0]]
+    """
+    arrays: Arrays = {}
+    facts = {
+        field.name: _pack(getattr(message, field.name), f"{name}.{field.name}", arrays)
+        for field in fields(type(message))
+    }
+    return arrays, {name: fact for name, fact in facts.items() if fact is not None}
+
+
+def unpack(kind: type[Message], arrays: Arrays, facts: dict[str, Any], name: str) -> Message:
+    """The message that `pack` took, bit for bit.
+
+    Its limits are not checked: `catstream.wire.checks` does that.
+
+    Raises
+    ------
+    AttributeError, KeyError, TypeError, ValueError
+        If the arrays and facts are not those of a message of this kind.
+    """
+    values = {
+        field.name: _unpack(field, facts.get(field.name), f"{name}.{field.name}", arrays) for field in fields(kind)
+    }
+    return kind(**values)
+
+
+def _pack(value: Any, name: str, arrays: Arrays) -> Any:
+    """The fact that stands for a value, None if there is none; its arrays are added to `arrays`."""
+    if isinstance(value, np.ndarray):
+        arrays[name] = value
+        return None
+    if isinstance(value, dict):
+        return {key: _pack(entry, f"{name}.{key}", arrays) for key, entry in value.items()}
+    if dataclasses.is_dataclass(value):
+        parts, facts = pack(value, name)
+        arrays.update(parts)
+        return facts
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _unpack(field: Field, fact: Any, name: str, arrays: Arrays) -> Any:
+    if field.limit(Array) is not None:
+        return arrays.get(name) if field.optional else arrays[name]
+    if fact is None and field.optional:
+        return None
+    if field.values is not None:
+        return {key: _unpack(field.values, entry, f"{name}.{key}", arrays) for key, entry in fact.items()}
+    if field.is_message:
+        return unpack(field.type, arrays, fact, name)
+    if field.type is Box:
+        return Box(*map(float, fact))
+    if get_origin(field.type) is tuple:
+        return tuple(map(int, fact))
+    if get_origin(field.type) is Literal:
+        if fact not in get_args(field.type):
+            raise ValueError(f"{name} is {fact!r:.40}, not one of {', '.join(get_args(field.type))}")
+        return fact
+    return field.type(fact)
