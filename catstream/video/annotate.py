@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
@@ -16,7 +16,10 @@ from catstream.video.writer import VideoWriter
 __all__ = ["AnnotatedVideo", "draw", "draw_preview", "thumbnail"]
 
 #: Blue, green, red.
-_COLOURS = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
+_Point = tuple[float, float]
+_Colour = tuple[int, int, int]
+
+_COLOURS: dict[str, _Colour] = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
 _WHITE, _GREY, _DARK, _ORANGE = (245, 245, 245), (110, 110, 110), (32, 32, 32), (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -97,7 +100,7 @@ def _text_height(width: int) -> int:
     return round(_TEXT_HEIGHT * max(width / 640, _MIN_UNIT))
 
 
-def _draw_box(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float) -> None:
+def _draw_box(canvas: np.ndarray, start: _Point, end: _Point, colour: _Colour, unit: float) -> None:
     """Draw a thin rectangle with thick corners over a dark outline, so that it is visible on any background."""
     (left, top), (right, bottom) = (tuple(round(value) for value in corner) for corner in (start, end))
     thin, arm = max(1, round(1.2 * unit)), min(right - left, bottom - top) // 4
@@ -109,7 +112,7 @@ def _draw_box(canvas: np.ndarray, start: Any, end: Any, colour: Any, unit: float
             cv2.polylines(canvas, [corner], False, colour, max(2, round(3 * unit)), cv2.LINE_AA)
 
 
-def _draw_text(canvas: np.ndarray, track: Track, colour: Any, unit: float) -> None:
+def _draw_text(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -> None:
     """Draw the state, the score as a bar and a number, the model version and the frame number; in a narrow image only
     the first of these."""
     height, width = canvas.shape[:2]

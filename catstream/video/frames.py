@@ -6,10 +6,14 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from av import AudioStream, FFmpegError, VideoFrame, VideoStream
 
 __all__ = ["RATE", "Frame", "Source", "UprightConverter", "ffmpeg_reason", "without_password"]
 
@@ -87,12 +91,17 @@ class UprightConverter:
 
         self._reformatter = VideoReformatter()
 
-    def __call__(self, frame: Any) -> np.ndarray:
+    def __call__(self, frame: VideoFrame) -> np.ndarray:
         image = self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
         return np.ascontiguousarray(np.rot90(image, frame.rotation // 90))
 
 
-def ffmpeg_reason(error: Any) -> str:
+def time_base(stream: VideoStream | AudioStream) -> Fraction:
+    """Return the unit of the time stamps of a stream, in seconds. A stream that is read always has one."""
+    return stream.time_base or Fraction(1)
+
+
+def ffmpeg_reason(error: FFmpegError) -> str:
     """Return FFmpeg's own description of an error."""
     return (error.strerror or str(error)).lower()
 

@@ -14,13 +14,17 @@ import re
 import threading
 from collections.abc import Callable, Iterator
 from time import monotonic
-from typing import Any
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import cv2
 
 from catstream.errors import VideoError
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, without_password
+
+if TYPE_CHECKING:
+    from av import VideoFrame
+    from av.container import InputContainer
 
 __all__ = ["LiveSource"]
 
@@ -66,7 +70,7 @@ class LiveSource(Source):
         self._number, self._zero, self._idle = start, since, idle
         self._upright = UprightConverter()
         self._condition = threading.Condition()  # guards the fields below
-        self._newest: tuple[float, Any] | None = None
+        self._newest: tuple[float, VideoFrame] | None = None
         self._problem = ""  # why the source is lost; empty while it is not
         self._last_frame_time = monotonic()
         self._closed = False
@@ -112,7 +116,7 @@ class LiveSource(Source):
                 )
         return self._frame(*newest)
 
-    def _wait_for_newest(self) -> tuple[float, Any] | None:
+    def _wait_for_newest(self) -> tuple[float, VideoFrame] | None:
         """Return the newest frame and its arrival time, or None if no frame arrives within `_IDLE_SECONDS`."""
         with self._condition:
             if self._newest is None and not self._closed:
@@ -120,7 +124,7 @@ class LiveSource(Source):
             newest, self._newest = self._newest, None
         return newest
 
-    def _frame(self, moment: float, decoded: Any) -> Frame:
+    def _frame(self, moment: float, decoded: VideoFrame) -> Frame:
         image = self._upright(decoded)
         size = image.shape[1], image.shape[0]
         self.size = self.size if any(self.size) else size
@@ -155,7 +159,7 @@ class LiveSource(Source):
                 self._condition.wait_for(lambda: self._closed, pause * random.uniform(0.5, 1))
             pause = min(2 * pause, _LONGEST_PAUSE)
 
-    def _decoded(self) -> Iterator[Any]:
+    def _decoded(self) -> Iterator[VideoFrame]:
         """Yield the undamaged frames of one connection, until it ends."""
         import av
 
@@ -167,7 +171,7 @@ class LiveSource(Source):
             for packet in container.demux(stream):
                 if self._closed or monotonic() > due:  # a packet that was cut off by a time-out is incomplete
                     return
-                decoded: list[Any] = []
+                decoded: list[VideoFrame] = []
                 with contextlib.suppress(av.FFmpegError):  # the packet is damaged; the next may be whole
                     decoded = stream.codec_context.decode(packet)
                 for frame in decoded:
@@ -175,7 +179,7 @@ class LiveSource(Source):
                         due = monotonic() + _SILENT_SECONDS
                         yield frame
 
-    def _store_newest(self, moment: float, decoded: Any) -> None:
+    def _store_newest(self, moment: float, decoded: VideoFrame) -> None:
         with self._condition:
             if self._closed:
                 return
@@ -193,7 +197,7 @@ class LiveSource(Source):
         self._problem = problem
 
 
-def _open_container(text: str) -> Any:
+def _open_container(text: str) -> InputContainer:
     """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
     import av
 

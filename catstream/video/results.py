@@ -16,11 +16,11 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Self, get_args
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import Track
+from catstream.messages import State, Track
 
 __all__ = [
     "COLUMNS",
@@ -175,10 +175,11 @@ def _parsed_lines(path: Path) -> Iterator[tuple[int, Track]]:
             yield end, track
 
 
-def _state(text: str) -> Any:
-    if text not in ("bootstrapping", "present", "absent"):
+def _state(text: str) -> State:
+    states: dict[str, State] = {state: state for state in get_args(State)}
+    if text not in states:
         raise ValueError(text)
-    return text
+    return states[text]
 
 
 def _row_ends(path: Path) -> list[int]:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from catstream.video.frames import ffmpeg_reason
+from catstream.video.frames import ffmpeg_reason, time_base
+
+if TYPE_CHECKING:
+    from av import AudioStream, Packet
+    from av.container import InputContainer, OutputContainer
 
 __all__ = ["Sound"]
 
@@ -22,8 +26,8 @@ class Sound:
     container : `av.container.OutputContainer` to copy to, before its first packet
     """
 
-    def __init__(self, path: Path | None, container: Any) -> None:
-        self._source: Any = None
+    def __init__(self, path: Path | None, container: OutputContainer) -> None:
+        self._source: InputContainer | None = None
         if path is None:
             return
         import av
@@ -43,11 +47,11 @@ class Sound:
             _log.warning("the sound of %s is left out: %s", path, error)
             source.close()
             return
-        picture: Any = source.streams.video[0]
-        self._zero = float((picture.start_time or 0) * picture.time_base)
+        picture = source.streams.video[0]
+        self._zero = float((picture.start_time or 0) * time_base(picture))
         self._source, self._container = source, container
         self._packets = source.demux(self._stream)
-        self._next: Any = None
+        self._next: Packet[AudioStream] | None = None
 
     def copy(self, start: float, end: float) -> None:
         """Copy the sound from `start` up to `end`, in seconds of the source. Calls must be in order of time."""

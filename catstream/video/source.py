@@ -28,14 +28,19 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 import cv2
 import numpy as np
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason
+from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, time_base
+
+if TYPE_CHECKING:
+    from av import Packet, VideoFrame, VideoStream
+    from av.container import InputContainer
+    from av.stream import Stream
 
 __all__ = ["ALL_FRAMES", "image_files", "is_live", "natural_order", "open_source", "without_scheme"]
 
@@ -234,7 +239,7 @@ def image_files(path: Path) -> list[Path]:
     return sorted(files, key=natural_order)
 
 
-def natural_order(path: Path) -> list[Any]:
+def natural_order(path: Path) -> list[tuple[int, str]]:
     """Sort key by which 10 comes after 2."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
@@ -315,14 +320,16 @@ def _count_frames(path: Path, rate: float) -> int | None:
         return count or None
 
 
-def _read_video(path: Path, container: Any, rate: float, wanted: range, start: int, damage: _Damage) -> Iterator[Frame]:
+def _read_video(
+    path: Path, container: InputContainer, rate: float, wanted: range, start: int, damage: _Damage
+) -> Iterator[Frame]:
     stream = container.streams.video[0]
     stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
     number, time, zero, shape, upright = 0, 0.0, None, None, UprightConverter()
     with container:
         for frame in _good_frames(container, stream, rate, damage):
             zero = frame.pts if zero is None else zero
-            time = number / rate if frame.pts is None else float((frame.pts - zero) * stream.time_base)
+            time = number / rate if frame.pts is None else float((frame.pts - (zero or 0)) * time_base(stream))
             if number in wanted[start:]:
                 image = upright(frame)
                 if shape is not None and image.shape != shape:
@@ -362,7 +369,7 @@ class _Damage:
             )
 
 
-def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> Iterator[Any]:
+def _good_frames(container: InputContainer, stream: VideoStream, rate: float, damage: _Damage) -> Iterator[VideoFrame]:
     """Yield the undamaged frames in order, and report each damage between them to `damage`."""
     import av
 
@@ -371,7 +378,7 @@ def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> I
         if waits_for_key and packet is not None and packet.size and not packet.is_keyframe:
             continue
         waits_for_key = False
-        frames: list[Any] = []
+        frames: list[VideoFrame] = []
         if not problem:
             try:
                 frames = stream.codec_context.decode(packet)
@@ -383,7 +390,7 @@ def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> I
         for frame in frames:
             gap = 1.0
             if last is not None and frame.pts is not None:
-                gap = float((frame.pts - last) * stream.time_base) * rate
+                gap = float((frame.pts - last) * time_base(stream)) * rate
             if frame.is_corrupt or (problem and gap > 1.5):
                 problem = problem or "its picture is damaged"
                 break
@@ -398,7 +405,9 @@ def _good_frames(container: Any, stream: Any, rate: float, damage: _Damage) -> I
             stream.codec_context.flush_buffers()
 
 
-def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, str]]:
+def _packets(
+    container: InputContainer, stream: VideoStream, rate: float
+) -> Iterator[tuple[Packet[Stream] | None, str]]:
     """Yield each packet with a description of the damage before or in it, "" if there is none. The last packet is the
     empty one that flushes the decoder."""
     import av
@@ -427,14 +436,14 @@ def _packets(container: Any, stream: Any, rate: float) -> Iterator[tuple[Any, st
             yield packet, f"its stated duration is {stated:.1f} s, it ends at {end:.1f} s" if short else ""
             return
         if packet.pts is not None:
-            end = max(end, float((packet.pts + (packet.duration or 0) - (stream.start_time or 0)) * stream.time_base))
+            end = max(end, float((packet.pts + (packet.duration or 0) - (stream.start_time or 0)) * time_base(stream)))
         yield packet, "data is missing" if packet.is_corrupt or missing else ""
 
 
-def _stated_duration(container: Any, stream: Any) -> float:
+def _stated_duration(container: InputContainer, stream: VideoStream) -> float:
     """Return the duration that the container states for the video stream in seconds, 0 if it states none."""
     if stream.duration:
-        return float(stream.duration * stream.time_base)
+        return float(stream.duration * time_base(stream))
     if clock := re.fullmatch(r"(\d+):(\d+):([\d.]+)", stream.metadata.get("DURATION", "")):
         return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3])
     # The container's duration is that of its longest stream, so it counts only if the video is the only stream.
