@@ -25,7 +25,7 @@ from table import Table, command, publish
 
 with atheris.instrument_imports(include=["catstream"]):
     from catstream import storage
-    from catstream.box import Box
+    from catstream.box import Box, Window
     from catstream.compression.compressor import Compressor
     from catstream.errors import CatstreamError, ProtocolError, RecordingError, ServiceError, SettingsError
     from catstream.heads import GROUPS
@@ -90,7 +90,9 @@ def value(field: Field, full: bool, d: int) -> Any:
         return get_args(field.type)[0 if full else -1]
     if get_origin(field.type) is tuple:
         return (3, 1, 0)
-    return {bool: full, int: 4, float: 0.75, str: "7f", Box: Box(4.5, 3.0, 20.0, 10.0)}[field.type]
+    if field.type in (Box, Window):
+        return field.type(4.5, 3.0, 20.0, 10.0)
+    return {bool: full, int: 4, float: 0.75, str: "7f"}[field.type]
 
 
 def decoders(folder: Path) -> dict[str, Decoder]:

@@ -67,11 +67,11 @@ class Stream:
     """Messages without end, of rows that a detector cut from a video."""
 
     def __init__(self, sequence: Sequence, frames: int, settings: Settings) -> None:
-        lessons = list(cut(sequence, frames, settings))
-        seen = _all(lessons, APPEARANCE)
+        features = list(cut(sequence, frames, settings))
+        seen = _all(features, APPEARANCE)
         self._object, self._background = seen.rows[seen.labels == 1], seen.rows[seen.labels == 0]
-        self._extents = _all(lessons, EXTENT)
-        self._box, self._random = lessons[-1].box, np.random.default_rng(settings.run.seed)
+        self._extents = _all(features, EXTENT)
+        self._box, self._random = features[-1].box, np.random.default_rng(settings.run.seed)
 
     def message(self, seq: int) -> Features:
         """A row of the object, one of the background and two of its extent."""
@@ -84,9 +84,9 @@ class Stream:
         return Features(seq, seq - 1, (seq - 1) / 25, self._box, training)
 
 
-def _all(lessons: list[Features], group: str) -> TrainingRows:
+def _all(features: list[Features], group: str) -> TrainingRows:
     """The training rows of a group of all frames."""
-    found = [features.training[group] for features in lessons if group in features.training]
+    found = [each.training[group] for each in features if group in each.training]
     return sum(found[1:], start=found[0])
 
 
@@ -108,9 +108,9 @@ def cut(sequence: Sequence, frames: int, settings: Settings) -> Iterator[Feature
     """What the first frames of a sequence teach."""
     detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
     for number, image in zip(range(frames), sequence.frames(), strict=False):
-        _, lesson = detector.step(image) if number else detector.init(image, Box(*sequence.boxes[0]))
-        yield lesson
-        if (sample := compressor.take(lesson)) is not None:
+        _, features = detector.step(image) if number else detector.init(image, Box(*sequence.boxes[0]))
+        yield features
+        if (sample := compressor.take(features)) is not None:
             detector.adopt(trainer.train(sample))
 
 

@@ -25,7 +25,7 @@ WINDOW = Settings().run.unstored_frames
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    features, messages = lesson(), 50 if options.quick else options.messages
+    features, messages = features_of_a_frame(), 50 if options.quick else options.messages
     count = sum(map(len, features.training.values()))
     megabytes = sum(training.rows.nbytes for training in features.training.values()) / 1e6
     rows = []
@@ -38,8 +38,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield Table("Features, sent and acknowledged", columns, rows, note)
 
 
-def lesson() -> Features:
-    """What an ordinary frame teaches."""
+def features_of_a_frame() -> Features:
+    """The message of an ordinary frame."""
     sequence, detector = rendered(2, (320, 240)), Detector(Settings())
     first, second = sequence.frames()
     detector.init(first, Box(*sequence.boxes[0]))

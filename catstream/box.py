@@ -1,27 +1,24 @@
-"""`Box`: an axis-aligned rectangle in pixels, `x, y, w, h`, the format of the public benchmarks."""
+"""Boxes and windows: axis-aligned rectangles in pixels, `x, y, w, h`.
+
+A `Box` is what is reported: tight around the object, as the benchmarks write it. A `Window` is what is cut from the
+frame, searched and learned from: the box with some of its surroundings, `context` times as wide and high. They are two
+types, so that mypy finds where one stands for the other. `Window.of` and `Window.box` convert.
+"""
 
 from __future__ import annotations
 
 import math
 import reprlib
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from catstream.errors import BoxError
 
-__all__ = ["Box"]
+__all__ = ["Box", "Window"]
 
 
-class Box(NamedTuple):
-    """A rectangle in pixels: top left corner, width and height.
-
-    Examples
-    --------
-    >>> Box(10, 20, 30, 40).centre
-    (25.0, 40.0)
-    >>> Box(0, 0, 10, 10).overlap(Box(5, 0, 10, 10))
-    0.3333333333333333
-    """
+class _Rectangle(NamedTuple):
+    """A rectangle in pixels: its top left corner, its width and its height."""
 
     x: float
     y: float
@@ -30,28 +27,25 @@ class Box(NamedTuple):
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Centre of the box, (x, y)."""
+        """The point in the middle, (x, y)."""
         return self.x + self.w / 2, self.y + self.h / 2
 
     @property
     def area(self) -> float:
-        """Area in square pixels."""
+        """Square pixels."""
         return self.w * self.h
 
-    def scaled(self, across: float, down: float | None = None) -> Box:
-        """Return the box with the same centre, `across` times the width and `down` times the height.
-
-        If `down` is None, the height is scaled by `across` too.
-        """
+    def scaled(self, across: float, down: float | None = None) -> Self:
+        """The same centre, `across` times the width and `down` times the height (`across` if None)."""
         w, h = self.w * across, self.h * (across if down is None else down)
-        return Box(self.x + (self.w - w) / 2, self.y + (self.h - h) / 2, w, h)
+        return type(self)(self.x + (self.w - w) / 2, self.y + (self.h - h) / 2, w, h)
 
-    def centred(self, x: float, y: float) -> Box:
-        """Return a box of the same size with another centre."""
-        return Box(x - self.w / 2, y - self.h / 2, self.w, self.h)
+    def centred(self, x: float, y: float) -> Self:
+        """The same size around another centre."""
+        return type(self)(x - self.w / 2, y - self.h / 2, self.w, self.h)
 
-    def with_centre_in(self, width: int, height: int) -> Box:
-        """Return the box, moved if necessary so that its centre is inside a frame of this size.
+    def with_centre_in(self, width: int, height: int) -> Self:
+        """Moved, if necessary, until its centre lies in a frame of this size.
 
         Examples
         --------
@@ -61,8 +55,8 @@ class Box(NamedTuple):
         x, y = self.centre
         return self.centred(min(max(x, 0), width - 1), min(max(y, 0), height - 1))
 
-    def overlap(self, other: Box) -> float:
-        """Return the intersection over union with another box, from 0 to 1."""
+    def overlap(self, other: Self) -> float:
+        """Intersection over union, 0 to 1: the overlap score S of the benchmarks."""
         w = min(self.x + self.w, other.x + other.w) - max(self.x, other.x)
         h = min(self.y + self.h, other.y + other.h) - max(self.y, other.y)
         if w <= 0 or h <= 0:
@@ -70,14 +64,28 @@ class Box(NamedTuple):
         shared = w * h
         return shared / (self.area + other.area - shared)
 
+
+class Box(_Rectangle):
+    """Where an object is: its top left corner, its width and its height, in pixels of the frame.
+
+    Examples
+    --------
+    >>> Box(10, 20, 30, 40).centre
+    (25.0, 40.0)
+    >>> Box(0, 0, 10, 10).overlap(Box(5, 0, 10, 10))
+    0.3333333333333333
+    """
+
+    __slots__ = ()
+
     @classmethod
     def parse(cls, value: str | Iterable[float]) -> Box:
-        """Make a box from four numbers or from a text `x,y,w,h`, separated by commas, blanks or tabs.
+        """Read a box as people write it: four numbers, or a text `x,y,w,h` (commas, blanks or tabs between them).
 
         Raises
         ------
         BoxError
-            If the value is not four numbers.
+            If these are not four numbers.
 
         Examples
         --------
@@ -97,22 +105,22 @@ class Box(NamedTuple):
         return cls(x, y, w, h)
 
     def validated(self, width: int, height: int) -> Box:
-        """Return the box unchanged if tracking can start with it in a frame of this size.
+        """This box, after a check that tracking can start with it in a frame of this size.
 
         Raises
         ------
         BoxError
-            If a number is not finite, the width or height is less than 2 pixels or more than twice that of the frame,
-            or the centre is outside the frame.
+            If a number is not finite, the box has no area, it is more than twice as wide or high as the frame, or its
+            centre lies outside the frame.
         """
         if not all(math.isfinite(value) for value in self):
             raise BoxError(f"a box needs four finite numbers, got {self}: give x,y,w,h in pixels")
         if self.w < 2 or self.h < 2:
             raise BoxError(f"a box needs a width and a height of at least 2 pixels, got {self.w:g} x {self.h:g}")
-        # With its centre inside the frame, such a box covers the whole frame: it does not select an object.
+        # Such a box covers the frame from edge to edge, wherever in it its centre lies: it says nothing of an object.
         if self.w > 2 * width or self.h > 2 * height:
             raise BoxError(
-                f"a box may be at most twice as wide and high as the frame of {width} x {height} pixels, got "
+                f"a box may be twice as wide and high as the frame of {width} x {height} pixels, got "
                 f"{self.w:g} x {self.h:g}: draw it tight around the object"
             )
         x, y = self.centre
@@ -125,3 +133,27 @@ class Box(NamedTuple):
 
     def __str__(self) -> str:
         return ",".join(f"{value:g}" for value in self)
+
+
+class Window(_Rectangle):
+    """What the features of an object are computed from: its box with some of its surroundings.
+
+    Examples
+    --------
+    >>> window = Window.of(Box(10, 20, 40, 80), context=1.25)
+    >>> window
+    Window(x=5.0, y=10.0, w=50.0, h=100.0)
+    >>> window.box(context=1.25)
+    Box(x=10.0, y=20.0, w=40.0, h=80.0)
+    """
+
+    __slots__ = ()
+
+    @classmethod
+    def of(cls, box: Box, context: float) -> Self:
+        """The window of a box, `context` times as wide and high, with the same centre."""
+        return cls(*box).scaled(context)
+
+    def box(self, context: float) -> Box:
+        """The box of a window: the inverse of `of`."""
+        return Box(*self.scaled(1 / context))

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
-from catstream.box import Box
+from catstream.box import Box, Window
 from catstream.heads import GROUPS, HEADS
 from catstream.schema import Array, Bytes, Named, OnlyWith, Whole
 
@@ -31,6 +31,7 @@ __all__ = [
     "End",
     "Features",
     "Health",
+    "Level",
     "Model",
     "Motion",
     "Position",
@@ -46,6 +47,8 @@ __all__ = [
 ]
 
 State = Literal["bootstrapping", "present", "absent"]
+
+Level = Literal["lost", "redetected", "weak", "confident"]
 
 Verb = Literal["set-box", "pause", "resume", "save", "stop"]
 
@@ -68,31 +71,33 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class DetectorState:
-    """What a detector needs to go on after a frame, besides the newest model.
+    """All that a detector knows after a frame, besides the model: with both, another one goes on bit for bit.
 
-    state      as in `Track`
-    window     where it looks next
-    sure       where it was when it was last sure
-    first      where it was in its first frame, None while it was not found yet
-    usual      score that the object usually has
-    elsewhere  whether it was found by a search of the whole frame, and is not trusted yet
-    motion     the Kalman filter's parameters, None before it has any
-    centre     the filter's mean (x, y, and their speeds) above its covariance; None before it has any
-    balance    where the object's colours lie in its window: frames taken in, contrast, the first
-               centre's x and y, the present one's; None where nothing is known of it
-    sightings  frames in a row in which an object that is not found yet was seen at one place
+    first_frame       the object's first; a model of frames before it is of another object
+    level             of the belief that the object was found, see `catstream.detection.belief`
+    window            where the object was; the next search begins there
+    confident_window  the same in the last frame in which the belief was confident
+    first_window      the same in the first frame; None while the object of a saved model has not been found
+    trusted           false after the object was found again elsewhere in the frame, until its score is high
+    usual_score       running mean of the score in the frames in which the object was present
+    sightings         frames in a row in which the object of a saved model was seen in one place
+    motion            of the Kalman filter of the centre, None before a model had any
+    centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
+    colour_centroid   where in the window the object's colours are: frames taken in, contrast, x and y at first, x and y
+                      now; None before the first of these frames
     """
 
-    state: State
-    window: Box
-    sure: Box
-    first: Box | None
-    usual: float
-    elsewhere: bool
+    first_frame: int
+    level: Level
+    window: Window
+    confident_window: Window
+    first_window: Window | None
+    trusted: bool = True
+    usual_score: float = 0.0
+    sightings: int = 0
     motion: Motion | None = None
     centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None
-    balance: Annotated[np.ndarray, Array("float64", (6,))] | None = None
-    sightings: int = 0
+    colour_centroid: Annotated[np.ndarray, Array("float64", (6,))] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

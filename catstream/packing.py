@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import numpy as np
 
-from catstream.box import Box
+from catstream.box import Box, Window
 from catstream.schema import Array, Field, fields
 
 __all__ = ["pack", "unpack"]
@@ -75,8 +75,8 @@ def _unpack(field: Field, fact: Any, name: str, arrays: Arrays) -> Any:
         return {key: _unpack(field.values, entry, f"{name}.{key}", arrays) for key, entry in fact.items()}
     if field.is_message:
         return unpack(field.type, arrays, fact, name)
-    if field.type is Box:
-        return Box(*map(float, fact))
+    if field.type in (Box, Window):
+        return field.type(*map(float, fact))
     if get_origin(field.type) is tuple:
         return tuple(map(int, fact))
     if get_origin(field.type) is Literal:

@@ -148,7 +148,7 @@ class Tracker:
         track = self.track
         arrays, facts = self.compressor.state()
         model, model_facts = pack(self.detector.model, "model")
-        start, start_facts = self.detector.bootstrap_state()
+        start, start_facts = self.detector.scm_state()
         told: dict[str, object] = {
             "kind": _KIND,
             "program": version("catstream"),
@@ -200,7 +200,7 @@ class Tracker:
         if state is None:
             raise ValueError("it does not say where the object was")
         self.detector.resume(seq, state, model)
-        self.detector.resume_bootstrap(arrays, facts["bootstrap"])
+        self.detector.resume_scm(arrays, facts["bootstrap"])
         height, width = facts["size"]
         self._size = int(height), int(width)
         self._track = unpack(Track, arrays, facts["track"], "track")

@@ -246,7 +246,7 @@ class DetectorLoop:
         due = features.sent - (0 if settings.run.lockstep else settings.run.lag_frames)
         live = self._source is not None and self._source.live
         while not live and not self.over:
-            match awaited(due, features.taken, features.made(due), self.detector.heard):
+            match awaited(due, features.taken, features.made(due), self.detector.newest_version):
                 case Awaited.NOTHING:
                     return
                 case Awaited.TAKEN:

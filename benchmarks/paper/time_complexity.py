@@ -20,9 +20,9 @@ sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
 from sequences import named
 from table import Table, command, publish
 
-from catstream.box import Box
+from catstream.box import Window
 from catstream.compression.tree import CoresetTree
-from catstream.detection import affine
+from catstream.detection.teacher import affine_copies
 from catstream.evaluation.datasets import Sequence
 from catstream.features.cells import row_length
 from catstream.features.pyramid import Pyramid
@@ -54,7 +54,7 @@ def points_of(sequence: Sequence, count: int) -> np.ndarray:
     present = int(np.isfinite(sequence.boxes).all(axis=1).sum())
     copies, rng = -(-count // present), np.random.default_rng(0)
     rows = [
-        affine.copies(Pyramid(image), Box(*box), copies, rng)
+        affine_copies(Pyramid(image), Window(*box), copies, rng)
         for image, box in zip(sequence.frames(), sequence.boxes, strict=True)
         if np.isfinite(box).all()
     ]

@@ -1,4 +1,8 @@
-"""The detector: frames in, tracks and features out (paper, "Classification")."""
+"""The detector: frames in, tracks and training rows out (paper, "Classification").
+
+`step` is a pure function: the same state, frame, model and settings give the same result. `Detector` holds the state
+and the model from one frame to the next.
+"""
 
 from __future__ import annotations
 
@@ -7,63 +11,95 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from catstream.box import Box
-from catstream.detection import bootstrap, extent, lessons, search
-from catstream.detection.balance import Balance
-from catstream.detection.lessons import Lesson
-from catstream.detection.motion import CentreFilter
-from catstream.detection.search import Found
+from catstream.box import Box, Window
+from catstream.detection import belief, colour_centroid, extent, motion, search, teacher
+from catstream.detection.search import Detection, ScoreMap
+from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import COLOURS, row_length
 from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.heads import APPEARANCE, EXTENT
-from catstream.messages import DetectorState, Features, Model, State, Track, TrainingRows
+from catstream.messages import DetectorState, Features, Model, State, Track
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel
 
-__all__ = ["Detector"]
+__all__ = ["Detector", "step"]
 
-_USUAL_RATE = 0.01  # share that a frame has in the score that the object usually has
-_AGAIN_OVERLAP = 0.3  # above which two windows in successive frames are the same object
-_SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that is not found yet
+
+def step(
+    state: DetectorState,
+    frame: Pyramid,
+    seq: int,
+    time: float,
+    model: Model,
+    settings: Settings,
+    found: Detection | None = None,
+) -> tuple[DetectorState, Track, Training]:
+    """Find the object in the next frame, and cut the training rows that the belief in the detection allows.
+
+    Costs the same for every frame: a few small patches around the object, and the whole frame if the belief is low (or
+    always, if `search.mode` is "full").
+
+    Parameters
+    ----------
+    seq, time : of the frame's messages
+    found : what the paper's first tracker found, in place of a search; it never reports the object as absent
+    """
+    if found is not None:
+        level = belief.level_of(found.score, belief.ALWAYS, True, settings.belief)
+        state = replace(state, level=level, window=found.window)
+    else:
+        state = motion.expected(state)
+        state, found = search.searched(frame, state, seq, model, settings)
+        state = belief.updated(state, found.score, found.redetected, settings.belief)
+        if belief.policies(settings)[state.level].reported:
+            state = _followed(state, found, frame.size, model, settings)
+            state = motion.observed(state)
+    training = teacher.training_of(frame, found, state, seq, model, settings)
+    return state, _track(state, seq, time, found.score, model, settings), training
+
+
+def _followed(
+    state: DetectorState, found: Detection, size: tuple[int, int], model: Model, settings: Settings
+) -> DetectorState:
+    """The state with the window moved to a detection, as far as the belief in it allows."""
+    policy, colours = belief.policies(settings)[state.level], state.colour_centroid
+    window = extent.followed(state.window, found.window, found.score >= policy.resize, settings.extent)
+    if found.around is not None and found.score >= policy.recentre:
+        slack, weights = settings.extent.colour_slack, model.weights[COLOURS]
+        colours, window = colour_centroid.recentred(colours, window, found.around, weights, slack)
+    window = window.with_centre_in(*size)
+    confident = window if found.score >= policy.remember else state.confident_window
+    return replace(state, window=window, confident_window=confident, colour_centroid=colours)
+
+
+def _track(state: DetectorState, seq: int, time: float, score: float, model: Model, settings: Settings) -> Track:
+    box = None if state.level == "lost" else state.window.box(settings.search.context)
+    reported: State = "absent" if box is None else "present" if model.version else "bootstrapping"
+    return Track(seq, seq - 1, time, reported, box, float(score), model.version)
 
 
 class Detector:
-    """Finds the object in each frame with the newest model, and cuts out what the frame teaches.
+    """Follows one object with the newest model.
 
-    Costs the same for every frame: a few small images around the object; the whole
-    frame where it is not sure (or always, `detection="full"`).
-
-    Call `init` with the first frame, or `seek` before it, then `step` for every other; `adopt` models as they come.
+    Call `init` with the first frame, or `seek` before it, then `step` for every other; `adopt` models as they arrive.
 
     Attributes
     ----------
     seq : of the last message
+    state : after the last frame, None before there is an object; with the model, and SCM if it is in use, all there is
     model : the one in use
-    heard : version of the newest model that came, in use or not
+    newest_version : of the models that arrived, in use or not
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.seq = 0
-        self.state: State = "bootstrapping"
+        self.state: DetectorState | None = None
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
-        self.heard = 0
-        self._started = False  # whether there is anything to follow
-        self._forget()
-
-    def _forget(self) -> None:
-        """All but the stream of messages, which goes on."""
-        self._first_frame = self.seq  # of this object: an older model is of another one
-        self._usual_score = 0.0
-        self._elsewhere = False  # found by a search of the whole frame, and not trusted yet
-        self._sightings = 0  # frames in a row in which a saved model saw its object at one place
-        self._first_box: Box | None = None  # None while it was not found yet
-        self._centre: CentreFilter | None = None
-        self._balance = Balance()
+        self.newest_version = 0
         self._scm: SparseCollaborativeModel | None = None
 
     def prepare(self) -> None:
@@ -76,10 +112,10 @@ class Detector:
     @property
     def box(self) -> Box | None:
         """Where the object was last, in pixels; None before the first frame."""
-        return self._box.scaled(1 / self.settings.search.context) if self.seq and self._started else None
+        return self.state.window.box(self.settings.search.context) if self.seq and self.state else None
 
     def init(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
-        """Start on a box; what was followed before is forgotten.
+        """Start with the box of an object; another one before it is forgotten.
 
         Parameters
         ----------
@@ -90,35 +126,26 @@ class Detector:
         Raises
         ------
         BoxError
-            For a box that is no start for this frame (see `Box.inside`), or looks like what is around it.
-            Nothing is forgotten then.
+            If tracking cannot start with the box in this frame (see `Box.validated`), or if the object looks like
+            what is around it. The detector stays as it was.
         """
-        frame = Pyramid.of(image)
-        # The window is wider than the object: the edge of an object tells most about where it is.
+        frame, scm = Pyramid.of(image), None
         box = Box(*map(float, box)).validated(*frame.size)
-        window, scm = box.scaled(self.settings.search.context), None
+        window, rng = Window.of(box, self.settings.search.context), (self.settings.run.seed, self.seq)
         if self.settings.teaching.bootstrap == "scm":
             from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
-            scm = SparseCollaborativeModel(image, box, self._random())
-            lesson = lessons.near(frame, window, None, self._random(), self.settings)
-            lesson = lessons.with_extents(lesson, frame, window, self.settings)
-        else:
-            lesson = lessons.first(frame, window, self._random(), self.settings)
-        model = bootstrap.stand_in(lesson)
-        lesson += lessons.far(frame, window, model, self.settings)
-        model = bootstrap.stand_in(lesson)
-        self._forget()
-        self._box = self._sure_box = self._first_box = window
-        self.model, self._scm, self._started = model, scm, True
-        self.seq, self.state = self.seq + 1, "bootstrapping"
-        return self._answer(time, 1.0, lesson, begins=True)
+            scm = SparseCollaborativeModel(image, box, np.random.default_rng(rng))
+        model, training = teacher.first_training(frame, window, np.random.default_rng(rng), self.settings)
+        self.state, self.model, self._scm = DetectorState(self.seq, "confident", window, window, window), model, scm
+        self.seq += 1
+        return self._messages(_track(self.state, self.seq, time, 1.0, model, self.settings), training, begins=True)
 
     def seek(self, model: Model, box: Box) -> None:
         """Start with a model: the object is absent until it is found, in whichever frame and size that is.
 
-        It is found at the window that scores `belief.sighting_lead` higher than the rest of the frame, in
-        `belief.sighting_frames` frames in a row: of two objects that look alike, neither.
+        It is found at the window that scores `sighting_lead` higher than the rest of the frame, in `sighting_frames`
+        frames in a row: of two objects that look alike, neither.
 
         Parameters
         ----------
@@ -127,16 +154,30 @@ class Detector:
         Raises
         ------
         ProtocolError
-            For a model of other features.
+            If the model is of other features.
         """
         if len(model.weights) != row_length():
             raise ProtocolError(
                 f"the model has {len(model.weights)} weights, the features of a window are {row_length()}: "
                 "learn it anew with this catstream"
             )
-        self._box = self._sure_box = box.scaled(self.settings.search.context)
-        self.state, self._started = "absent", True
-        self.adopt(model)
+        window = Window.of(box, self.settings.search.context)
+        self.state = DetectorState(0, "lost", window, window, None)
+        self.model, self.newest_version = model, model.version
+
+    def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
+        """Find the object in the next frame."""
+        if self.state is None:
+            raise BoxError("there is no box to follow yet: call init with a frame and a box first")
+        frame = Pyramid.of(image)
+        self.seq += 1
+        found = None
+        if self._scm is not None:
+            score, box = self._scm.step(image)
+            found = Detection(score, Window.of(box, self.settings.search.context).with_centre_in(*frame.size))
+        state = self.state
+        self.state, track, training = step(state, frame, self.seq, time, self.model, self.settings, found)
+        return self._messages(track, training)
 
     def correct(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
         """Go on with the same object at another box, whatever a search would have found.
@@ -144,41 +185,47 @@ class Detector:
         Raises
         ------
         BoxError
-            As `init` does.
+            If there is no object yet, or as `init` does.
         """
+        if self.state is None:
+            raise BoxError("there is no box to follow yet: call init with a frame and a box first")
         frame = Pyramid.of(image)
-        self._box = self._sure_box = Box(*map(float, box)).validated(*frame.size).scaled(self.settings.search.context)
-        self.seq, self.state = self.seq + 1, "present"
-        self._elsewhere, self._first_box = False, self._first_box or self._box
-        self._balance = Balance()  # this box says anew where in it the colours lie
-        if self._centre is not None:
-            self._centre.predict()
-            self._centre.update(self._box.centre)
-        score = float(search.scored_around(frame, self._box, WINDOW, self.model).scores[0, 0])
-        lesson = lessons.near(frame, self._box, self.model, self._random(), self.settings)
-        lesson = lessons.with_extents(lesson, frame, self._box, self.settings)
-        return self._answer(time, score, lesson)
+        window = Window.of(Box(*map(float, box)).validated(*frame.size), self.settings.search.context)
+        self.seq += 1
+        self.state = motion.observed(
+            replace(
+                motion.expected(self.state),
+                level="confident",
+                trusted=True,
+                window=window,
+                confident_window=window,
+                first_window=self.state.first_window or window,
+                colour_centroid=None,  # this box shows anew where in it the colours are
+            )
+        )
+        score = float(ScoreMap.around(frame, window, WINDOW, self.model).scores[0, 0])
+        training = teacher.training_at(frame, window, self.seq, self.model, self.settings)
+        return self._messages(_track(self.state, self.seq, time, score, self.model, self.settings), training)
 
     def miss(self, time: float = 0.0) -> tuple[Track, Features]:
-        """Let a frame pass unseen: the object counts as absent."""
-        self.seq, self.state = self.seq + 1, "absent"
-        return self._answer(time, 0.0, Lesson.none())
+        """Let a frame pass without a search: the object counts as absent."""
+        self.seq += 1
+        if self.state is not None:
+            self.state = replace(self.state, level="lost")
+        track = Track(self.seq, self.seq - 1, time, "absent", None, 0.0, self.model.version)
+        return self._messages(track, {})
 
     def adopt(self, model: Model) -> None:
-        """Go on with a model, unless it is older than the newest that came, or of an object before this one."""
-        if model.version <= self.heard:
+        """Go on with a model, unless it is older than the newest that arrived, or of an object before this one."""
+        if model.version <= self.newest_version:
             return
-        self.heard = model.version
-        if model.frame < self._first_frame or not self._started:
-            return
-        self.model, self._scm = model, None
-        if model.motion is not None and self.seq:
-            if self._centre is None:
-                self._centre = CentreFilter(model.motion, self._box.centre)
-            else:
-                self._centre.adopt(model.motion)
+        self.newest_version = model.version
+        if self.state is not None and model.frame >= self.state.first_frame:
+            self.model, self._scm = model, None
+            if model.motion is not None:
+                self.state = replace(self.state, motion=model.motion)
 
-    def resume(self, seq: int, detector: DetectorState, model: Model) -> None:
+    def resume(self, seq: int, state: DetectorState, model: Model) -> None:
         """Go on after message `seq` of a stream that another detector began.
 
         With the model that the other one had by then, it goes on as that would have, bit for bit.
@@ -186,158 +233,28 @@ class Detector:
         Parameters
         ----------
         seq : the last Features that is stored
-        detector : that of that message, or `state_at` where the object was last
+        state : that of this message, or `state_at` the box where the object was last
         model : the newest there is
         """
-        self.seq, self.state, self._started = seq, detector.state, True
-        self._first_box = detector.first
-        self._box, self._sure_box = detector.window, detector.sure
-        self._usual_score, self._elsewhere = detector.usual, detector.elsewhere
-        self._sightings = detector.sightings
-        if detector.motion is not None and detector.centre is not None:
-            self._centre = CentreFilter.resumed(detector.motion, detector.centre, detector.state != "absent")
-        if detector.balance is not None:
-            self._balance = Balance.resumed(detector.balance)
-        if not model.version:
-            self.model = model  # what stands in before the first one
-        self.adopt(model)
+        self.seq, self.model, self.newest_version = seq, model, model.version
+        self.state = state if model.motion is None else replace(state, motion=model.motion)
 
-    def bootstrap_state(self) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
-        """Arrays and facts of the sparse collaborative model, for `resume_bootstrap`; none if it is not in use."""
+    def state_at(self, box: Box, first: Box) -> DetectorState:
+        """The state if nothing is known but the boxes of the object in the last frame and in its first one."""
+        context = self.settings.search.context
+        window = Window.of(box, context)
+        return DetectorState(0, "confident", window, window, Window.of(first, context))
+
+    def scm_state(self) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
+        """Arrays and facts of the paper's first tracker, for `resume_scm`; none if it is not in use."""
         return ({}, None) if self._scm is None else self._scm.state()
 
-    def resume_bootstrap(self, arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> None:
-        """Go on with the sparse collaborative model that another detector followed the object by, after `resume`."""
+    def resume_scm(self, arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> None:
+        """Go on with the paper's first tracker, as another detector did; after `resume`."""
         if facts is not None:
             from catstream.paper.scm import SparseCollaborativeModel
 
             self._scm = SparseCollaborativeModel.resumed(arrays, facts)
 
-    def state_at(self, box: Box, first: Box) -> DetectorState:
-        """Where nothing is known but where the object was last, and in its first frame."""
-        window = box.scaled(self.settings.search.context)
-        return DetectorState("present", window, window, first.scaled(self.settings.search.context), 0.0, False)
-
-    def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
-        """Find the object in the next frame."""
-        settings = self.settings
-        if not self._started:
-            raise BoxError("there is no box to follow yet: call init with a frame and a box first")
-        self.seq += 1
-        if self._centre is not None:
-            self._box = self._box.centred(*self._centre.predict())
-        frame = Pyramid.of(image)
-        if self._scm is not None:
-            score, box = self._scm.step(image)  # it has no word for absent
-            self._box = box.scaled(settings.search.context).with_centre_in(*frame.size)
-            return self._answer(time, score, self._lesson(frame, Found(score, self._box)))
-        found = self._find(frame) if self._first_box else self._seek(frame)
-        self._elsewhere &= found.score < settings.belief.trust_score
-        there = self._first_box is not None and self._there(found.score)
-        if there:
-            self.state = "present" if self.model.version else "bootstrapping"
-            self._box = self._balanced(extent.followed(self._box, found, settings), found).with_centre_in(*frame.size)
-            if found.score >= settings.belief.confident_score:
-                self._sure_box = self._box
-        else:
-            self.state = "absent"
-        if self._centre is not None:
-            self._centre.update(self._box.centre if there else None)
-        return self._answer(time, found.score, self._lesson(frame, found) if there else Lesson.none())
-
-    def _there(self, score: float) -> bool:
-        """Whether the best score in a frame is the object's: high enough, also for what this one usually scores."""
-        settings = self.settings
-        if self.state == "absent":
-            there = score >= max(settings.belief.return_score, settings.belief.return_share * self._usual_score)
-        else:
-            there = score >= max(settings.belief.present_score, settings.belief.present_share * self._usual_score)
-        if there:
-            self._usual_score += _USUAL_RATE * (score - self._usual_score)
-        return there
-
-    def _balanced(self, box: Box, found: Found) -> Box:
-        """The box, drawn after the object's colours if it crept off them."""
-        settings = self.settings
-        if found.around is None or self._elsewhere or found.score < settings.belief.extent_score:
-            return box
-        return self._balance.drawn(box, found.around, self.model.weights[COLOURS], settings.extent.colour_slack)
-
-    def _find(self, frame: Pyramid) -> Found:
-        settings = self.settings
-        surely = self._sure_box.centred(*self._box.centre)  # as large as it surely was
-        if settings.search.mode == "full":
-            doubtful = self._elsewhere or self.state == "absent"
-            found = self._fitted(frame, search.whole(frame, surely if doubtful else self._box, self.model, settings))
-            self._elsewhere |= not found.box.overlap(self._box)
-            return found
-        found = self._fitted(frame, search.local(frame, self._box, self.model, settings))
-        lost = found.score < settings.belief.lost_score
-        unsure = found.score < settings.belief.confident_score or self._elsewhere
-        if lost or (unsure and self.seq % settings.search.whole_interval == 0):
-            other = search.whole(frame, surely, self.model, settings)
-            if other.score > settings.belief.return_score and other.score > found.score + settings.belief.jump_margin:
-                other = self._fitted(frame, search.local(frame, other.box, self.model, settings))
-                if other.score > found.score:
-                    self._elsewhere = True
-                    return other
-        return found
-
-    def _seek(self, frame: Pyramid) -> Found:
-        """The best window of the whole frame, of any size that the object may have.
-
-        The object counts as found once this window has led the rest of the frame at one place in several
-        frames in a row. While nothing scores high, each frame is searched at a third of the sizes.
-        """
-        settings = self.settings
-        third = _SOUGHT_FACTORS[self.seq % 3 :: 3]
-        found, lead = search.sought(frame, self._box, third, self.model, settings)
-        if self._sightings or found.score >= settings.belief.return_score:
-            found, lead = search.sought(frame, self._box, _SOUGHT_FACTORS, self.model, settings)
-        seen = found.score >= settings.belief.return_score and lead >= settings.belief.sighting_lead
-        again = self._sightings and found.box.overlap(self._sure_box) > _AGAIN_OVERLAP
-        self._sightings = (self._sightings + 1 if again else 1) if seen else 0
-        self._sure_box = found.box
-        if self._sightings < settings.belief.sighting_frames:
-            return found
-        self._box = self._first_box = found.box
-        self._elsewhere = True
-        return self._fitted(frame, found)
-
-    def _fitted(self, frame: Pyramid, found: Found) -> Found:
-        fitted = extent.fitted(frame, found.box, self._first_box or found.box, self.model, self.settings)
-        return replace(fitted, around=found.around)
-
-    def _lesson(self, frame: Pyramid, found: Found) -> Lesson:
-        settings = self.settings
-        if found.score < settings.belief.teach_score or self._elsewhere:
-            return Lesson.none()
-        lesson = lessons.near(frame, self._box, self.model, self._random(), settings, found.around)
-        if self.seq % settings.extent.interval == 0:
-            lesson = lessons.with_extents(lesson, frame, self._box, settings)
-        if found.score > settings.belief.mine_score and self.seq % settings.teaching.mining_interval == 0:
-            lesson += lessons.far(frame, self._box, self.model, settings)
-        return lesson
-
-    def _random(self) -> np.random.Generator:
-        """A fresh generator for each frame: what a frame teaches does not depend on the ones before."""
-        return np.random.default_rng((self.settings.run.seed, self.seq))
-
-    def _answer(self, time: float, score: float, lesson: Lesson, *, begins: bool = False) -> tuple[Track, Features]:
-        seq, frame = self.seq, self.seq - 1
-        box = None if self.state == "absent" else self.box
-        track = Track(seq, frame, time, self.state, box, float(score), self.model.version)
-        groups = {
-            APPEARANCE: TrainingRows(lesson.rows, lesson.labels, lesson.weights),
-            EXTENT: TrainingRows(lesson.extents, lesson.fits, np.ones_like(lesson.fits)),
-        }
-        training = {name: rows for name, rows in groups.items() if len(rows)}
-        return track, Features(seq, frame, time, box, training, self._detector_state(), begins)
-
-    def _detector_state(self) -> DetectorState | None:
-        if not self._started:
-            return None
-        motion, centre = (self._centre.motion, self._centre.state) if self._centre is not None else (None, None)
-        boxes = self._box, self._sure_box, self._first_box
-        usual, balance = float(self._usual_score), self._balance.state.copy()
-        return DetectorState(self.state, *boxes, usual, self._elsewhere, motion, centre, balance, self._sightings)
+    def _messages(self, track: Track, training: Training, *, begins: bool = False) -> tuple[Track, Features]:
+        return track, Features(track.seq, track.frame, track.time, track.box, training, self.state, begins)

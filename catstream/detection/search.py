@@ -1,125 +1,316 @@
-"""Search: where in a frame the model scores highest.
+"""Search: the window of a frame that scores highest, its place, its size and its aspect ratio.
 
-Near the place where the object is expected, or in the whole frame. A search at
-another size resizes the frame, not the model.
+A window is 8 x 8 cells. A search at another size resizes the frame, not the model.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from catstream.box import Box
-from catstream.detection import windows
-from catstream.detection.windows import Scored
-from catstream.features.hog import CELL, WINDOW
+from catstream.box import Window
+from catstream.detection import belief, extent
+from catstream.features.cells import Cells
+from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Model
-from catstream.settings import Settings
+from catstream.heads import EXTENT
+from catstream.messages import DetectorState, Model
+from catstream.settings import ExtentSettings, SearchSettings, Settings
 
-__all__ = ["Found", "highest", "local", "scored_around", "scored_whole", "sought", "whole"]
+__all__ = [
+    "Detection",
+    "ScoreMap",
+    "find",
+    "local",
+    "non_maximum_suppression",
+    "searched",
+    "seek",
+    "vertex",
+    "whole",
+]
 
-_FAR_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
-_MOST_PIXELS = 4_000_000  # of a resized frame: what a whole search may cost for a tiny object in a large frame
+_FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a cell away from that at another size
+_WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
+_SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
+_SAME_OVERLAP = 0.3  # above which two windows in successive frames show the same object
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """A window and its score.
+class Detection:
+    """The best window of a search.
 
-    around : what a local search scored, which the window is in; None where there was none
+    score       of the window
+    window      where it lies in the frame
+    around      scores of the windows around it, if a local search found it
+    redetected  whether a search of the whole frame found it, away from where the object was expected
     """
 
     score: float
-    box: Box
-    around: Scored | None = None
+    window: Window
+    around: ScoreMap | None = None
+    redetected: bool = False
 
 
-def local(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
-    """The best window near a box, of its size.
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoreMap:
+    """Features of a part of a frame at one scale, and the score of each window in them.
 
-    Distance costs a little of the score, so that of two equal windows the nearer wins.
+    cells    of rows x columns
+    scores   float32 (rows - 7, columns - 7), each of the window whose first cell is there
+    origin   corner of the first cell in the frame, (x, y) in pixels
+    step     width and height of a cell, in pixels of the frame
     """
-    cells = WINDOW + 2 * round((settings.search.area - 1) * WINDOW / 2)
-    scored = scored_around(frame, box, cells, model)
-    away = (np.arange(cells - WINDOW + 1) - (cells - WINDOW) // 2) / WINDOW
-    place = highest(scored.scores - settings.search.distance_penalty * (away[:, None] ** 2 + away**2))
-    return Found(float(scored.scores[place]), scored.box(*scored.refined(*place)), scored)
+
+    cells: Cells
+    scores: np.ndarray
+    origin: tuple[float, float]
+    step: tuple[float, float]
+
+    @classmethod
+    def around(cls, frame: Pyramid, window: Window, side: int, model: Model | None) -> ScoreMap:
+        """All windows in `side` x `side` cells around a window, of its size; without a model all scores are 0."""
+        patch = frame.around(window, side)
+        cells = Cells.within(patch)
+        if model is None:
+            scores = np.zeros((side - WINDOW + 1,) * 2, np.float32)
+        else:
+            scores = cells.respond(model.weights, model.bias)
+        step, (x, y) = (window.w / WINDOW, window.h / WINDOW), window.centre
+        return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step)
+
+    @classmethod
+    def whole(cls, frame: Pyramid, window: Window, model: Model) -> ScoreMap:
+        """All windows of a size in a frame, or in as large a part around the window as can be searched in time."""
+        image, origin, step = frame.whole(window)
+        cells = Cells.of(image)
+        return cls(cells, cells.respond(model.weights, model.bias), origin, step)
+
+    def window(self, row: float, column: float) -> Window:
+        """The window at (row, column), which may lie between cells."""
+        (x, y), (w, h) = self.origin, self.step
+        return Window(x + column * w, y + row * h, WINDOW * w, WINDOW * h)
+
+    def place(self, window: Window) -> tuple[float, float]:
+        """Row and column, between the cells, of the window with the same centre: the inverse of `window`."""
+        (x, y), (w, h), (left, top) = window.centre, self.step, self.origin
+        return (y - top) / h - WINDOW / 2, (x - left) / w - WINDOW / 2
+
+    def row(self, row: int, column: int) -> np.ndarray:
+        """Feature row of the window at (row, column), float32 (d,)."""
+        return self.cells.row(row, column)
+
+    def best(self, penalty: np.ndarray | float = 0.0) -> Detection:
+        """The window with the highest score less a penalty, its place refined between the cells."""
+        row, column = map(int, np.unravel_index((self.scores - penalty).argmax(), self.scores.shape))
+        return Detection(float(self.scores[row, column]), self.window(*self.refined(row, column)))
+
+    def refined(self, row: int, column: int) -> tuple[float, float]:
+        """The maximum at (row, column) refined between the cells, by a parabola in each direction."""
+        scores = self.scores
+        return row + vertex(scores[:, column], row), column + vertex(scores[row], column)
+
+    def highest_apart(self, window: Window) -> float:
+        """The highest score of a window that does not touch another; -inf if there is none."""
+        (x, y), (w, h) = self.origin, self.step
+        rows, columns = self.scores.shape
+        top, left = y + h * np.arange(rows), x + w * np.arange(columns)
+        beyond = (top >= window.y + window.h) | (top + WINDOW * h <= window.y)
+        beside = (left >= window.x + window.w) | (left + WINDOW * w <= window.x)
+        return float(self.scores.max(where=beyond[:, None] | beside, initial=-np.inf))
 
 
-def whole(frame: Pyramid, box: Box, model: Model, settings: Settings) -> Found:
-    """The best window of a whole frame, at three sizes: that of a box, and a quarter less and more."""
-    best, least = Found(-np.inf, box), -np.inf
-    for factor in _FAR_FACTORS:
-        scored = scored_whole(frame, box.scaled(factor), model)
-        place = highest(scored.scores)
-        score = float(scored.scores[place])
-        worth = score - settings.extent.penalty * abs(np.log(factor))
-        if worth > least:
-            least = worth
-            best = Found(score, scored.box(*scored.refined(*place)))
-    return best
+def searched(
+    frame: Pyramid, state: DetectorState, seq: int, model: Model, settings: Settings
+) -> tuple[DetectorState, Detection]:
+    """The best window of a frame, and the state that it was searched with: `seek` changes it, `find` does not."""
+    if state.first_window is None:
+        return seek(frame, state, seq, model, settings)
+    return state, find(frame, state, seq, model, settings)
 
 
-def sought(
-    frame: Pyramid, box: Box, factors: tuple[float, ...], model: Model, settings: Settings
-) -> tuple[Found, float]:
-    """The best window of a whole frame at several sizes, and by how much it scores higher than the rest of the frame.
+def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings: Settings) -> Detection:
+    """The best window near the expected one; of the whole frame, if the belief in it is low and another leads clearly.
+
+    Parameters
+    ----------
+    seq : of the frame, which says whether a search of the whole frame is due
+    """
+    confident = state.confident_window.centred(*state.window.centre)  # as large as in the last confident detection
+    if settings.search.mode == "full":
+        doubtful = not state.trusted or state.level == "lost"
+        best = whole(frame, confident if doubtful else state.window, model, settings.extent)
+        best = _fitted(frame, best, state.first_window, model, settings.extent)
+        return replace(best, redetected=not best.window.overlap(state.window))
+    near = _near(frame, state.window, state, model, settings)
+    level = belief.level_of(near.score, settings.belief.lost_score, state.trusted, settings.belief)
+    interval = belief.policies(settings)[level].search_interval
+    if interval and seq % interval == 0:
+        other = whole(frame, confident, model, settings.extent)
+        if belief.is_redetection(other.score, near.score, settings.belief):
+            other = _near(frame, other.window, state, model, settings)
+            if other.score > near.score:
+                return replace(other, redetected=True)
+    return near
+
+
+def seek(
+    frame: Pyramid, state: DetectorState, seq: int, model: Model, settings: Settings
+) -> tuple[DetectorState, Detection]:
+    """The best window of the whole frame, of any size that an object that has not been found yet may have.
+
+    The object counts as found once this window has led the rest of the frame in one place in several frames in a
+    row: the state then has a first window. While no score is high, each frame is searched at a third of the sizes.
+    """
+    best, lead = _sought(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model, settings.extent)
+    if state.sightings or best.score >= settings.belief.return_score:
+        best, lead = _sought(frame, state.window, _SOUGHT_FACTORS, model, settings.extent)
+    seen = best.score >= settings.belief.return_score and lead >= settings.belief.sighting_lead
+    again = state.sightings > 0 and best.window.overlap(state.confident_window) > _SAME_OVERLAP
+    state = replace(
+        state,
+        sightings=0 if not seen else state.sightings + 1 if again else 1,
+        confident_window=best.window,
+    )
+    if state.sightings < settings.belief.sighting_frames:
+        return state, best
+    found = _fitted(frame, best, best.window, model, settings.extent)
+    return replace(state, window=best.window, first_window=best.window), replace(found, redetected=True)
+
+
+def local(frame: Pyramid, window: Window, model: Model, settings: SearchSettings) -> Detection:
+    """The best window near another, of its size.
+
+    The squared distance, in windows, costs `distance_penalty` of the score: of two equal windows the nearer wins.
+    """
+    side = WINDOW + 2 * round((settings.area - 1) * WINDOW / 2)
+    scores = ScoreMap.around(frame, window, side, model)
+    away = (np.arange(side - WINDOW + 1) - (side - WINDOW) // 2) / WINDOW
+    return replace(scores.best(settings.distance_penalty * (away[:, None] ** 2 + away**2)), around=scores)
+
+
+def whole(frame: Pyramid, window: Window, model: Model, settings: ExtentSettings) -> Detection:
+    """The best window of a whole frame at three sizes: that of a window, 0.8 and 1.25 times as large."""
+    found = [ScoreMap.whole(frame, window.scaled(factor), model).best() for factor in _WHOLE_FACTORS]
+    costs = [settings.penalty * abs(np.log(factor)) for factor in _WHOLE_FACTORS]
+    return found[int(np.argmax([each.score - cost for each, cost in zip(found, costs, strict=True)]))]
+
+
+def _sought(
+    frame: Pyramid, window: Window, factors: tuple[float, ...], model: Model, settings: ExtentSettings
+) -> tuple[Detection, float]:
+    """The best window of a whole frame at several sizes, and by how much it leads the rest of the frame.
 
     In a scene that the model never saw, anything may score high. The windows that do not touch the best
     one show how high; 0, the mean of the background that was learned, counts as one of them.
 
     Parameters
     ----------
-    factors : the sizes, as factors of that of the box
+    factors : the sizes, as factors of that of the window
     """
-    sizes = [scored_whole(frame, box.scaled(factor), model) for factor in factors]
-    costs = [settings.extent.penalty * abs(np.log(factor)) for factor in factors]
-    worths = [float(scored.scores.max()) - cost for scored, cost in zip(sizes, costs, strict=True)]
-    best = sizes[int(np.argmax(worths))]
-    place = highest(best.scores)
-    found = Found(float(best.scores[place]), best.box(*best.refined(*place)))
-    return found, found.score - max(0.0, *(_highest_apart(scored, found.box) for scored in sizes))
+    maps = [ScoreMap.whole(frame, window.scaled(factor), model) for factor in factors]
+    costs = [settings.penalty * abs(np.log(factor)) for factor in factors]
+    worths = [float(each.scores.max()) - cost for each, cost in zip(maps, costs, strict=True)]
+    best = maps[int(np.argmax(worths))].best()
+    return best, best.score - max(0.0, *(each.highest_apart(best.window) for each in maps))
 
 
-def _highest_apart(scored: Scored, box: Box) -> float:
-    """The highest score of a window that does not touch a box; -inf if there is none."""
-    (x, y), (w, h) = scored.origin, scored.step
-    rows, columns = scored.scores.shape
-    top, left = y + h * np.arange(rows), x + w * np.arange(columns)
-    beyond = (top >= box.y + box.h) | (top + WINDOW * h <= box.y)
-    beside = (left >= box.x + box.w) | (left + WINDOW * w <= box.x)
-    return float(scored.scores.max(where=beyond[:, None] | beside, initial=-np.inf))
+def _near(frame: Pyramid, window: Window, state: DetectorState, model: Model, settings: Settings) -> Detection:
+    """The best window near another, at its best size and aspect ratio."""
+    best = local(frame, window, model, settings.search)
+    return _fitted(frame, best, state.first_window, model, settings.extent)
 
 
-def scored_around(frame: Pyramid, box: Box, side: int, model: Model) -> Scored:
-    """Scores of all windows in `side` x `side` cells around a box."""
-    cells, origin, step = windows.around(frame, box, side)
-    return Scored(cells, cells.respond(model.weights, model.bias), origin, step)
+def _fitted(
+    frame: Pyramid, found: Detection, first: Window | None, model: Model, settings: ExtentSettings
+) -> Detection:
+    """A detection moved by at most a cell, at the size and then the aspect ratio with the highest value.
 
+    The value is the score, plus `weight` times what the extent head says, less the cost of the change.
 
-def scored_whole(frame: Pyramid, box: Box, model: Model) -> Scored:
-    """Scores of all windows of the size of a box in a frame.
-
-    Where the frame, resized so that the box is a window, would be too large to search in time,
-    it is the part around the box.
+    Parameters
+    ----------
+    first : the window of the first frame, whose size and aspect ratio are likelier than others
     """
-    width, height = frame.size
-    window = WINDOW * CELL
-    reach = np.sqrt(_MOST_PIXELS / (width * window / box.w * height * window / box.h))
-    left, top = 0, 0
-    if reach < 1:
-        x, y = box.centre
-        w, h = int(width * reach), int(height * reach)
-        left, top = int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))
-        frame = Pyramid(frame.image[top : top + h, left : left + w])
-    cells, origin, step = windows.whole(frame, box)
-    origin = origin[0] + left, origin[1] + top
-    return Scored(cells, cells.respond(model.weights, model.bias), origin, step)
+    first = first or found.window
+    resized = _at_best_size(frame, found, first, model, settings)
+    return resized if EXTENT not in model.heads else _at_best_aspect(frame, resized, first, model, settings)
 
 
-def highest(scores: np.ndarray) -> tuple[int, int]:
-    """Row and column of the highest window."""
-    row, column = np.unravel_index(scores.argmax(), scores.shape)
-    return int(row), int(column)
+def _at_best_size(frame: Pyramid, found: Detection, first: Window, model: Model, settings: ExtentSettings) -> Detection:
+    grown = math.log(found.window.area / first.area) / 2
+    head = model.heads.get(EXTENT)
+
+    def tried(step: int) -> tuple[float, Detection]:
+        scores = ScoreMap.around(frame, found.window.scaled(extent.size(step, settings)), _FINE_SIDE, model)
+        best = scores.best()
+        fit = 0.0 if head is None else settings.weight * float(scores.row(1, 1) @ head)
+        return best.score + fit - extent.cost(step * math.log(1 + settings.size_step), grown, settings), best
+
+    best, _, beside = _climb(tried, settings.size_count // 2)
+    return replace(found, score=best.score, window=best.window.scaled(extent.size(beside, settings)))
+
+
+def _at_best_aspect(
+    frame: Pyramid, found: Detection, first: Window, model: Model, settings: ExtentSettings
+) -> Detection:
+    widened = math.log(found.window.w / found.window.h * first.h / first.w)
+    head = model.heads[EXTENT]
+
+    def tried(step: int) -> tuple[float, Detection]:
+        scores = ScoreMap.around(frame, found.window.scaled(*extent.stretch(step, settings)), WINDOW, model)
+        fit = settings.weight * float(scores.row(0, 0) @ head)
+        cost = extent.cost(step * math.log(1 + settings.aspect_step), widened, settings)
+        return float(scores.scores[0, 0]) + fit - cost, found
+
+    _, step, beside = _climb(tried, settings.aspect_count // 2)
+    return replace(found, window=found.window.scaled(*extent.stretch(step + beside, settings)))
+
+
+def _climb(tried: Callable[[int], tuple[float, Detection]], most: int) -> tuple[Detection, int, float]:
+    """Hill climbing: from step 0 up or down for as long as the value rises, at most `most` steps either way.
+
+    Returns
+    -------
+    the detection at the best step, the step, and the offset of the vertex of the parabola through its neighbours
+    """
+    trials = {step: tried(step) for step in range(-min(most, 1), min(most, 1) + 1)}
+    best = way = max(trials, key=lambda step: trials[step][0])
+    while way and abs(best) < most:
+        trials[best + way] = tried(best + way)
+        if trials[best + way][0] <= trials[best][0]:
+            break
+        best += way
+    neighbours = (best - 1, best, best + 1)
+    if not all(step in trials and math.isfinite(trials[step][0]) for step in neighbours):
+        return trials[best][1], best, 0.0
+    return trials[best][1], best, vertex(np.array([trials[step][0] for step in neighbours]), 1)
+
+
+def non_maximum_suppression(scores: np.ndarray, most: int, apart: int, least: float = -np.inf) -> list[tuple[int, int]]:
+    """The highest windows, each more than `apart` cells from any higher one.
+
+    Returns
+    -------
+    up to `most` pairs (row, column) with a score above `least`, highest first
+    """
+    left = scores.copy()
+    maxima = []
+    for _ in range(most):
+        row, column = divmod(int(left.argmax()), left.shape[1])
+        if not left[row, column] > least:
+            break
+        maxima.append((row, column))
+        left[max(row - apart, 0) : row + apart + 1, max(column - apart, 0) : column + apart + 1] = -np.inf
+    return maxima
+
+
+def vertex(values: np.ndarray, i: int) -> float:
+    """Offset of the vertex of the parabola through three neighbours, -0.5 to 0.5."""
+    if not 0 < i < len(values) - 1:
+        return 0.0
+    before, here, after = float(values[i - 1]), float(values[i]), float(values[i + 1])
+    bend = before - 2 * here + after
+    return float(np.clip((before - after) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0

@@ -5,9 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from catstream.box import Window
 from catstream.features.compiled import kernel
+from catstream.features.hog import CELL, MARGIN, WINDOW
 
 __all__ = ["Pyramid"]
+
+_MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for a tiny object in a large frame
 
 
 class Pyramid:
@@ -48,6 +52,41 @@ class Pyramid:
             if level == len(self._halves):
                 self._halves.append(_half(self._halves[-1]))
         return self._halves[level], 1 << level
+
+    def around(self, window: Window, side: int) -> np.ndarray:
+        """A patch of `side` x `side` cells around a window and a margin, in which the window is 64 x 64 pixels."""
+        x, y = window.centre
+        step = window.w / WINDOW, window.h / WINDOW
+        return self.cut(x, y, step[0] / CELL, step[1] / CELL, (side + 2 * MARGIN) * CELL)
+
+    def whole(self, window: Window) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+        """The frame, resized until a window is 64 x 64 pixels; the part around the window, if this were too large.
+
+        Returns
+        -------
+        the image; its corner, (x, y), and width and height of a cell, in pixels of the frame
+        """
+        width, height = self.size
+        side = WINDOW * CELL
+        reach = np.sqrt(_MOST_PIXELS / (width * side / window.w * height * side / window.h))
+        left, top, part = 0, 0, self
+        if reach < 1:
+            x, y = window.centre
+            w, h = int(width * reach), int(height * reach)
+            left, top = int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))
+            part = Pyramid(self.image[top : top + h, left : left + w])
+        resized, step = part._resized(window)
+        return resized, (float(left), float(top)), step
+
+    def _resized(self, window: Window) -> tuple[np.ndarray, tuple[float, float]]:
+        width, height = self.size
+        columns = max(WINDOW, round(width / window.w * WINDOW))
+        rows = max(WINDOW, round(height / window.h * WINDOW))
+        size = (columns * CELL, rows * CELL)
+        scale = min(width / size[0], height / size[1])
+        image, wide = self.near(scale)
+        resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR)
+        return resized, (image.shape[1] * wide / columns, image.shape[0] * wide / rows)
 
     def cut(self, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
         """A square of `size` pixels, centred at (x, y); beyond the edge the last pixel is repeated.

@@ -12,7 +12,7 @@ from typing import Any, get_origin
 
 import numpy as np
 
-from catstream.box import Box
+from catstream.box import Box, Window
 from catstream.errors import ProtocolError
 from catstream.schema import LARGEST_INTEGER, Array, Bytes, Field, Named, OnlyWith, Whole, fields
 
@@ -79,7 +79,7 @@ def _check_of(field: Field, where: str) -> _Check | None:
         return _bytes(limits, where)
     if field.type is int:
         return _whole(where, least.low if (least := field.limit(Whole)) else 0)
-    return {float: _number(where), Box: _box(where)}.get(field.type)
+    return {float: _number(where), Box: _rectangle(where), Window: _rectangle(where)}.get(field.type)
 
 
 def _map(field: Field, values: Field, where: str) -> _Check | None:
@@ -164,8 +164,8 @@ def _number(where: str) -> _Check:
     return checked
 
 
-def _box(where: str) -> _Check:
-    def checked(box: Box, _: _Lengths) -> None:
+def _rectangle(where: str) -> _Check:
+    def checked(box: Box | Window, _: _Lengths) -> None:
         if not (box.w > 0 and box.h > 0):
             raise ProtocolError(f"{where}: expected a width and a height above 0, got {box}", "range")
         if not all(map(math.isfinite, box)):

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from catstream import storage
-from catstream.box import Box
+from catstream.box import Box, Window
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
@@ -184,9 +184,9 @@ def test_the_last_sample_can_be_had_again_though_the_trees_have_grown(settings, 
 @pytest.mark.parametrize("moving", [False, True])
 def test_the_detector_state_of_the_last_message_is_kept_bit_for_bit(settings, messages, moving, rng, tmp_path):
     motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
-    detector = DetectorState("absent", *(Box(*rng.random(4)) for _ in range(3)), rng.random(), True)
+    detector = DetectorState(7, "lost", *(Window(*rng.random(4)) for _ in range(3)), False, rng.random())
     if moving:
-        detector = dataclasses.replace(detector, motion=motion, centre=centre, balance=rng.random(6))
+        detector = dataclasses.replace(detector, motion=motion, centre=centre, colour_centroid=rng.random(6))
     compressor = Compressor(settings)
     compressor.take(dataclasses.replace(next(messages), detector=detector))
     compressor.save(tmp_path / "state")

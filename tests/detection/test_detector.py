@@ -1,5 +1,6 @@
-"""The detector alone: no trees, no trainer, only the stand-in of the first frame."""
+"""The detector alone: no trees, no trainer, only the initial model of the first frame."""
 
+import copy
 import dataclasses
 
 import cv2
@@ -7,9 +8,10 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.detection.detector import Detector
+from catstream.detection.detector import Detector, step
 from catstream.errors import BoxError, ProtocolError
-from catstream.features.cells import COLOURS, row_length
+from catstream.features.cells import row_length
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Model, Motion
 from catstream.settings import Settings
 
@@ -45,17 +47,6 @@ def test_the_first_frame_teaches_a_leaf_of_each_tree(scene):
     assert training.rows.shape[1] == row_length()
     assert (training.labels == 1).sum() == settings.coreset.size
     assert (training.labels == 0).sum() >= settings.coreset.size
-
-
-def test_without_colours_no_row_tells_of_them_and_the_model_weighs_none(scene):
-    for colours in (True, False):
-        detector = Detector(Settings(teaching={"colours": colours}, extent={"interval": 1}))
-        _, first = detector.init(scene((60, 50)), START)
-        detector.seq = 4  # the next frame is searched for hard negatives
-        _, later = detector.step(scene((62, 50)))
-        for features in (first, later):
-            assert {rows.rows[:, COLOURS].any() for rows in features.training.values()} == {colours}
-        assert detector.model.weights[COLOURS].any() == colours
 
 
 def test_half_of_the_first_copies_are_put_on_another_background(scene):
@@ -166,6 +157,36 @@ def test_with_the_state_after_a_frame_another_detector_goes_on_bit_for_bit(scene
         np.testing.assert_equal(dataclasses.asdict(repeated), dataclasses.asdict(features))
 
 
+def test_a_step_depends_on_nothing_but_state_frame_model_and_settings_and_changes_none_of_them(scene):
+    detector = started(scene)
+    detector.adopt(dataclasses.replace(detector.model, version=1, motion=Motion(np.eye(4), np.eye(2))))
+    for at in ((64, 50), (68, 50)):
+        detector.step(scene(at))
+    for frame in (scene((72, 50)), scene(), scene((250, 180))):
+        given = detector.state, Pyramid(frame), detector.seq + 1, 0.0, detector.model, detector.settings
+        before = copy.deepcopy(given[0])
+        one, two = step(*given), step(*given)
+        np.testing.assert_equal(_plain(one), _plain(two))
+        np.testing.assert_equal(dataclasses.asdict(given[0]), dataclasses.asdict(before))
+        detector.step(frame)
+
+
+def _plain(results):
+    state, track, training = results
+    return dataclasses.asdict(state), track, {name: dataclasses.asdict(rows) for name, rows in training.items()}
+
+
+def test_a_detector_that_is_resumed_adopts_no_model_of_the_object_before_either(scene):
+    detector, other = started(scene), Detector(Settings())
+    detector.step(scene((62, 50)))
+    _, features = detector.init(scene((90, 60)), Box(90, 60, 48, 40))
+    other.resume(features.seq, features.detector, detector.model)
+    other.adopt(dataclasses.replace(detector.model, version=1, frame=1))
+    assert (other.model.version, other.newest_version) == (0, 1)
+    other.adopt(dataclasses.replace(detector.model, version=2, frame=2))
+    assert other.model.version == 2
+
+
 def test_a_frame_teaches_the_same_whatever_came_before(scene):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1)
@@ -226,10 +247,10 @@ def test_another_object_begins_with_a_model_of_its_own_and_older_ones_are_not_ad
         detector.step(scene((left, 50)))
     track, features = detector.init(scene((64, 50)), Box(64, 50, 48, 40))
     assert (track.seq, track.state, track.model_version, features.begins) == (4, "bootstrapping", 0, True)
-    stand_in = detector.model
-    detector.adopt(dataclasses.replace(stand_in, version=2, frame=2))
-    assert (detector.model, detector.heard) == (stand_in, 2), "it is of the object before"
-    detector.adopt(dataclasses.replace(stand_in, version=3, frame=3))
+    initial = detector.model
+    detector.adopt(dataclasses.replace(initial, version=2, frame=2))
+    assert (detector.model, detector.newest_version) == (initial, 2), "it is of the object before"
+    detector.adopt(dataclasses.replace(initial, version=3, frame=3))
     assert detector.model.version == 3
 
 
@@ -327,5 +348,5 @@ def test_a_corrected_box_is_gone_on_with_and_teaches(scene):
 
 def test_a_corrected_box_says_anew_where_the_colours_lie(scene):
     detector = started(scene)
-    assert detector.step(scene((62, 50)))[1].detector.balance[0] == 1
-    assert detector.correct(scene((90, 60)), Box(90, 60, 48, 40))[1].detector.balance[0] == 0
+    assert detector.step(scene((62, 50)))[1].detector.colour_centroid[0] == 1
+    assert detector.correct(scene((90, 60)), Box(90, 60, 48, 40))[1].detector.colour_centroid is None

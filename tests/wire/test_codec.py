@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from catstream.box import Box
+from catstream.box import Box, Window
 from catstream.errors import ProtocolError
 from catstream.messages import (
     Answer,
@@ -46,8 +46,8 @@ def summary(columns: int) -> Summary:
 
 
 MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
-BOXES = Box(4.0, 2.0, 25.0, 12.5), Box(4.5, 2.0, 25.0, 12.5), Box(9.0, 2.0, 25.0, 12.5)
-DETECTOR = DetectorState("present", *BOXES, 0.9, False, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
+WINDOWS = Window(4.0, 2.0, 25.0, 12.5), Window(4.5, 2.0, 25.0, 12.5), Window(9.0, 2.0, 25.0, 12.5)
+DETECTOR = DetectorState(3, "weak", *WINDOWS, False, 0.9, 0, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
 TRAINING = TrainingRows(array(3, 5), array(3), array(3))
 TREES = {"object": summary(5), "background": summary(5), "loss": summary(7), "extent": summary(7)}
 EXAMPLES = {
@@ -162,7 +162,8 @@ def _plain(field: Field) -> st.SearchStrategy[Any]:
     if get_origin(field.type) is tuple:
         return st.lists(whole, max_size=4).map(tuple)
     kinds = {bool: st.booleans(), int: whole, float: FINITE, str: st.text(max_size=8)}
-    return kinds[field.type] if field.type is not Box else st.builds(Box, FINITE, FINITE, SIDE, SIDE)
+    rectangle = field.type in (Box, Window)
+    return st.builds(field.type, FINITE, FINITE, SIDE, SIDE) if rectangle else kinds[field.type]
 
 
 @FUZZ

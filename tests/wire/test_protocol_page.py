@@ -15,7 +15,7 @@ from typing import Literal, get_args, get_origin
 
 import pytest
 
-from catstream.box import Box
+from catstream.box import Box, Window
 from catstream.heads import HEADS
 from catstream.messages import DetectorState, End, Motion, Stored, Summary, Track, TrainingRows
 from catstream.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Bytes, Named, OnlyWith, Whole, fields
@@ -27,7 +27,7 @@ from catstream.wire.sockets import Publisher
 PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
 MESSAGES = [*codec.KINDS.values(), DetectorState, Motion, Summary, TrainingRows]
-PLAIN = {int: "whole number", float: "number", str: "text", bool: "boolean", Box: "box"}
+PLAIN = {int: "whole number", float: "number", str: "text", bool: "boolean", Box: "box", Window: "window"}
 
 
 def block(language):

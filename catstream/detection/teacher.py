@@ -1,0 +1,263 @@
+"""The teacher: training rows of the windows in and around the object's, and what label each should get.
+
+A row of the object has label 1, one of the background 0. Between them are near misses, windows beside the object, and
+windows of the object of a wrong size or aspect ratio. Both get a Gaussian of their offset, so that scores fall smoothly
+around the right window. The initial model is learned from the rows of the first frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+
+import cv2
+import numpy as np
+
+from catstream import ridge
+from catstream.box import Window
+from catstream.detection import belief, extent
+from catstream.detection.search import Detection, ScoreMap, non_maximum_suppression
+from catstream.errors import BoxError
+from catstream.features.cells import COLOURS, Cells, row_length
+from catstream.features.hog import CELL, MARGIN, WINDOW
+from catstream.features.pyramid import Pyramid
+from catstream.heads import APPEARANCE, BACKGROUND, EXTENT
+from catstream.messages import DetectorState, Model, TrainingRows
+from catstream.settings import Settings, TeachingSettings
+
+__all__ = [
+    "Training",
+    "affine_copies",
+    "first_training",
+    "hard_negatives",
+    "initial_model",
+    "training_at",
+    "training_of",
+]
+
+#: Training rows by group, as in `Features`; a group without rows is left out.
+Training = dict[str, TrainingRows]
+
+_NEAR = 2  # cells around the object whose windows are near misses, not background
+_NEAREST = 0.9  # cells: a nearer window shows the object as well as its own does
+_SIDE = 20  # cells around the object, at least, from which background is taken
+_HARD_OVERLAP = 0.2  # of a hard negative with the object's window, at most
+
+_SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations of affine copies: a factor, a share of the box, radians
+_PATCH = (WINDOW + 2 * MARGIN) * CELL  # side of a copy with its margin, in pixels
+_NEAREST_OTHER, _FARTHEST_OTHER = 0.3, 1.0  # distance of another background, in windows
+_SOLID, _GONE = 0.8, 1.15  # radii between which the object's ellipse fades; 1 touches the sides of its box
+
+
+def first_training(
+    frame: Pyramid, window: Window, rng: np.random.Generator, settings: Settings
+) -> tuple[Model, Training]:
+    """The initial model and the rows of the first frame: as many as fill a leaf of each tree, unless SCM comes first.
+
+    Raises
+    ------
+    BoxError
+        If object and background look the same.
+    """
+    teaching, count = settings.teaching, settings.coreset.size
+    if teaching.bootstrap == "scm":
+        rows = _appearance(frame, window, None, None, rng, teaching)
+    else:
+        context, moved = settings.search.context, teaching.other_backgrounds
+        copies = affine_copies(frame, window, count, rng, context=context, moved=moved)
+        rows = _rows(copies, 1, teaching.object_weight, teaching)
+        rows += _surroundings(ScoreMap.around(frame, window, _SIDE, None), window, count, 0, rng, teaching)
+    training = _extents(frame, window, rows, settings)
+    rows += hard_negatives(frame, window, initial_model(rows), teaching)
+    return initial_model(rows), {APPEARANCE: rows, **training}
+
+
+def training_of(
+    frame: Pyramid, found: Detection, state: DetectorState, seq: int, model: Model, settings: Settings
+) -> Training:
+    """What the belief in a detection allows to learn from it, in this frame.
+
+    Parameters
+    ----------
+    state : after the detection: its level of belief, and the window that the rows are cut around
+    seq : of the frame: rows of group "extent" and hard negatives are not cut in each
+    """
+    policy, teaching = belief.policies(settings)[state.level], settings.teaching
+    if found.score < policy.teach:
+        return {}
+    training = training_at(
+        frame, state.window, seq, model, settings, found.around, extents=seq % settings.extent.interval == 0
+    )
+    if found.score >= policy.mine and seq % teaching.mining_interval == 0:
+        training[APPEARANCE] += hard_negatives(frame, state.window, model, teaching)
+    return training
+
+
+def training_at(
+    frame: Pyramid,
+    window: Window,
+    seq: int,
+    model: Model,
+    settings: Settings,
+    around: ScoreMap | None = None,
+    *,
+    extents: bool = True,
+) -> Training:
+    """The rows of an object that is known to be at a window.
+
+    Parameters
+    ----------
+    around : scores of the windows around it, if a search left them: near misses and background are taken from these,
+        if they reach far enough
+    extents : whether to cut rows of group "extent", too
+    """
+    rng = np.random.default_rng((settings.run.seed, seq))  # of this frame alone: no frame depends on those before
+    rows = _appearance(frame, window, around, model, rng, settings.teaching)
+    return {APPEARANCE: rows, **(_extents(frame, window, rows, settings) if extents else {})}
+
+
+def hard_negatives(frame: Pyramid, window: Window, model: Model, teaching: TeachingSettings) -> TrainingRows:
+    """The windows of the whole frame that score highest, without those that overlap the object's."""
+    scores = ScoreMap.whole(frame, window, model)
+    places = non_maximum_suppression(scores.scores, teaching.hard_negatives + 1, WINDOW // 2)
+    rows = [scores.row(*place) for place in places if scores.window(*place).overlap(window) < _HARD_OVERLAP]
+    return _rows(rows[: teaching.hard_negatives], 0, 1, teaching)
+
+
+def initial_model(rows: TrainingRows) -> Model:
+    """A model of version 0, by ridge regression of the object's rows against the background's.
+
+    Raises
+    ------
+    BoxError
+        If the two look the same.
+    """
+    background = rows.rows[rows.labels == 0]
+    mean, background_mean = rows.rows[rows.labels == 1].mean(axis=0), background.mean(axis=0)
+    weights = ridge.between(background, mean - background_mean, BACKGROUND.ridge)
+    contrast = float(weights @ (mean - background_mean))
+    if not contrast > 0:
+        raise BoxError("the object in the box looks like all that is around it: give another box, or another frame")
+    weights /= np.float32(contrast)
+    return Model(0, 0, weights, -float(weights @ background_mean))
+
+
+def affine_copies(
+    frame: Pyramid,
+    window: Window,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    context: float = 1.0,
+    moved: float = 0.0,
+    mirrored: int = 0,
+) -> np.ndarray:
+    """Features of a window and of copies of it, slightly scaled, shifted and rotated (paper, "System Implementation").
+
+    All copies of one frame agree on the corners of the window, which are not the object: some copies are put on another
+    background. An object that turns shows another side, which often is the mirror image.
+
+    Parameters
+    ----------
+    count : rows in all; the first is that of the window itself
+    rng : source of scales, shifts and rotations
+    context : size of the window as a multiple of the object's box
+    moved : share of the copies that are put on another background of the frame
+    mirrored : how many of them, the last ones, are mirrored left to right
+
+    Returns
+    -------
+    float32 (count, d)
+    """
+    change = rng.normal(size=(count, 4))
+    if count:
+        change[0] = 0
+    rows = []
+    x, y = window.centre
+    for number, (scale, right, down, turn) in enumerate(change):
+        factor = np.exp(_SCALE * scale) / (WINDOW * CELL)
+        pixel = window.w * factor, window.h * factor
+        centre = x + _SHIFT * right * window.w, y + _SHIFT * down * window.h
+        patch = frame.cut(*centre, *pixel, _PATCH, _TURN * turn)
+        if number and number * moved % 1 < moved:
+            angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(_NEAREST_OTHER, _FARTHEST_OTHER)
+            away = centre[0] + far * np.cos(angle) * window.w, centre[1] + far * np.sin(angle) * window.h
+            background, share = frame.cut(*away, *pixel, _PATCH, _TURN * turn), _ellipse(context)
+            patch = cv2.blendLinear(patch, background, share, 1 - share)
+        if number >= max(count - mirrored, 1):
+            patch = cv2.flip(patch, 1)
+        rows.append(Cells.within(patch).row(0, 0))
+    return np.array(rows, np.float32)
+
+
+@cache
+def _ellipse(context: float) -> np.ndarray:
+    """Share of the object in each pixel of a patch, float32: 1 inside its ellipse, falling to 0 around it."""
+    across = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / context / 2)
+    out = np.hypot(across[:, None], across)
+    return ((_GONE - out) / (_GONE - _SOLID)).clip(0, 1).astype(np.float32)
+
+
+def _appearance(
+    frame: Pyramid,
+    window: Window,
+    around: ScoreMap | None,
+    model: Model | None,
+    rng: np.random.Generator,
+    teaching: TeachingSettings,
+) -> TrainingRows:
+    """The object, affine copies of it, near misses and background; half of this scores highest, if there is a model."""
+    own = affine_copies(frame, window, 1 + teaching.copies, rng, mirrored=teaching.mirrored)
+    rows = _rows(own, 1, teaching.object_weight / len(own), teaching)
+    if around is None or min(around.cells.shape) < _SIDE:
+        around = ScoreMap.around(frame, window, _SIDE, model)
+    hardest = 0 if model is None else teaching.near_negatives // 2
+    return rows + _surroundings(around, window, teaching.near_negatives, hardest, rng, teaching)
+
+
+def _surroundings(
+    around: ScoreMap, window: Window, count: int, hardest: int, rng: np.random.Generator, teaching: TeachingSettings
+) -> TrainingRows:
+    """Near misses of a window, and `count` background windows: the `hardest` highest ones, the rest at random."""
+    row, column = around.place(window)
+    rows, columns = around.scores.shape
+    down, across = np.arange(rows)[:, None] - row, np.arange(columns) - column
+    outside = np.maximum(abs(down), abs(across)) > _NEAR + 0.5
+    misses, labels = [], []
+    near = np.argwhere(~outside)
+    for place in near[rng.integers(len(near), size=teaching.near_misses)] if len(near) else ():
+        distance = math.hypot(down[place[0], 0], across[place[1]])
+        if distance > _NEAREST:
+            misses.append(around.row(*place))
+            labels.append(_gaussian(distance, teaching.near_sigma))
+    places = non_maximum_suppression(np.where(outside, around.scores, -np.inf), hardest, _NEAR)
+    anywhere = np.argwhere(outside)
+    places += list(map(tuple, rng.choice(anywhere, count - len(places), replace=count > len(anywhere))))
+    background = [around.row(*place) for place in places]
+    return _rows([*misses, *background], [*labels, *[0.0] * len(background)], 1, teaching)
+
+
+def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Settings) -> Training:
+    """Rows of group "extent": the object's own, the first of `rows`, and windows of a wrong size or aspect ratio."""
+    trials = extent.trials(window, settings.extent)
+    if not trials:
+        return {}
+    cuts = [Cells.within(frame.around(trial, WINDOW)).row(0, 0) for _, trial in trials]
+    labels = [_gaussian(steps, settings.extent.sigma) for steps, _ in trials]
+    return {EXTENT: _rows([rows.rows[0], *cuts], [1.0, *labels], 1, settings.teaching)}
+
+
+def _gaussian(offset: float, sigma: float) -> float:
+    """Label of a window at an offset from the right one: exp(-offset^2 / (2 sigma^2))."""
+    return math.exp(-((offset / sigma) ** 2) / 2)
+
+
+def _rows(
+    rows: Sequence[np.ndarray] | np.ndarray, labels: float | list[float], weight: float, teaching: TeachingSettings
+) -> TrainingRows:
+    """Training rows of one weight; the histogram of colours is 0 unless it is used: then no model weighs it."""
+    k, table = len(rows), np.array(rows, np.float32).reshape(len(rows), row_length())
+    if not teaching.colours:
+        table[:, COLOURS] = 0
+    return TrainingRows(table, np.full(k, labels, np.float32), np.full(k, weight, np.float32))

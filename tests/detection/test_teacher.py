@@ -1,0 +1,132 @@
+"""The teacher: which windows are training rows, and their labels."""
+
+import numpy as np
+import pytest
+
+from catstream.box import Window
+from catstream.detection import teacher
+from catstream.detection.search import ScoreMap
+from catstream.features.cells import COLOURS, Cells, row_length
+from catstream.features.hog import WINDOW
+from catstream.features.pyramid import Pyramid
+from catstream.heads import APPEARANCE, EXTENT
+from catstream.messages import Model
+from catstream.settings import Settings
+
+OBJECT = Window(120, 80, 64, 64)
+SETTINGS = Settings(teaching={"near_misses": 200})
+
+
+@pytest.fixture
+def frame(texture):
+    return Pyramid(texture(240, 320, 12))
+
+
+@pytest.fixture
+def model(rng):
+    return Model(1, 0, rng.normal(size=row_length()).astype(np.float32), 0.0)
+
+
+def cut(frame, model, around=None, window=OBJECT):
+    """Training rows of group "appearance", and which of them are the object, near misses and background."""
+    rows = teacher.training_at(frame, window, 3, model, SETTINGS, around)[APPEARANCE]
+    own = rows.labels == 1
+    return rows, own, (rows.labels > 0) & ~own, rows.labels == 0
+
+
+def places(scored, rows):
+    """Row and column of the windows that feature rows were taken from."""
+    rows = {row.tobytes() for row in rows}
+    return [place for place in np.ndindex(scored.scores.shape) if scored.row(*place).tobytes() in rows]
+
+
+def test_the_label_of_a_near_miss_is_a_gaussian_of_its_distance(frame, model):
+    around = ScoreMap.around(frame, OBJECT, 20, model)
+    rows, _, misses, _ = cut(frame, model, around)
+    row, column = around.place(OBJECT)
+    assert (row, column) == (6, 6)
+    worth = {around.row(*place).tobytes(): np.hypot(place[0] - row, place[1] - column) for place in np.ndindex(13, 13)}
+    assert misses.sum() > 100
+    for features, label in zip(rows.rows[misses], rows.labels[misses], strict=True):
+        assert label == pytest.approx(np.exp(-((worth[features.tobytes()] / SETTINGS.teaching.near_sigma) ** 2) / 2))
+
+
+def test_a_window_nearer_than_most_of_a_cell_is_no_near_miss(frame, model):
+    around = ScoreMap.around(frame, OBJECT, 20, model)
+    window = OBJECT.centred(OBJECT.centre[0] + 4, OBJECT.centre[1] - 3)  # half a cell of 8 pixels, and less
+    rows, _, misses, _ = cut(frame, model, around, window)
+    row, column = around.place(window)
+    distances = [np.hypot(place[0] - row, place[1] - column) for place in places(around, rows.rows[misses])]
+    assert 0.9 < min(distances) < max(distances) < 4
+
+
+def test_background_is_beyond_the_near_misses_and_half_of_it_scores_highest(frame, model):
+    around = ScoreMap.around(frame, OBJECT, 20, model)
+    rows, _, _, background = cut(frame, model, around)
+    assert background.sum() == SETTINGS.teaching.near_negatives
+    taken = places(around, rows.rows[background])
+    assert all(max(abs(row - 6), abs(column - 6)) > 2 for row, column in taken)
+    outside = [place for place in np.ndindex(13, 13) if max(abs(place[0] - 6), abs(place[1] - 6)) > 2]
+    best = max(outside, key=lambda place: around.scores[place])
+    assert best in taken
+
+
+def test_the_object_at_the_edge_of_what_was_searched_is_learned_from_as_well(frame, model):
+    around = ScoreMap.around(frame, OBJECT, 20, model)
+    edge = around.window(0, 12)
+    rows, own, misses, background = cut(frame, model, around, edge)
+    assert own.sum() == 1 + SETTINGS.teaching.copies
+    assert background.sum() == SETTINGS.teaching.near_negatives
+    assert misses.any()
+    assert np.isfinite(rows.rows).all()
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["model", "none"])
+def test_where_no_search_left_cells_they_are_cut_around_the_box(frame, model, known):
+    rows, own, misses, background = cut(frame, model if known else None)
+    assert own.sum() == 1 + SETTINGS.teaching.copies
+    assert misses.any()
+    assert background.sum() == SETTINGS.teaching.near_negatives
+    scored = ScoreMap.around(frame, OBJECT, 20, model)
+    assert scored.scores.shape == (20 - WINDOW + 1,) * 2
+    assert len(places(scored, rows.rows[~own])) > 20
+
+
+def test_scores_of_a_narrow_search_are_not_enough(frame, model):
+    narrow = ScoreMap.around(frame, OBJECT, 12, model)
+    for one, other in zip(cut(frame, model, narrow), cut(frame, model), strict=True):
+        np.testing.assert_array_equal(getattr(one, "rows", one), getattr(other, "rows", other))
+
+
+def test_the_label_of_a_wrong_size_or_aspect_ratio_is_a_gaussian_of_its_steps(frame, model):
+    settings = SETTINGS.but({"extent.size_count": 5, "extent.aspect_count": 3})
+    training = teacher.training_at(frame, OBJECT, 3, model, settings)
+    own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)
+    extents = training[EXTENT]
+    np.testing.assert_array_equal(extents.rows[0], own)
+    np.testing.assert_array_equal(training[APPEARANCE].rows[0], own)
+    assert extents.labels == pytest.approx([1, *np.exp([-2, -0.5, -0.5, -2]), *np.exp([-0.5, -0.5])])
+    assert all(np.abs(row - own).max() > 0.01 for row in extents.rows[1:])
+
+
+def test_without_a_weight_of_the_extent_head_it_has_no_rows(frame, model):
+    assert set(teacher.training_at(frame, OBJECT, 3, model, SETTINGS.but({"extent.weight": 0}))) == {APPEARANCE}
+
+
+def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
+    rows = teacher.hard_negatives(frame, OBJECT, model, SETTINGS.teaching)
+    scores = rows.rows @ model.weights
+    assert 0 < len(rows) <= SETTINGS.teaching.hard_negatives
+    assert list(scores) == sorted(scores, reverse=True)
+    assert not rows.labels.any()
+    own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)
+    assert min(np.abs(rows.rows - own).max(axis=1)) > 0.01
+
+
+def test_colours_that_are_not_used_are_0_in_every_row(frame, model):
+    for used in (True, False):
+        settings = SETTINGS.but({"teaching.colours": used})
+        first, training = teacher.first_training(frame, OBJECT, np.random.default_rng(1), settings)
+        groups = [*training.values(), *teacher.training_at(frame, OBJECT, 3, model, settings).values()]
+        assert all(group.rows[:, COLOURS].any() == used for group in groups)
+        assert first.weights[COLOURS].any() == used
