@@ -1,6 +1,6 @@
-"""The table of heads. A head is one coreset tree of the compressor, and what the trainer learns from its sample.
+"""The table of heads. A head is one coreset tree of the compressor and the regression that is trained on its sample.
 
-Compressor, trainer, checkpoint, codec, `catstream watch` and the page go by this table: a new head is a new row.
+Compressor, trainer, checkpoint, codec, `catstream watch` and the page use this table: a new head is a new row.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ __all__ = ["APPEARANCE", "BACKGROUND", "EXTENT", "GROUPS", "HEADS", "OBJECT", "H
 
 #: Training rows of windows at and around the object: label 1 the object, 0 background, between them a near miss.
 APPEARANCE = "appearance"
-#: Training rows of the object cut at the right and at wrong sizes and aspects: the label is how well the cut fits.
+#: Training rows of windows of the right and of wrong sizes and aspects at the object: label 1 the right one, towards 0.
 EXTENT = "extent"
 
 
@@ -19,16 +19,16 @@ EXTENT = "extent"
 class Head:
     """One row of the table.
 
-    name           of its tree, of its counters, and of its vector in a `Model`
-    group          of the training rows that its tree takes
-    label          its tree takes the feature rows of this label only. None: it takes all rows of the group, as
-                   [x, 1, y] times the root of their weight, so that ||A [w; b; -1]||^2 is the squared error of a
-                   linear model, and the trainer fits one by ridge regression
-    ridge          penalty of the regression; the least squares of `OBJECT` against `BACKGROUND` takes the background's
-    adds_to_score  its direction is a part of the score, and no sample is made before its tree has a leaf. Otherwise
-                   the head is fitted to what the score leaves over, and has a vector of its own in `Model.heads`
-    title          for people
-    meaning        what its tree summarises, for people
+    name           name of its tree, of its counters, and of its vector in a `Model`
+    group          group of the training rows that its tree takes
+    label          if given, its tree takes the feature rows x with this label only. If None, it takes all rows of the
+                   group with their label y, as [x, 1, y] * sqrt(weight). Then ||A [w; b; -1]||^2 is the squared error
+                   of the linear model (w, b), which the trainer minimises by ridge regression
+    ridge          penalty of the regression; the least squares of `OBJECT` against `BACKGROUND` uses the background's
+    adds_to_score  if true, its direction is added to the score, and no sample is made before its tree has a leaf.
+                   Otherwise it is fitted to the residual of the score, and has its own vector in `Model.heads`
+    title          title on the page
+    meaning        description of its tree on the page
     """
 
     name: str
@@ -41,7 +41,7 @@ class Head:
 
     @property
     def more_columns(self) -> int:
-        """Columns of a row of its tree beyond those of a feature row."""
+        """Number of columns of its tree in addition to those of a feature row."""
         return 2 if self.label is None else 0
 
 

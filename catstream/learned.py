@@ -1,6 +1,6 @@
-"""What was learned of an object, in a file: enough to find it again elsewhere, and to go on learning.
+"""A saved model: with it, the object is found again in another video, and training continues.
 
-The newest model, the sample of the coreset trees that it was learned from, and how large the object was.
+The file has the newest model, the sample of the coreset trees that it was trained on, and the last box.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _KIND = "learned 2"  # and the version of what the file holds
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A model, and what it was learned from.
+    """A model and the sample that it was trained on.
 
-    model   the newest there was; of a file, as if it was learned before frame 0
-    sample  the one that the model was learned from
-    box     where the object was last, in pixels: its size is what a search begins with
+    model   the newest model; loaded from a file, its frame is 0
+    sample  the sample that the model was trained on
+    box     last box of the object, in pixels: a search begins with its size
     """
 
     model: Model
@@ -38,12 +38,12 @@ class Learned:
     box: Box
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write one safetensors file, whole or not at all.
+        """Write one safetensors file, atomically.
 
         Raises
         ------
         ServiceError
-            Where it cannot be written.
+            If it cannot be written.
         """
         sample_arrays, sample_facts = pack(self.sample, "sample")
         model_arrays, model_facts = pack(self.model, "model")
@@ -60,9 +60,9 @@ class Learned:
         Raises
         ------
         ServiceError
-            Where it cannot be read.
+            If it does not exist.
         ProtocolError
-            Where it is torn, damaged, or another file.
+            If it is damaged, or another file.
         """
         if not Path(path).is_file():
             raise ServiceError(f"there is no saved model {str(path)!r}: `catstream save` writes one")

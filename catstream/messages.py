@@ -1,11 +1,10 @@
-"""The facts that travel between the stages.
+"""The messages between the stages.
 
-Each message is a noun, frozen, and complete by itself. In one process the
-stages hand them over as they are; between processes `catstream.wire` turns
-them into msgpack and back, and checks every field on arrival.
+A message is frozen and complete by itself. In one process the stages pass the objects themselves. Between processes
+`catstream.wire` converts them to msgpack and back, and checks every field on arrival.
 
-The annotations are the schema (see `catstream.schema`), and the docstrings say what the fields mean: the checks of
-the codec, the tables of `docs/protocol.md` and the fuzzers are derived from both.
+The annotations are the schema (see `catstream.schema`), and the docstrings describe the fields. The checks, the files
+of `catstream.packing`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
 
 `d` is the length of a feature row (`catstream.features.cells.row_length`), `n`
 the coreset size, frames count from 0.
@@ -54,7 +53,7 @@ Verb = Literal["set-box", "pause", "resume", "save", "stop"]
 
 _COLUMNS = {name: head.more_columns for name, head in HEADS.items()}
 _REQUIRED = frozenset(name for name, head in HEADS.items() if head.adds_to_score)
-_BESIDE = {name: 0 for name in HEADS if name not in _REQUIRED}
+_NOT_IN_THE_SCORE = {name: 0 for name in HEADS if name not in _REQUIRED}
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +101,12 @@ class DetectorState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingRows:
-    """Feature rows of windows of a frame, with the label that each should get.
+    """Feature rows of windows of a frame, each with its label and weight.
 
     rows     features of the windows
-    labels   of group "appearance" 1 the object, 0 background, between them a near miss; of group "extent" how well
-             the cut fits: 1 the right size and aspect, towards 0 far from them
-    weights  how many ordinary rows each counts for
+    labels   group "appearance": 1 for the object, 0 for background, between them for a near miss; group "extent": 1 for
+             a window of the right size and aspect, towards 0 for windows far from it
+    weights  number of ordinary rows that each stands for
     """
 
     rows: Annotated[np.ndarray, Array("float32", ("k", "d"))]
@@ -133,15 +132,15 @@ class TrainingRows:
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """What one frame teaches: rows for the coreset trees, detector -> compressor.
+    """The training rows of one frame, detector -> compressor.
 
-    seq       1, 2, 3 ... without a gap: one message a frame
-    frame     the frame the rows were cut from
-    time      seconds since the start of the source, of a live one since that of the run
-    box       where the object was found, or None
-    training  by group, see `catstream.heads`; a group without rows is left out
-    detector  from where a restarted detector goes on; None where the sender has none
-    begins    whether another object begins here: what was learned before is forgotten
+    seq       number of the message: 1, 2, 3 ... without a gap, one message a frame
+    frame     number of the frame that the rows were cut from
+    time      seconds since the start of the source, or of the run if the source is live
+    box       the object's box, None if it was not found
+    training  training rows of each group of `catstream.heads`; a group without rows is left out
+    detector  state of the detector after this frame, from which a restarted detector continues; None before it has one
+    begins    whether a new object is tracked from this frame on: the trees begin anew
     """
 
     seq: int
@@ -155,12 +154,12 @@ class Features:
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """Acknowledges messages of an acknowledged channel, receiver -> sender.
+    """Acknowledges the messages of an acknowledged channel, receiver -> sender.
 
-    seq      every message up to and with this one survives the receiver's death, but for `unsaved`: forget it
-    taken    every message up to and with this one has been taken
-    version  the newest Sample made so far, 0 before the first
-    unsaved  how many of those up to `seq`, the last ones, are in memory only: the disk takes nothing
+    seq      all messages up to this one are stored, except for the last `unsaved` ones: the sender drops them
+    taken    all messages up to this one have been processed
+    version  version of the newest Sample, 0 before the first
+    unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """
 
     seq: int
@@ -171,14 +170,14 @@ class Stored:
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where a stream goes on: a receiver's answer to each new connection.
+    """Where a stream continues: the answer of a receiver to each new connection.
 
-    seq       the last message stored, 0 in a new stream: send from the next one on
-    frame     its frame
-    box       where the object was last found, None in a new stream
-    version   the newest Sample made so far, 0 before the first
-    detector  that of that message, None where it had none
-    unsaved   how many of those up to `seq`, the last ones, are in memory only: the disk takes nothing
+    seq       the last message that is stored, 0 in a new stream: the sender continues with the next one
+    frame     number of its frame
+    box       box in which the object was last found, None in a new stream
+    version   version of the newest Sample, 0 before the first
+    detector  the detector state of message `seq`, None if it had none
+    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """
 
     seq: int = 0
@@ -193,10 +192,10 @@ class Position:
 class Summary:
     """A hierarchical sample of one coreset tree (paper, section "Coreset Appearance Model").
 
-    rows    at most 2n, spread and rescaled: each weighs one original row
-    mean    exact mean of all rows ever inserted
-    count   how many rows that was
-    levels  level of each node in memory, oldest first, strictly falling
+    rows    at most 2n rows, rotated and rescaled so that each has the weight of one original row
+    mean    exact mean of all rows that were inserted
+    count   number of rows that were inserted
+    levels  level of each node in memory, oldest first, strictly decreasing
     """
 
     rows: Annotated[np.ndarray, Array("float32", ("r", "d"))]
@@ -207,12 +206,12 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What the trainer learns from, compressor -> trainer; only the newest counts.
+    """A training sample of all frames so far, compressor -> trainer; only the newest is used.
 
-    version  1, 2, 3 ... in order of making
-    frame    newest frame that it summarises
-    trees    by head, see `catstream.heads`; a tree without a leaf is left out
-    centres  centre of the object in each frame of the last whole block of frames, pixels; NaN while absent
+    version  1, 2, 3 ... in the order in which they are made
+    frame    number of the newest frame that it summarises
+    trees    the summary of each tree of `catstream.heads`; a tree without a leaf is left out
+    centres  centre of the object in each frame of the last complete block of frames, pixels; NaN while absent
     """
 
     version: int
@@ -225,13 +224,13 @@ class Sample:
 class Model:
     """A trained appearance model, trainer -> detector and anyone.
 
-    version  that of the Sample it was learned from
-    frame    newest frame that the sample summarises
-    weights  score of a window = weights @ row + bias
-    bias     so that the score is 0 at the background's mean and 1 at the object's
-    motion   parameters of the Kalman filter, or None before EM had enough centres
-    heads    vectors of the heads that do not add to the score, as far as they are trained: of windows around one
-             place, the one that fits the object best has the largest (weights + heads["extent"]) @ row
+    version  version of the Sample that it was trained on
+    frame    number of the newest frame that the sample summarises
+    weights  of the score of a window: weights @ row + bias
+    bias     chosen so that the score is 0 at the mean of the background and 1 at the mean of the object
+    motion   parameters of the Kalman filter, None until there are enough centres for EM
+    heads    vector of each head that does not add to the score, once it is trained. The best fitting size and aspect
+             at a place maximise (weights + heads["extent"]) @ row
     """
 
     version: int
@@ -239,7 +238,7 @@ class Model:
     weights: Annotated[np.ndarray, Array("float32", ("d",))]
     bias: float
     motion: Motion | None = None
-    heads: Annotated[dict[str, Annotated[np.ndarray, Array("float32", ("d",))]], Named(_BESIDE)] = field(
+    heads: Annotated[dict[str, Annotated[np.ndarray, Array("float32", ("d",))]], Named(_NOT_IN_THE_SCORE)] = field(
         default_factory=dict
     )
 
@@ -251,21 +250,21 @@ class Track:
     Attributes
     ----------
     seq : int
-        1, 2, 3 ...: a gap means that this subscriber missed some.
+        1, 2, 3 ...: a gap means that this subscriber missed messages.
     frame : int
         Number of the frame.
     time : float
-        Seconds since the start of the source, of a live one since that of the run.
+        Seconds since the start of the source, or of the run if the source is live.
     state : str
         "bootstrapping" until the first model, then "present" or "absent".
     box : Box or None
-        Where it is, in pixels of the frame; None while absent.
+        Box of the object, in pixels of the frame; None while absent.
     score : float
         Confidence: about 0 on background, about 1 on the object.
     model_version : int
-        The model that scored it, 0 before the first.
+        Version of the model that scored it, 0 before the first.
     pts : float or None
-        Time stamp of the frame in a live stream, seconds of a clock of the stream's own; None of a file.
+        Time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file.
 
     Examples
     --------
@@ -313,13 +312,13 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """A small picture of a frame that was followed, or that waits for a box, detector -> anyone.
+    """A small picture of a frame, detector -> anyone.
 
     frame   number of the frame
-    width   of the frame in pixels; the picture may be smaller
-    height  of the frame in pixels
-    box     where the object was found in it, in pixels of the frame; None while absent, or before there is a box
-    jpeg    the picture: a JPEG file, its sides in the proportion of the frame's
+    width   width of the frame in pixels; the picture may be smaller
+    height  height of the frame in pixels
+    box     box of the object, in pixels of the frame; None while it is absent, or before a box was given
+    jpeg    the picture as a JPEG file, with the frame's aspect ratio
     """
 
     frame: int
@@ -331,13 +330,13 @@ class Preview:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """How a process is, once a second, every process -> anyone.
+    """The condition of a process, once a second, every process -> anyone.
 
-    process   its name
-    time      seconds since the epoch
-    counters  what it counts: name -> number
-    trouble   what is wrong with it, for a person to read; empty where nothing is
-    source    that the pipeline follows, without user and password; only the detector knows it
+    process   name of the process
+    time      seconds since the epoch (1970)
+    counters  counters of the process, by name
+    trouble   description of what is wrong with the process, empty if nothing is
+    source    the video source without user and password; empty except for the detector
     """
 
     process: str
@@ -352,7 +351,7 @@ class Run:
     """What a pipeline runs with: with it, its features can be learned from again, detector -> anyone.
 
     program   version of catstream
-    settings  name -> value of all settings but `run.endpoint` and `run.keys`, each as the text that `--set` takes
+    settings  all settings except `run.endpoint` and `run.keys`, by name, each as the text that `--set` takes
     """
 
     program: str
@@ -366,12 +365,12 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """The last message of a stream: nothing follows.
+    """The last message of a stream.
 
-    seq     one after the last message before it
-    reason  why it ended, for a person to read
-    failed  whether that was an error
-    totals  what was counted: name -> number
+    seq     number of the last message before it, plus one
+    reason  description of why the stream ended
+    failed  whether it ended because of an error
+    totals  final counters, by name: features messages `sent` and `stored`
     """
 
     seq: int
@@ -382,12 +381,12 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What somebody wants of a running pipeline, anyone -> detector.
+    """A control command to a running pipeline, anyone -> detector.
 
-    id    chosen anew for each command: one that comes twice is answered twice, and done once
-    verb  what to do
-    box   with "set-box": where the object is in the newest frame, in pixels
-    keep  with "set-box": it is the same object, and what was learned of it is kept
+    id    unique for each command: a command that is received twice is executed once and answered twice
+    verb  the action
+    box   for "set-box": box of the object in the newest frame, in pixels
+    keep  for "set-box": whether it is the same object, so that everything learned about it is kept
     """
 
     id: str
@@ -398,14 +397,14 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of a Command, detector -> who sent it.
+    """The answer to a Command, detector -> its sender.
 
-    id       that of the command
-    done     whether it was carried out
-    reason   what was done, or why nothing was, for a person to read
-    frame    the newest frame that was followed by then
-    box      where the object was last, or None
-    version  the newest model of this object, 0 before the first
+    id       id of the command
+    done     whether it was executed
+    reason   description of what was done, or why nothing was
+    frame    number of the newest frame that was processed
+    box      last box of the object, None if there is none
+    version  version of the newest model of this object, 0 before the first
     """
 
     id: str

@@ -1,7 +1,6 @@
 """Ridge regression in closed form, for far fewer rows than features.
 
-By the push-through identity only a `rows x rows` system is solved, never a
-`d x d` one: O(r^2 d) for r rows.
+By the push-through identity an r x r system is solved in place of a d x d one: O(r^2 d) for r rows of length d.
 """
 
 from __future__ import annotations
@@ -12,19 +11,19 @@ __all__ = ["between", "fit", "prepare"]
 
 
 def prepare() -> None:
-    """Import what the first call needs, in a quarter of a second: for who has the time before it."""
+    """Import scipy before the first call, which would otherwise take a quarter of a second longer."""
     import scipy.linalg  # noqa: F401
 
 
 def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.ndarray:
-    """The direction that tells two means apart over a background: w = (S + penalty I)^-1 towards.
+    """The least-squares direction between two classes: w = (S + penalty I)^-1 towards.
 
-    S is the covariance of the background: least squares of two classes.
+    S is the covariance of the background.
 
     Parameters
     ----------
     background : float32 (r, d)
-    towards : float32 (d,), the object's mean minus the background's
+    towards : float32 (d,), mean of the object minus mean of the background
     penalty : lambda, in units of a feature's variance
 
     Returns
@@ -47,7 +46,7 @@ def fit(rows: np.ndarray, penalty: float) -> np.ndarray:
 
     Returns
     -------
-    float32 (d,), w; the bias is left to whoever scales the score
+    float32 (d,), w without b: the caller chooses the bias when it scales the score
     """
     scaled = rows / np.float32(np.sqrt(len(rows)))
     x, ones, y = scaled[:, :-2], scaled[:, -2], scaled[:, -1]
@@ -58,7 +57,7 @@ def fit(rows: np.ndarray, penalty: float) -> np.ndarray:
 
 
 def _solve(gram: np.ndarray, penalty: float, right: np.ndarray) -> np.ndarray:
-    import scipy.linalg  # a restarted detector has its model, and needs none of it
+    import scipy.linalg  # imported late: a restarted detector has its model, and does not need scipy
 
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
     solved: np.ndarray = scipy.linalg.solve(gram, right, assume_a="pos", overwrite_a=True, check_finite=False)

@@ -1,4 +1,4 @@
-"""The last checkpoints of a compressor, each a file: where the newest is damaged, there is one before it."""
+"""The last two checkpoints of a compressor, a file each: if the newest is damaged, the one before it is used."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from catstream.settings import Settings
 __all__ = ["CheckpointStore"]
 
 _KEPT = 2
-_DAMAGED = "damaged"  # the newest of these is kept, for whoever wants to know why
+_DAMAGED = "damaged"  # name of the newest damaged checkpoint, which is kept for analysis
 
 _log = logging.getLogger(__name__)
 
 
 class CheckpointStore:
-    """Checkpoints in a folder: the newest `_KEPT`, one that was found damaged, and nothing else.
+    """A folder with the newest two checkpoints, and one that was found damaged.
 
-    A file appears there whole or not at all, and is on disk before the call returns. None is
-    written over: what is there stays until a newer one is whole.
+    A checkpoint is written atomically, and is on disk before `save` returns. No file is overwritten: an older
+    checkpoint is removed after a newer one is complete.
 
     Parameters
     ----------
-    folder : of the checkpoints, and of nothing else
+    folder : folder that holds only the checkpoints
 
     Attributes
     ----------
-    trouble : what is wrong now, for a person; empty where nothing is
+    trouble : description of what is wrong now, empty if nothing is
     failing : whether the last checkpoint could not be written
     """
 
@@ -38,20 +38,22 @@ class CheckpointStore:
         self.failing = False
         self._folder = Path(folder)
         self._damaged: list[Path] = []
-        self._said = ""  # of damaged files
-        self._why = ""  # the last checkpoint could not be written
+        self._found_damaged = ""  # description of the damaged files
+        self._not_written = ""  # description of why the last checkpoint could not be written
 
     @property
     def trouble(self) -> str:
-        return "; ".join(filter(None, (self._why, self._said)))
+        return "; ".join(filter(None, (self._not_written, self._found_damaged)))
 
     def load(self, settings: Settings) -> Compressor:
-        """A compressor that goes on from the newest checkpoint that is whole; a new one where there is none.
+        """A compressor from the newest undamaged checkpoint, a new one if there is none.
 
         Raises
         ------
+        ServiceError
+            If the newest undamaged file is not a checkpoint, or one of another version of catstream.
         SettingsError
-            Where they were made with another coreset size.
+            If it was made with another coreset size.
         """
         self._damaged, compressor = [], None
         for path in reversed(self._files()):
@@ -63,25 +65,25 @@ class CheckpointStore:
                 self._damaged.append(path)
         if self._damaged:
             instead = f"the one of frame {compressor.frame} was used" if compressor else "all is learned anew"
-            self._said = f"damaged checkpoints: {len(self._damaged)}, {instead}"
-            _log.warning("%s", self._said)
+            self._found_damaged = f"damaged checkpoints: {len(self._damaged)}, {instead}"
+            _log.warning("%s", self._found_damaged)
         return compressor or Compressor(settings)
 
     def save(self, compressor: Compressor) -> bool:
-        """Write the next one, and remove the oldest; False where it cannot be written, and all stays as it was."""
+        """Write a checkpoint, and remove the oldest; returns False and changes nothing if it cannot be written."""
         files = self._files()
         number = int(files[-1].stem) + 1 if files else 1
         try:
             compressor.save(self._folder / f"{number:012d}.safetensors")
         except OSError as error:
             why = f"no checkpoint can be written to {self._folder} ({error.strerror})"
-            if why != self._why:
+            if why != self._not_written:
                 _log.warning("%s: what is learned is kept in memory only, and it is tried again", why)
-            self.failing, self._why = True, why
+            self.failing, self._not_written = True, why
             return False
         if self.failing:
             _log.warning("checkpoints are written again")
-        self.failing, self._why = False, ""
+        self.failing, self._not_written = False, ""
         for path in self._damaged:
             path.replace(self._folder / _DAMAGED)
         self._damaged = []
@@ -90,5 +92,5 @@ class CheckpointStore:
         return True
 
     def _files(self) -> list[Path]:
-        """Oldest first."""
+        """The checkpoints, oldest first."""
         return sorted(self._folder.glob("[0-9]*.safetensors"))

@@ -1,4 +1,4 @@
-"""The compressor: every frame's features in, now and then a sample to learn from out.
+"""The compressor: takes the features of every frame, and returns a training sample now and then.
 
 It is the only owner of the coreset trees: one for each head of `catstream.heads`.
 """
@@ -26,19 +26,19 @@ _GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few fra
 
 
 class Compressor:
-    """Summarises all frames so far; answers with a sample when there is something new to learn.
+    """Summarises all frames so far, and returns a sample when the trees have grown enough.
 
     Constant time a frame on average, logarithmic memory. The same messages make
     the same samples, bit for bit, also across `save` and `load`.
 
     Parameters
     ----------
-    tree : class of its trees: what `sample` of one shows is learned from
+    tree : class of its trees
 
     Attributes
     ----------
-    last_sample : the newest, None before the first
-    detector : the state of the detector that came with the last message: a restarted detector goes on from there
+    last_sample : the newest sample, None before the first
+    detector : the detector state in the last message: a restarted detector continues from it
     """
 
     def __init__(self, settings: Settings, tree: type[CoresetTree] = CoresetTree) -> None:
@@ -55,7 +55,7 @@ class Compressor:
         self._forget()
 
     def _forget(self) -> None:
-        """All but the stream of messages and the versions of samples, which go on."""
+        """Reset everything except the position in the stream and the version of the samples."""
         self.trees = {name: self._tree(self.settings.coreset.size) for name in HEADS}
         self.centres = np.empty((0, 2))
         self._path: list[tuple[float, float]] = []
@@ -65,7 +65,7 @@ class Compressor:
 
     @classmethod
     def of(cls, sample: Sample, settings: Settings) -> Compressor:
-        """Go on with what a sample of an earlier stream summarises, in trees of one node each; versions go on."""
+        """A compressor whose trees are made from a sample of an earlier stream, one node each; versions continue."""
         self = cls(settings)
         for name, summary in sample.trees.items():
             self.trees[name] = CoresetTree.of(summary, settings.coreset.size)
@@ -73,7 +73,7 @@ class Compressor:
         return self
 
     def check(self, features: Features) -> None:
-        """Raise ProtocolError where rows have another length than those before: they are of another stream."""
+        """Raise ProtocolError if rows have another length than those before."""
         before = {self.trees[name].width - head.more_columns for name, head in HEADS.items() if self.trees[name].width}
         width = max(before, default=0)
         for training in features.training.values():
@@ -85,16 +85,16 @@ class Compressor:
                 )
 
     def take(self, features: Features) -> Sample | None:
-        """Store one frame's features; a sample where the trees have grown enough since the last.
+        """Insert the features of one frame; returns a sample if the trees have grown enough since the last one.
 
-        Where another object begins, all trees begin anew; versions of samples go on. A message
-        that is stored already (by `seq`) is ignored.
+        If a new object begins, all trees begin anew; the versions of samples continue. A message with a `seq` that was
+        taken before is ignored.
 
         Raises
         ------
         ProtocolError
-            Where a message is missing before this one, or its rows are of
-            another length than those before. Nothing of it is stored.
+            If a message before this one is missing, or its rows have another length than those before. Nothing of it
+            is inserted.
         """
         if features.seq <= self.seq:
             return None
@@ -117,26 +117,26 @@ class Compressor:
 
     @property
     def version(self) -> int:
-        """That of the last sample, 0 before the first."""
+        """Version of the last sample, 0 before the first."""
         return self.last_sample.version if self.last_sample else 0
 
     @property
     def position(self) -> Position:
-        """Where the stream of messages goes on, once all that was taken is stored."""
+        """Position at which the stream continues, once everything that was taken is stored."""
         return Position(self.seq, max(self.frame, 0), self.box, self.sampled, self.detector)
 
     @property
     def leaves(self) -> int:
-        """Leaves ever inserted into the trees."""
+        """Number of leaves that were inserted into the trees."""
         return sum(self._leaves().values())
 
     @property
     def sampled(self) -> int:
-        """Version of the last sample, 0 where it was of another object."""
+        """Version of the last sample, 0 if it was of another object."""
         return self.version if self._sampled_leaves else 0
 
     def counters(self) -> dict[str, float]:
-        """What health tells of it."""
+        """Counters for the health messages."""
         return {
             "seq": self.seq,
             "version": self.version,
@@ -149,12 +149,12 @@ class Compressor:
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one file, whole or not at all."""
+        """Write everything to one file, atomically."""
         arrays, facts = self.state()
         storage.write(path, arrays, facts | {"kind": _KIND})
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Arrays and facts that `from_state` goes on from."""
+        """Arrays and facts that `from_state` restores."""
         arrays: dict[str, np.ndarray] = {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
         facts: dict[str, Any] = {
             "seq": self.seq,
@@ -163,8 +163,8 @@ class Compressor:
             "sampled_leaves": self._sampled_leaves,
             "trees": {},
         }
-        # The trees grow on after a sample. The sample itself is kept too: from it, a trainer that starts anew learns
-        # the model that the detector goes by.
+        # The trees grow after a sample was made. The sample is kept too, so that a restarted trainer trains the same
+        # model again that the detector uses.
         for name, message in (("sample", self.last_sample), ("detector", self.detector)):
             if message is not None:
                 own, facts[name] = pack(message, name)
@@ -176,7 +176,7 @@ class Compressor:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], settings: Settings) -> Compressor:
-        """Go on where `save` was called.
+        """Restore what `save` wrote.
 
         Raises
         ------
@@ -206,7 +206,7 @@ class Compressor:
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any], settings: Settings) -> Compressor:
-        """Go on where `state` was called; KeyError, TypeError or ValueError if these are none."""
+        """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
         self = cls(settings)
         self.seq, self.frame = int(facts["seq"]), int(facts["frame"])
         self.box = Box(*facts["box"]) if facts["box"] else None
@@ -222,18 +222,18 @@ class Compressor:
         return self
 
     def _leaves(self) -> dict[str, int]:
-        """Of each tree: the levels of its nodes are the ones in this number's binary digits."""
+        """Leaves of each tree: the levels of its nodes are the binary digits of this number that are 1."""
         return {name: sum(1 << node.level for node in tree.nodes) for name, tree in self.trees.items()}
 
     def _follow(self, box: Box | None) -> None:
-        """Centres go out in whole blocks, so that the trainer learns the motion once a block."""
+        """Append the centre of a box. Samples have complete blocks only, so that motion is trained once a block."""
         self._path.append(box.centre if box else (np.nan, np.nan))
         if len(self._path) == self.settings.search.motion_frames:
             self.centres = np.array(self._path)
             self._path = []
 
     def _due(self) -> bool:
-        """Trees that can teach, and a leaf more than last time: at once while they are small, else not too soon."""
+        """Whether there is a new leaf, and the trees have grown by an eighth or the interval is over."""
         if not all(self.trees[name].nodes for name, head in HEADS.items() if head.adds_to_score):
             return False
         leaves, last = self.leaves, self.last_sample

@@ -1,4 +1,4 @@
-"""A node of the coreset tree: what consecutive rows are summarised by."""
+"""A node of the coreset tree: the summary of consecutive rows."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ __all__ = ["Node"]
 class Node:
     """A coreset of `count` consecutive rows.
 
-    level   how often it was merged: 0 for a leaf; it stands for n * 2**level rows
-    rows    float32 (n, d): of a leaf as they came, else orthogonal, strongest direction first
-    count   rows it stands for
-    sum     float64 (d,), their exact sum
-    energy  ||A||^2 of all of them
+    level   0 for a leaf, otherwise one more than the level of the two nodes that were merged; it summarises
+            n * 2**level rows
+    rows    float32 (n, d): the original rows in a leaf, otherwise orthogonal rows, strongest direction first
+    count   number of rows that it summarises
+    sum     float64 (d,), exact sum of these rows
+    energy  ||A||^2 of these rows
     """
 
     level: int
@@ -36,17 +37,17 @@ class Node:
 
     @property
     def dropped(self) -> float:
-        """c of the paper: what all reductions below it lost, ||A||^2 = ||C||^2 + c."""
+        """c of the paper, the energy that all reductions below it lost: ||A||^2 = ||C||^2 + c."""
         return self.energy - energy(self.rows)
 
     @cached_property
     def directions(self) -> np.ndarray:
-        """Its rows turned so that they are orthogonal, and the strongest comes first."""
-        # Most leaves are merged before anyone asks, which saves turning them.
+        """Its rows rotated so that they are orthogonal, strongest first."""
+        # Leaves are rotated only if a sample is made of them: most are merged before.
         return self.rows if self.level else reduce(self.rows, len(self.rows), towards=self.sum)
 
     def merged(self, newer: Node) -> Node:
-        """One node, a level up, for the rows of two of the same level."""
+        """The node one level up that summarises this node and a newer one of the same level."""
         total = self.sum + newer.sum
         rows = reduce(np.vstack([self.rows, newer.rows]), len(self.rows), towards=total)
         return Node(self.level + 1, rows, self.count + newer.count, total, self.energy + newer.energy)

@@ -1,7 +1,6 @@
-"""Reduction: fewer rows that stand for many, in the directions that matter most.
+"""Reduction of many rows to few, by the singular value decomposition A = U S V'.
 
-With the singular value decomposition A = U S V', the first n rows of S V' are
-the best n rows there are: no other n keep more of ||A||^2, the sum of squares.
+The first n rows of S V' are optimal: no other n rows keep more of ||A||^2, the sum of squares.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ __all__ = ["energy", "prepare", "reduce"]
 
 
 def prepare() -> None:
-    """Import what the first reduction needs, in a quarter of a second: for who has the time before it."""
+    """Import scipy before the first reduction, which would otherwise take a quarter of a second longer."""
     import scipy.linalg  # noqa: F401
 
 
@@ -37,8 +36,8 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     ----------
     rows : float32 (m, d)
     size : rows to keep (n in the paper), at least 1
-    towards : float (d,), each kept direction gets the sign that points this way, since a singular
-        vector has none of its own; the sum of the rows where None
+    towards : float (d,), each row gets the sign with which its product with this vector is not negative, because the
+        sign of a singular vector is arbitrary; None: the sum of the rows
 
     Returns
     -------
@@ -47,12 +46,12 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     >>> reduce(np.ones((6, 4), np.float32), size=2).shape
     (2, 4)
     """
-    import scipy.linalg  # a restarted compressor answers first
+    import scipy.linalg  # imported late, so that a restarted compressor can answer first
 
     m = len(rows)
     keep = min(size, m)
     gram = rows @ rows.T
-    # Divide and conquer: the default driver loses orthogonality, or vectors, where many eigenvalues are equal.
+    # Divide and conquer: the default driver loses orthogonality, or vectors, if many eigenvalues are equal.
     _, vectors = scipy.linalg.eigh(gram, driver="evd", overwrite_a=True, check_finite=False)
     kept = vectors[:, : -keep - 1 : -1].T @ rows
     kept[kept @ (rows.sum(axis=0) if towards is None else towards).astype(np.float32) < 0] *= -1

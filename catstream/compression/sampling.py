@@ -1,10 +1,9 @@
-"""The hierarchical sample: from each node as many rows as its age leaves it.
+"""The hierarchical sample: more rows of a node the higher its level is.
 
-A node's rows are singular directions, not images: the sign of each is
-arbitrary, and all but the first have a mean near zero, so a classifier learns
-nothing from them as they are. Any left rotation Q of a coreset is the same
-coreset, ||Q C Y|| = ||C Y||: the reflection that spreads the first, the mean
-direction, evenly over all rows makes every row "the mean plus a variation".
+The rows of a node are singular directions, not images: the sign of each is arbitrary, and all except the first have a
+mean near zero, so that a classifier cannot be trained on them. Any left rotation Q of a coreset is an equivalent
+coreset, ||Q C Y|| = ||C Y||. The reflection that distributes the first row, the mean direction, evenly over all rows
+makes every row the mean plus a variation.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ __all__ = ["sample", "share", "spread"]
 
 
 def share(level: int, top: int, size: int) -> int:
-    """Rows to take of a node: n w with w = 2**(level - top), rounded down.
+    """Number of rows to take from a node: n w with w = 2**(level - top), rounded down.
 
     >>> [share(level, top=3, size=64) for level in (3, 2, 0)]
     [64, 32, 8]
@@ -28,7 +27,7 @@ def share(level: int, top: int, size: int) -> int:
 
 
 def sample(nodes: Sequence[Node], size: int) -> np.ndarray:
-    """The first n w rows of each node, spread, each weighing one original row.
+    """The first n w rows of each node, reflected and rescaled so that each has the weight of one original row.
 
     Parameters
     ----------
@@ -52,7 +51,7 @@ def sample(nodes: Sequence[Node], size: int) -> np.ndarray:
 
 
 def spread(rows: np.ndarray) -> np.ndarray:
-    """Reflect rows so that the first lies evenly in all: Q C with Q e1 = 1 / sqrt(m).
+    """Reflect rows so that the first is distributed evenly over all: Q C with Q e1 = 1 / sqrt(m).
 
     A Householder reflection: Q'Q = I, so that the result is the same coreset. Costs O(m d).
 

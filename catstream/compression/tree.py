@@ -1,13 +1,12 @@
-"""The coreset tree: all rows ever inserted, summarised in logarithmic memory.
+"""The coreset tree: a summary of all inserted rows in logarithmic memory.
 
-Rows gather until there are n; these become a leaf. Whenever the two newest
-nodes have the same level, their 2n rows are reduced to n, a node one level up
-(paper, "Coreset Tree Implementation").
+Every n rows become a leaf. Whenever the two newest nodes have the same level, their 2n rows are reduced to n, and
+become a node one level up (paper, "Coreset Tree Implementation").
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CoresetTree"]
 
-_LEVELS = 64  # more leaves than any stream has
+_LEVELS = 64  # no stream has 2**64 leaves
 
 
 class CoresetTree:
@@ -31,12 +30,12 @@ class CoresetTree:
 
     For p rows it keeps at most log2(p / n) + 1 nodes, O(n d log p) bytes. Inserting a
     row costs O(n d) on average, and the same at any p. For every orthonormal Y,
-    `||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2`, where A is everything inserted, C the rows of
-    all nodes and those pending, and c is `dropped_energy`.
+    `||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2`, where A are all inserted rows, C the rows of
+    all nodes and the pending ones, and c is `dropped_energy`.
 
     Parameters
     ----------
-    size : rows of a node, n in the paper
+    size : number of rows of a node, n in the paper
 
     >>> tree = CoresetTree(size=4)
     >>> tree.insert(np.eye(13, 5, dtype=np.float32))
@@ -53,10 +52,10 @@ class CoresetTree:
 
     @classmethod
     def of(cls, summary: Summary, size: int) -> CoresetTree:
-        """A tree of one node, for all that a sample of another tree stands for: as heavy, and with the same mean.
+        """A tree of one node with the weight and the mean of everything that a sample of another tree summarises.
 
-        Its count is rounded down to what a node may stand for. Where it is less than a leaf, its rows are pending.
-        What the sample had lost is in no bound of this tree.
+        The count is rounded down to n * 2**level. If it is less than a leaf, the rows of the sample are pending rows.
+        The bound of this tree does not include the energy that the sample had lost.
         """
         tree = cls(size)
         level = (summary.count // size).bit_length() - 1
@@ -79,12 +78,12 @@ class CoresetTree:
 
     @property
     def rows_seen(self) -> int:
-        """Rows ever inserted, p in the paper."""
+        """Number of inserted rows, p in the paper."""
         return sum(node.count for node in self.nodes) + len(self.pending)
 
     @property
     def sum(self) -> np.ndarray:
-        """Exact sum of all rows ever inserted, float64 (d,)."""
+        """Exact sum of all inserted rows, float64 (d,)."""
         total = self.pending.sum(axis=0, dtype=np.float64)
         for node in self.nodes:
             total = total + node.sum
@@ -97,7 +96,7 @@ class CoresetTree:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays held."""
+        """Size of all arrays in bytes."""
         return self.pending.nbytes + sum(node.rows.nbytes + node.sum.nbytes for node in self.nodes)
 
     def insert(self, rows: np.ndarray) -> None:
@@ -106,7 +105,7 @@ class CoresetTree:
         Raises
         ------
         ProtocolError
-            For rows of another length, or with numbers that are not finite.
+            If the rows have another length than those before, or numbers that are not finite.
         """
         rows = self._checked(rows)
         if not len(rows):
@@ -118,22 +117,22 @@ class CoresetTree:
         self.pending = waiting.copy()
 
     def merge(self, other: CoresetTree) -> None:
-        """Take in the summary of another stream: as if its rows had been inserted here.
+        """Add the summary of another stream, as if its rows had been inserted here.
 
-        The bound holds for both streams together; the other tree is left as it was.
+        The bound holds for both streams together. The other tree is not changed.
         """
         if other.size != self.size:
             raise ProtocolError(
-                f"a tree of size {self.size} cannot take in one of size {other.size}: build both with the same size"
+                f"a tree of size {self.size} cannot merge one of size {other.size}: build both with the same size"
             )
         if self.width and other.width and self.width != other.width:
             raise ProtocolError(
-                f"a tree of rows of length {self.width} cannot take in rows of length {other.width}: "
+                f"a tree of rows of length {self.width} cannot merge rows of length {other.width}: "
                 "build both from the same features"
             )
         if not self.width:
             self.pending = np.empty((0, other.width), np.float32)
-        # As in adding two binary numbers: equal levels merge, from the lowest up.
+        # As in the addition of two binary numbers, equal levels are merged from the lowest level up.
         carried = sorted([*self.nodes, *other.nodes], key=lambda node: -node.level)
         self.nodes = []
         while carried:
@@ -156,7 +155,7 @@ class CoresetTree:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the tree to a safetensors file, whole or not at all."""
+        """Write the tree to a safetensors file, atomically."""
         storage.write(path, *self.state())
 
     @classmethod
@@ -166,12 +165,12 @@ class CoresetTree:
         Raises
         ------
         ProtocolError
-            Where the file is not a whole, consistent tree.
+            If the file is damaged, or not a consistent tree.
         """
         return cls.from_state(*storage.read(path))
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-        """Arrays and facts that `from_state` makes this tree of again."""
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays and facts that `from_state` restores."""
         arrays = {"pending": self.pending}
         for i, node in enumerate(self.nodes):
             arrays[f"rows.{i}"] = node.rows
@@ -180,11 +179,11 @@ class CoresetTree:
         return arrays, {"size": self.size, "nodes": nodes}
 
     @classmethod
-    def from_state(cls, arrays: dict[str, np.ndarray], facts: dict[str, object]) -> CoresetTree:
-        """The tree whose `state` this is; ProtocolError where it is not one."""
+    def from_state(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> CoresetTree:
+        """The tree that `state` described; ProtocolError if it is something else."""
         try:
-            tree = cls(int(facts["size"]))  # type: ignore[call-overload]
-            for i, node in enumerate(facts["nodes"]):  # type: ignore[arg-type, var-annotated]
+            tree = cls(int(facts["size"]))
+            for i, node in enumerate(facts["nodes"]):
                 rows, total, whole = arrays[f"rows.{i}"], arrays[f"sum.{i}"], float.fromhex(node["energy"])
                 tree.nodes.append(Node(int(node["level"]), rows, int(node["count"]), total, whole))
             tree.pending = arrays["pending"]
@@ -213,7 +212,7 @@ class CoresetTree:
     def _check(self) -> None:
         levels = [node.level for node in self.nodes]
         if levels != sorted(set(levels), reverse=True):
-            raise ValueError(f"levels {levels} do not strictly fall")
+            raise ValueError(f"levels {levels} are not strictly decreasing")
         if self.pending.ndim != 2 or self.pending.dtype != np.float32 or len(self.pending) >= self.size:
             raise ValueError(f"pending rows of {self.pending.dtype} {self.pending.shape}")
         for node in self.nodes:

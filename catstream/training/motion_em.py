@@ -1,9 +1,7 @@
-"""How an object moves, learned from where it was: expectation maximisation (paper, "Classification").
+"""Expectation maximisation of the parameters of the Kalman filter (paper, "Classification").
 
-The centre of the object moves at constant velocity, but for a random push a
-frame, and is measured with an error: a linear-Gaussian model. The covariances
-of push and error are what is learned; the detector's Kalman filter then knows
-how far to trust a prediction, and how far a measurement.
+The model is linear and Gaussian: the centre of the object moves at constant velocity with process noise, and is
+measured with observation noise. EM estimates the covariances of both from the measured centres.
 """
 
 from __future__ import annotations
@@ -15,23 +13,22 @@ from catstream.messages import Motion
 
 __all__ = ["FEWEST", "OBSERVATION_FLOOR", "PROCESS_FLOOR", "learn_motion"]
 
-FEWEST = 8  #: centres that 13 free parameters can be learned from
+FEWEST = 8  #: centres that 13 free parameters can be estimated from
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
 OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels
 
 
 def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
-    """Find the covariances of a constant-velocity model that make these centres likely.
+    """Estimate the covariances of the constant-velocity model from centres, by maximum likelihood.
 
-    No iteration lowers their likelihood; the covariances are symmetric, and their
-    eigenvalues are not below `PROCESS_FLOOR` and `OBSERVATION_FLOOR`, so that a
-    motionless object gives a usable filter too. Costs O(m) an iteration, about 50
-    microseconds a frame.
+    No iteration lowers the likelihood. The covariances are symmetric, and their eigenvalues are at least
+    `PROCESS_FLOOR` and `OBSERVATION_FLOOR`, so that the filter also works for a motionless object. Costs O(m) an
+    iteration, about 50 microseconds a frame.
 
     Parameters
     ----------
-    centres : float64 (m, 2), x and y in pixels of consecutive frames, NaN where the object was absent
-    iterations : how often to smooth (expectation) and to refit (maximisation)
+    centres : float64 (m, 2), x and y in pixels of consecutive frames, NaN while the object is absent
+    iterations : number of expectation (smoothing) and maximisation (refitting) steps
 
     Returns
     -------
@@ -48,7 +45,7 @@ def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
     if len(present) < FEWEST:
         return None
     mean, covariance, motion = _start(centres[present])
-    # Frames before the first sighting and after the last say nothing.
+    # Frames before the first centre and after the last carry no information.
     centres = centres[present[0] : present[-1] + 1]
     for _ in range(iterations):
         motion = _refit(centres, *_smooth(centres, mean, covariance, motion))
@@ -56,9 +53,10 @@ def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
 
 
 def _start(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray, Motion]:
-    """First state, its covariance, and first guess, all in proportion to how the centres move."""
+    """Initial state, its covariance, and initial parameters, in proportion to the speed of the centres."""
     speed = np.mean(np.diff(centres, axis=0) ** 2)
-    # In a second difference the variance of the error counts 6 times, of pushes on the place 2, on the velocity 1.
+    # The variance of a second difference is 6 times that of the observation noise, plus 2 times that of the process
+    # noise of the position, plus that of the velocity.
     share = np.mean(np.diff(centres, n=2, axis=0) ** 2) / 9 + OBSERVATION_FLOOR
     mean = np.concatenate([centres[0], [0, 0]])
     return mean, np.diag([share, share, share + speed, share + speed]), Motion(share * np.eye(4), share * np.eye(2))
@@ -79,7 +77,7 @@ def _smooth(
 
 
 def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lagged: np.ndarray) -> Motion:
-    """Maximisation: mean outer products of the pushes and of the errors, the states' uncertainty included."""
+    """Maximisation: mean outer products of the residuals, plus the uncertainty of the smoothed states."""
     push = states[1:] - states[:-1] @ TRANSITION.T
     together = (lagged @ TRANSITION.T).sum(axis=0)
     spread = covariances[1:].sum(axis=0) + TRANSITION @ covariances[:-1].sum(axis=0) @ TRANSITION.T
@@ -92,7 +90,7 @@ def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lag
 
 
 def _floored(covariance: np.ndarray, floor: float) -> np.ndarray:
-    """The most likely covariance with no eigenvalue below the floor: raising those below it is exact."""
+    """The covariance with its eigenvalues raised to the floor: the constrained maximum of the likelihood."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, floor))
     return root @ root.T

@@ -1,4 +1,4 @@
-"""The trainer: a sample of the coreset trees in, a model out."""
+"""The trainer: takes a sample of the coreset trees, and returns a model."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ __all__ = ["Trainer"]
 
 
 class Trainer:
-    """Learns a linear model of the object; the same sample gives the same model."""
+    """Trains a linear model of the object; the same sample gives the same model, bit for bit."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        ridge.prepare()  # now, and not with the first sample, whose model is waited for
+        ridge.prepare()  # before the first sample, because the detector waits for its model
 
     def train(self, sample: Sample) -> Model:
-        """Learn from a sample, in time that depends on n only.
+        """Train a model on a sample, in time that depends on n only.
 
-        The score is scaled to be 0 at the mean of the background and 1 at the mean of the
-        object, so that every model's scores mean the same.
+        The score is scaled to 0 at the mean of the background and 1 at the mean of the object, so that the scores of
+        all models are comparable.
 
         Raises
         ------
         ProtocolError
-            For a sample in which object and background are the same.
+            If object and background are the same in the sample.
         """
         background_mean = sample.trees["background"].mean
         apart = sample.trees["object"].mean - background_mean
-        # A direction in which the object scores no higher, as very few rows may give one, is worth nothing.
+        # Very few rows may give a direction in which the object does not score higher: it is left out.
         useful = [scaled for each in self._directions(sample) if (scaled := _unit_contrast(each, apart)) is not None]
         weights = _unit_contrast(np.sum(useful, axis=0) if useful else _between(sample), apart)
         if weights is None:
             raise ProtocolError(
-                f"sample {sample.version} holds no difference between object and background: give another box"
+                f"sample {sample.version} has no difference between object and background: give another box"
             )
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
         bias = -float(weights @ background_mean)
-        return Model(sample.version, sample.frame, weights, bias, motion, _beside_the_score(sample, weights))
+        return Model(sample.version, sample.frame, weights, bias, motion, _residual_vectors(sample, weights))
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
@@ -59,15 +59,15 @@ class Trainer:
 
 
 def _between(sample: Sample) -> np.ndarray:
-    """Least squares of the object's tree against the background's: the contrast is positive if the means differ."""
+    """Least squares of the object's tree against the background's; its contrast is positive if the means differ."""
     background = sample.trees["background"]
     return ridge.between(background.rows, sample.trees["object"].mean - background.mean, BACKGROUND.ridge)
 
 
-def _beside_the_score(sample: Sample, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """The vectors of the heads that do not add to the score, each fitted to what the score leaves of the labels.
+def _residual_vectors(sample: Sample, weights: np.ndarray) -> dict[str, np.ndarray]:
+    """The vectors of the heads that do not add to the score, each fitted to the residual of the labels.
 
-    Detection adds the two up where it chooses size and aspect.
+    The residual is label - weights @ row: detection adds both products when it chooses size and aspect.
     """
     vectors = {}
     for name, head in HEADS.items():
@@ -79,11 +79,11 @@ def _beside_the_score(sample: Sample, weights: np.ndarray) -> dict[str, np.ndarr
 
 
 def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | None:
-    """Scaled so that the means differ by 1 along it; None where the object's is not the higher one."""
+    """A direction scaled so that the means differ by 1 along it; None if the object's mean is not the higher one."""
     contrast = float(direction @ apart)
     return direction / np.float32(contrast) if contrast > 0 else None
 
 
-@lru_cache(maxsize=1)  # the same centres come with every sample of a block
+@lru_cache(maxsize=1)  # all samples of a block have the same centres
 def _motion(centres: bytes) -> Motion | None:
     return learn_motion(np.frombuffer(centres, np.float64).reshape(-1, 2))

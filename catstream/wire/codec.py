@@ -41,7 +41,7 @@ from catstream.wire.checks import check
 
 __all__ = ["KINDS", "VERSION", "decode", "decode_json", "encode", "encode_json", "opening"]
 
-#: Of the envelope and of what the fields mean.
+#: Version of the envelope and of the meaning of the fields.
 VERSION = 2
 
 #: Kinds of message, by their name on the wire.
@@ -51,7 +51,7 @@ KINDS: dict[str, type] = {
 }
 
 
-def encode(message: Any) -> bytes:
+def encode(message: object) -> bytes:
     """A message as bytes.
 
     Raises
@@ -64,7 +64,7 @@ def encode(message: Any) -> bytes:
 
 
 def decode(data: bytes | memoryview, *kinds: type) -> Any:
-    """The message in `data`, one of `kinds`. Arrays come read-only.
+    """The message in `data`, one of `kinds`. Its arrays are read-only.
 
     Raises
     ------
@@ -107,11 +107,11 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
 
 
 def opening(kind: type) -> bytes:
-    """What the bytes of every message of a kind begin with."""
+    """The bytes that every message of a kind begins with."""
     return _ENCODER.encode((VERSION, kind.__name__.lower(), None))[:-1]  # nil is one byte
 
 
-def encode_json(message: Any) -> bytes:
+def encode_json(message: object) -> bytes:
     """A message without arrays as a JSON object of its fields, for recordings.
 
     Raises
@@ -142,16 +142,16 @@ def decode_json(data: bytes, kind: type) -> Any:
 
 
 def _brief(value: Any) -> str:
-    """A value for a person to read; lists may be nested deeper than Python can print."""
+    """A value for an error message; lists may be nested deeper than Python can print."""
     return f"{value!r:.40}" if isinstance(value, str | int) else f"a {type(value).__name__}"
 
 
 def _plain(value: Any) -> Any:
-    """How an array travels."""
+    """An array as the map that is sent."""
     if isinstance(value, np.ndarray):
         array = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
         return {"dtype": array.dtype.str, "shape": array.shape, "data": array.data.cast("B") if array.size else b""}
-    raise TypeError(f"{type(value).__name__} does not travel")
+    raise TypeError(f"{type(value).__name__} cannot be sent")
 
 
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
@@ -164,10 +164,10 @@ class _Array(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _array(_: type, value: Any) -> np.ndarray:
-    """The array that `_plain` described."""
+    """The array that `_plain` converted."""
     plain = msgspec.convert(value, _Array)
     if plain.dtype not in ("<f4", "<f8") or not 1 <= len(plain.shape) <= 2 or min(plain.shape) < 0:
-        raise ValueError(f"an array of {plain.dtype:.20} and shape {plain.shape} does not travel")
+        raise ValueError(f"an array of {plain.dtype:.20} and shape {plain.shape} cannot be received")
     dtype = np.dtype(plain.dtype)
     if math.prod(plain.shape) * dtype.itemsize != len(plain.data):
         raise ValueError(f"{len(plain.data)} bytes are not an array of {plain.dtype} and shape {plain.shape}")
@@ -177,5 +177,5 @@ def _array(_: type, value: Any) -> np.ndarray:
 def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
     fields = dict(pairs)
     if len(fields) < len(pairs):
-        raise ValueError("a name comes twice in a map")
+        raise ValueError("a name is twice in a map")
     return fields
