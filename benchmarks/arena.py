@@ -27,9 +27,10 @@ from catstream.services.loop import REFUSED
 from catstream.services.start import service_command
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
-from catstream.wire.channels import CHANNELS
+from catstream.wire.acknowledged import Receiver
+from catstream.wire.channels import CHANNELS, MODELS, RESULTS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Receiver, Subscriber
+from catstream.wire.newest import Subscriber
 
 __all__ = ["HOSTS", "LINKS", "Arena", "Link", "small_disk"]
 
@@ -171,9 +172,9 @@ class Arena:
                 stack.callback(link.close)
             (self._folder / "sitecustomize.py").write_text(_CLOCK)
             self._results = stack.enter_context(
-                Receiver("results", self._places["detector"], Position(), self._settings.run.unstored_frames)
+                Receiver(RESULTS, self._places["detector"], Position(), self._settings.run.unstored_frames)
             )
-            self._models = stack.enter_context(Subscriber("models", self._places["trainer"]))
+            self._models = stack.enter_context(Subscriber(MODELS, self._places["trainer"]))
             stack.callback(self._stop)
             for name in NAMES:
                 self._start(name)
@@ -230,7 +231,7 @@ class Arena:
 
     def taught(self) -> bool:
         """Whether a model came since this was last asked."""
-        return bool(self._models.waiting())
+        return bool(self._models.receive_all())
 
     def signal(self, name: str, number: int) -> None:
         """Send one to a process, where it runs."""

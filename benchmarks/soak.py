@@ -31,8 +31,9 @@ from catstream.messages import End, Features, TrainingRows
 from catstream.services.start import service_command
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
+from catstream.wire.acknowledged import Sender
+from catstream.wire.channels import FEATURES
 from catstream.wire.endpoint import Endpoint, private_folder
-from catstream.wire.sockets import Sender
 
 BLOCKS = 200  # the run is looked at so often
 GAIN = 0.02  # standard deviation of a drawn row's brightness
@@ -153,13 +154,13 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
         options = ["--set", f"run.endpoint={folder}", "--state", folder / "state"]
         with (
             subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL) as process,
-            Sender("features", Endpoint.parse(str(folder)), settings.run.unstored_frames) as sender,
+            Sender(FEATURES, Endpoint.parse(str(folder)), settings.run.unstored_frames) as sender,
         ):
             seen, part, begin = psutil.Process(process.pid), messages // 5, 0.0
             for seq in range(1, messages + 1):
                 message = stream.message(seq)
                 while not sender.send(message):
-                    sender.listen(0.05)
+                    sender.poll(0.05)
                     if process.poll() is not None:
                         raise ServiceError(f"the compressor ended with {process.returncode}: run it by hand to see why")
                 if seq == 1:  # it is imported by the time that it has answered
@@ -179,7 +180,7 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
 def wait(sender: Sender, seq: int) -> None:
     """Until a message is stored."""
     while sender.stored < seq:
-        sender.listen(0.05)
+        sender.poll(0.05)
 
 
 def doubling(sights: list[Sight]) -> Iterator[Sight]:

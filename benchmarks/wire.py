@@ -17,9 +17,9 @@ from catstream.detection.detector import Detector
 from catstream.messages import End, Features, Position
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
-from catstream.wire.channels import CHANNELS
+from catstream.wire.acknowledged import Receiver, Sender
+from catstream.wire.channels import CHANNELS, FEATURES
 from catstream.wire.endpoint import Endpoint, private_folder
-from catstream.wire.sockets import Receiver, Sender
 
 WINDOW = Settings().run.unstored_frames
 
@@ -65,15 +65,15 @@ def delivered(endpoint: str, features: Features, messages: int) -> float:
     """Seconds until the last of some messages is acknowledged."""
     receiver = SPAWN.Process(target=receive, args=(endpoint,), daemon=True)
     receiver.start()
-    with Sender("features", Endpoint.parse(endpoint), WINDOW) as sender:
-        while sender.position() is None:  # not there yet
+    with Sender(FEATURES, Endpoint.parse(endpoint), WINDOW) as sender:
+        while sender.ask_position() is None:  # not there yet
             receiver.join(0.01)
         begin = perf_counter()
         for seq in range(1, messages + 1):
             while not sender.send(replace(features, seq=seq)):
-                sender.listen(0.01)
+                sender.poll(0.01)
         while sender.stored < messages:
-            sender.listen(0.01)
+            sender.poll(0.01)
         seconds = perf_counter() - begin
         sender.send(End(messages + 1, "that was all"))
     receiver.join()
@@ -82,7 +82,7 @@ def delivered(endpoint: str, features: Features, messages: int) -> float:
 
 def receive(endpoint: str) -> None:
     """Take every message, and say so, until the end."""
-    with Receiver("features", Endpoint.parse(endpoint), Position(), WINDOW) as features:
+    with Receiver(FEATURES, Endpoint.parse(endpoint), Position(), WINDOW) as features:
         message = None
         while not isinstance(message, End):
             message = features.receive(0.1)

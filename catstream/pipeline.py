@@ -29,9 +29,11 @@ from catstream.settings import Settings
 from catstream.state import began, learned, locked, position
 from catstream.video.frames import without_password
 from catstream.video.source import ALL_FRAMES, is_live, open_source, without_scheme
+from catstream.wire.acknowledged import Receiver
+from catstream.wire.channels import HEALTH, RESULTS
 from catstream.wire.endpoint import meeting_place, private_folder
+from catstream.wire.newest import Subscriber
 from catstream.wire.readable import readable
-from catstream.wire.sockets import Receiver, Subscriber
 
 __all__ = ["Pipeline"]
 
@@ -202,8 +204,8 @@ class Pipeline:
                 stack.enter_context(_begun(self._state, self._kept, self._job))
                 start = self._start(self._state) if self._kept is not None else start
             self._box = start.box or self._box
-            self._incoming = stack.enter_context(Receiver("results", endpoint, start, settings.run.unstored_frames))
-            self._reports = stack.enter_context(Subscriber("health", endpoint))
+            self._incoming = stack.enter_context(Receiver(RESULTS, endpoint, start, settings.run.unstored_frames))
+            self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
             if self._save_model is not None:  # by the compressor's last checkpoint
                 stack.enter_context(_saved(self._save_model, self._state or folder, settings))
             supervisor = Supervisor(self._started(str(endpoint)), folder)
@@ -385,7 +387,7 @@ class Pipeline:
             raise ServiceError("the processes ended before the video did: this should not happen, please report it")
 
     def _listen(self) -> None:
-        for health in self._reports.waiting():
+        for health in self._reports.receive_all():
             before = self._health.get(health.process)
             if health.trouble and (before is None or before.trouble != health.trouble):
                 _log.warning("%s: %s", health.process, health.trouble)

@@ -21,8 +21,10 @@ from catstream.box import Box
 from catstream.errors import RefusedError, SilenceError
 from catstream.learned import Learned
 from catstream.messages import Answer, Command, Model, Sample, Verb
+from catstream.wire.channels import MODELS, SAMPLES
+from catstream.wire.commands import Requester
 from catstream.wire.endpoint import find
-from catstream.wire.sockets import Requester, Subscriber
+from catstream.wire.newest import Subscriber
 
 __all__ = ["Control", "control"]
 
@@ -52,7 +54,7 @@ class Control:
     def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> None:
         self._place = find(endpoint, keys, source)
         self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
-        self._commands = Requester("control", self._place)
+        self._commands = Requester(self._place)
 
     def set_box(self, box: str | Iterable[float], *, keep: bool = False) -> Answer:
         """Set the box of the object in the newest frame: x, y, w, h in pixels.
@@ -104,9 +106,9 @@ class Control:
     def _newest(self, version: int) -> tuple[Model, Sample]:
         """Return the newest model, of this version or a later one, and the sample that it was trained on."""
         model, samples, deadline = None, dict[int, Sample](), monotonic() + self.timeout
-        with Subscriber("models", self._place) as models, Subscriber("samples", self._place) as newest:
+        with Subscriber(MODELS, self._place) as models, Subscriber(SAMPLES, self._place) as newest:
             while monotonic() < deadline:
-                samples |= {sample.version: sample for sample in newest.waiting() if isinstance(sample, Sample)}
+                samples |= {sample.version: sample for sample in newest.receive_all() if isinstance(sample, Sample)}
                 model = models.receive(0.05) or model
                 if model is not None and model.version >= version and model.version in samples:
                     return model, samples[model.version]

@@ -13,15 +13,15 @@ from __future__ import annotations
 
 import select
 from time import monotonic
-from typing import Any, Generic, Literal, Self, TypeVar, overload
+from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
 
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.wire.announced import Announcement
-from catstream.wire.channels import CHANNELS
+from catstream.wire.channels import CHANNELS, TRACKS
 from catstream.wire.endpoint import Endpoint, find
+from catstream.wire.newest import Subscriber
 from catstream.wire.readable import readable
-from catstream.wire.sockets import Subscriber
 
 __all__ = ["GapCounter", "Subscription", "subscribe", "wait_until_running"]
 
@@ -36,8 +36,8 @@ _CONNECTION_CHECK_SECONDS = 1.0
 
 #: Public name -> channel. Subscribers get features from the channel of copies.
 _SUBSCRIBABLE = {
-    **{name: name for name, channel in CHANNELS.items() if not channel.acknowledged and name != "lessons"},
-    "features": "lessons",
+    **{name: name for name, channel in CHANNELS.items() if not channel.acknowledged and name != "training"},
+    "features": "training",
 }
 
 Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features | Preview)
@@ -100,15 +100,13 @@ class Subscription(Generic[Message]):
         self.keys = str(place.keys.folder) if place.keys is not None else ""
         self.end: End | None = None
         self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
-        self._last_identity: dict[str, float] = {}  # of each process that sends: what was taken last
         self._close_time = float("inf")  # when to wait no more
         # A pipeline that starts here later waits until this subscription has connected.
         self._announcement = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
-        self._messages = Subscriber(
-            self._channel.name, place, reader=self._announcement.reader if self._announcement else ""
-        )
+        reader = self._announcement.reader if self._announcement else ""
+        self._messages = Subscriber(self._channel, place, reader=reader)
         # A socket of its own for the end: if this subscriber is slow, the end could be among the dropped messages.
-        self._ends = Subscriber("tracks", place, only=End)
+        self._ends = Subscriber(TRACKS, place, only=End)
 
     @property
     def missed(self) -> int:
@@ -126,9 +124,9 @@ class Subscription(Generic[Message]):
         return f"{self.missed} missed{before}"
 
     @property
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """Messages that were dropped because they were not what the channel carries."""
-        return self._messages.refused
+        return self._messages.rejected
 
     def close(self) -> None:
         """Disconnect."""
@@ -170,19 +168,17 @@ class Subscription(Generic[Message]):
 
     def _take(self) -> Message | None:
         """Return the next message if one was received, without waiting."""
-        while self._messages.pending():
-            message: Any = self._messages.receive(0)
-            if isinstance(message, End):
-                if self._channel.keeps == "every":  # on this channel the end is the last message
-                    self.end, self._close_time = message, 0.0
-                    return None
-            elif message is not None and self._new(message):
+        while (message := self._messages.receive(0)) is not None:
+            if isinstance(message, Track | Features):
+                self._gaps.take(message.seq)
+            if not isinstance(message, Run | End):
                 self._withdraw_announcement()
-                new: Message = message
-                return new
-        while self._ends.pending():
-            end = self._ends.receive(0)
-            if self.end is None and end is not None:
+                return cast(Message, message)
+            if isinstance(message, End) and self._channel.keeps == "every":  # the last message here
+                self.end, self._close_time = message, 0.0
+                return None
+        for end in self._ends.receive_all():
+            if self.end is None and isinstance(end, End):
                 self.end, self._close_time = end, monotonic() + _DRAIN_SECONDS
         return None
 
@@ -190,18 +186,6 @@ class Subscription(Generic[Message]):
         """Tell pipelines at this endpoint not to wait for this subscriber any more."""
         if self._announcement is not None:
             self._announcement.close()
-
-    def _new(self, message: Message) -> bool:
-        """Return whether a message is new. The last message is resent whenever another subscriber connects."""
-        if isinstance(message, Run):
-            return False
-        if isinstance(message, Track | Features):
-            self._gaps.take(message.seq)
-            return True
-        name, mark = _identity(message)
-        known = self._last_identity.get(name)
-        self._last_identity[name] = mark
-        return mark != known
 
     def _ended(self) -> bool:
         if self.end is None or monotonic() < self._close_time:
@@ -222,15 +206,6 @@ class Subscription(Generic[Message]):
             )
         until = min(deadline if self.end is None else float("inf"), self._close_time, now + _CONNECTION_CHECK_SECONDS)
         return max(0.0, until - now)
-
-
-def _identity(message: Health | Model | Sample | Preview) -> tuple[str, float]:
-    """Return the sender of a message, and a value that differs between successive messages of this sender."""
-    if isinstance(message, Health):
-        return message.process, message.time
-    if isinstance(message, Preview):  # before tracking starts, all frames of a live source have the same number
-        return "", hash((message.frame, message.jpeg))
-    return "", message.version
 
 
 @overload

@@ -16,7 +16,9 @@ from catstream.recording.file import RecordingWriter
 from catstream.services.loop import Process
 from catstream.services.recorder import Recorder
 from catstream.state import TREES, locked
-from catstream.wire.sockets import Publisher, Receiver
+from catstream.wire.acknowledged import Receiver
+from catstream.wire.channels import FEATURES, SAMPLES
+from catstream.wire.newest import Publisher
 
 __all__ = ["main"]
 
@@ -70,9 +72,9 @@ def main(process: Process) -> None:
                 compressor.check(message)
 
         features = stack.enter_context(
-            Receiver("features", process.endpoint, settled, settings.run.unstored_frames, store, check)
+            Receiver(FEATURES, process.endpoint, settled, settings.run.unstored_frames, check)
         )
-        samples = stack.enter_context(Publisher("samples", process.endpoint))
+        samples = stack.enter_context(Publisher(SAMPLES, process.endpoint))
 
         def counters() -> dict[str, float]:
             own: dict[str, float] = {"stored": stored}
@@ -83,35 +85,37 @@ def main(process: Process) -> None:
         if compressor.last_sample is not None:
             samples.send(compressor.last_sample)
         end = False
-        while not process.ended_for(_FAREWELL_SECONDS if features.fed else 0):
+        while not process.ended_for(_FAREWELL_SECONDS if features.has_sender else 0):
             message = features.receive(0.1)
             end = isinstance(message, End)
             if message is None:
                 reduce.prepare()
             if recorder is not None:
                 recorder.listen()
-            if message is not None and not end:
+            if isinstance(message, Features):
                 if recorder is not None:  # before it can count as stored: none is missing that a checkpoint holds
                     recorder.keep(message)
                 sample = compressor.take(message)
                 if sample is not None:
                     samples.send(sample)
             before, waiting = settled, compressor.seq - settled.seq
-            needed = checkpoints is None or end or 2 * waiting >= settings.run.unstored_frames
+            needed = checkpoints is None or end or 2 * waiting >= settings.run.unstored_frames or features.asked
             overdue = time.monotonic() - tried >= settings.run.checkpoint_seconds
             if compressor.seq > stored and (needed or overdue):
                 store(needed)
+            if features.asked:
+                features.answer(settled)
             if message is not None or settled is not before:
                 # The end of the stream holds no features: with all before it, it is stored too. A sample needs
                 # no checkpoint to be made: in lockstep the detector waits for its model.
                 now = replace(settled, version=compressor.sampled)
-                if end:
+                if isinstance(message, End):
                     now = replace(now, seq=message.seq, unsaved=now.unsaved and now.unsaved + 1)
                 features.acknowledge(now)
-            samples.welcome()
+            samples.serve_late_joiners()
             process.trouble = checkpoints.trouble if checkpoints else ""
             process.beat(counters, now=end)
-            if end:
+            if isinstance(message, End):
                 process.broken = message.failed
                 samples.send(message)
                 break

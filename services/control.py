@@ -10,8 +10,8 @@ from catstream.messages import Answer, Features, Track
 from catstream.services.commands import CommandHandler
 from catstream.services.desired import DesiredState
 from catstream.video.frames import Frame
+from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Responder
 
 __all__ = ["CommandChannel"]
 
@@ -30,14 +30,14 @@ class CommandChannel(Responder):
     """
 
     def __init__(self, endpoint: Endpoint, handler: CommandHandler, file: Path | None) -> None:
-        super().__init__("control", endpoint)
+        super().__init__(endpoint)
         self._handler, self._file = handler, file
         self._kept: DesiredState | None = None
         self._conclude([])
 
     def carry_out(self) -> bool:
         """Carry out the commands that have arrived; return whether there were any."""
-        commands = self.waiting()
+        commands = self.receive_all()
         self._conclude(self._handler.take(commands))
         return bool(commands)
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from typing import Any, TypeVar
 
 from catstream import kalman
 from catstream.detection.detector import Detector
@@ -28,9 +29,13 @@ from catstream.services.resume import agree, start
 from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password
 from catstream.video.source import open_source
-from catstream.wire.sockets import Sender, Subscriber
+from catstream.wire.acknowledged import Sender
+from catstream.wire.channels import MODELS
+from catstream.wire.newest import Subscriber
 
 __all__ = ["main", "opening_seconds"]
+
+Message = TypeVar("Message", bound=Track | Features | End)
 
 _FILE = "desired_state.json"  # in the folder of the state
 _FAREWELL_SECONDS = 10.0  # patience with the compressor, once the process was asked to end
@@ -88,7 +93,7 @@ class DetectorLoop:
         self._commands = CommandHandler(self.detector, _desired(process, learned))
         self._control = stack.enter_context(CommandChannel(process.endpoint, self._commands, file))
         self._outputs = stack.enter_context(Outputs(process))
-        self._models = stack.enter_context(Subscriber("models", process.endpoint))
+        self._models = stack.enter_context(Subscriber(MODELS, process.endpoint))
         self._source: Source | None = None
         self._skipped = 0  # frames that were passed over because the run is paused or waits for a box
         self._version = 0  # of the model of the last track
@@ -98,7 +103,7 @@ class DetectorLoop:
         """Why no frame is followed any more, empty before that."""
         return "it was stopped" if self._process.ended else self._commands.over
 
-    def turn(self, sender: Sender | None = None) -> None:
+    def turn(self, sender: Sender[Any] | None = None) -> None:
         """One turn of a waiting loop: take in acknowledgements, then `attend`.
 
         It waits a short time for the acknowledgements of a sender, if one is given.
@@ -141,9 +146,9 @@ class DetectorLoop:
         for sender, position in zip(self._outputs.senders, positions, strict=True):
             sender.resume(begin.seq, position.seq)
 
-    def _position(self, sender: Sender) -> Position:
+    def _position(self, sender: Sender[Any]) -> Position:
         """The answer of a receiver, however long it takes."""
-        while (position := sender.position()) is None:  # no `poll`, which would take the answer
+        while (position := sender.ask_position()) is None:  # no `poll`, which would take the answer
             self._attend_or_exit()
         return position
 
@@ -214,7 +219,7 @@ class DetectorLoop:
     def _step(self, frame: Frame) -> tuple[Track, Features]:
         """The track and the features of a frame that is followed for the first time, or once more after a restart."""
         detector, desired, seq = self.detector, self._commands.desired, self.detector.seq + 1
-        for model in self._models.waiting():
+        for model in self._models.receive_all():
             detector.adopt(model)
         if seq <= max(desired.begins, 1):
             self._process.allow(_OPEN_SECONDS)
@@ -246,7 +251,7 @@ class DetectorLoop:
         due = features.sent - (0 if settings.run.lockstep else settings.run.lag_frames)
         live = self._source is not None and self._source.live
         while not live and not self.over:
-            match awaited(due, features.taken, features.made(due), self.detector.newest_version):
+            match awaited(due, features.taken, features.sample_of(due), self.detector.newest_version):
                 case Awaited.NOTHING:
                     return
                 case Awaited.TAKEN:
@@ -270,14 +275,14 @@ class DetectorLoop:
         self._process.beat(self._counters, now=True)
 
     def _deliver(
-        self, sender: Sender, message: Track | Features | End, patience: float = 0.0, *, stored: bool = False
+        self, sender: Sender[Message], message: Message, patience: float = 0.0, *, stored: bool = False
     ) -> None:
         """Send a message on an acknowledged channel, and wait until its window takes it, or until it is stored."""
         sent = sender.send(message)
         while True:
             step = next_step(
                 sent=sent,
-                stored=not stored or sender.settled >= message.seq,
+                stored=not stored or sender.acknowledged >= message.seq,
                 asked_seconds=self._process.asked_seconds,
                 patience_seconds=patience,
             )

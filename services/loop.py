@@ -14,9 +14,10 @@ from catstream.errors import CatstreamError, SetBackError
 from catstream.job import Job
 from catstream.messages import Health, Run
 from catstream.services.watchdog import PATIENCE, Watchdog
+from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.refusals import refusals
-from catstream.wire.sockets import Publisher
+from catstream.wire.newest import Publisher
+from catstream.wire.rejects import rejects
 
 __all__ = ["BROKEN", "REFUSED", "Parent", "Process", "die_with", "run"]
 
@@ -64,7 +65,7 @@ class Process:
         factor = 1.0 if name == "detector" else max(1.0, (job.settings.coreset.size / _QUICK_SIZE) ** 2)
         self._watchdog = Watchdog(watchdog, PATIENCE * factor)
         self._asked = float("inf")  # when a signal asked the process to end
-        self._health = Publisher("health", self.endpoint, sender=name)
+        self._health = Publisher(HEALTH, self.endpoint, sender=name)
         self._reported = 0.0
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._end)
@@ -95,9 +96,9 @@ class Process:
             self._watchdog.allow(_CLOSE_SECONDS)
         if now or time.monotonic() - self._reported >= _HEALTH_SECONDS:
             self._reported = time.monotonic()
-            self._health.send(Health(self.name, time.time(), counters() | refusals(), self.trouble, self.source))
+            self._health.send(Health(self.name, time.time(), counters() | rejects(), self.trouble, self.source))
         else:
-            self._health.welcome()
+            self._health.serve_late_joiners()
 
     def allow(self, seconds: float) -> None:
         """Extend the watchdog's deadline for this turn of the loop."""

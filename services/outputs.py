@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from catstream.messages import End, Features, Track
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
+from catstream.wire.acknowledged import Sender
 from catstream.wire.announced import readers_of
-from catstream.wire.sockets import Publisher, Sender
+from catstream.wire.channels import FEATURES, RESULTS, TRACKS, TRAINING
+from catstream.wire.newest import Publisher
 
 __all__ = ["Outputs"]
 
@@ -31,41 +33,41 @@ class Outputs:
     def __init__(self, process: Process) -> None:
         window, endpoint = process.settings.run.unstored_frames, process.endpoint
         with ExitStack() as stack:
-            self.features = stack.enter_context(Sender("features", endpoint, window))
+            self.features = stack.enter_context(Sender(FEATURES, endpoint, window))
             owned = process.job.owned
-            self.results = stack.enter_context(Sender("results", endpoint, window)) if owned else None
-            self._tracks = stack.enter_context(Publisher("tracks", endpoint))
-            self._training = stack.enter_context(Publisher("lessons", endpoint, greeting=process.run))
+            self.results = stack.enter_context(Sender(RESULTS, endpoint, window)) if owned else None
+            self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
+            self._training = stack.enter_context(Publisher(TRAINING, endpoint, greeting=process.run))
             self._previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
-        self.senders = [self.features] + ([self.results] if self.results is not None else [])
+        self.senders: list[Sender[Any]] = [self.features] + ([self.results] if self.results is not None else [])
         for channel, readers in readers_of(endpoint).items():
             if (publisher := self._publishers.get(channel)) is not None:
                 publisher.expect(readers)
 
     @property
-    def _publishers(self) -> dict[str, Publisher]:
-        return {"tracks": self._tracks, "lessons": self._training}
+    def _publishers(self) -> dict[str, Publisher[Any]]:
+        return {"tracks": self._tracks, "training": self._training}
 
     @property
     def has_subscribers(self) -> bool:
         """Whether anybody receives the tracks."""
-        return self._tracks.heard
+        return self._tracks.has_subscribers
 
     @property
     def all_connected(self) -> bool:
         """Whether all subscribers that had announced themselves are connected."""
-        return all(publisher.complete for publisher in self._publishers.values())
+        return all(publisher.all_connected for publisher in self._publishers.values())
 
-    def poll(self, awaited: Sender | None = None) -> None:
+    def poll(self, awaited: Sender[Any] | None = None) -> None:
         """Take in acknowledgements, waiting a short time for one of the sender that is awaited."""
         for sender in self.senders:
-            sender.listen(_TURN_SECONDS if sender is awaited else 0)
+            sender.poll(_TURN_SECONDS if sender is awaited else 0)
 
     def serve_late_joiners(self) -> None:
         """Take in who has subscribed, and send the greeting or the newest picture to those who have just come."""
         for publisher in self._publishers.values():
-            publisher.welcome()
+            publisher.serve_late_joiners()
         self._previews.turn()
 
     def publish_track(self, track: Track | End) -> None:

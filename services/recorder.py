@@ -7,10 +7,11 @@ from contextlib import ExitStack
 from typing import Self
 
 from catstream.errors import RecordingError
-from catstream.messages import End, Health, Model
+from catstream.messages import End
 from catstream.recording.file import Recorded, RecordingWriter
+from catstream.wire.channels import HEALTH, MODELS, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 __all__ = ["Recorder"]
 
@@ -38,23 +39,19 @@ class Recorder:
         self.end: End | None = None
         self.failed = ""
         self._writer = writer
-        self._last: dict[
-            str, tuple[float, ...]
-        ] = {}  # identity of the last model, and of the last health of each process
         with ExitStack() as stack:
-            known = {"tracks": reader, "models": "", "health": ""}
-            self._channels = [
-                stack.enter_context(Subscriber(name, endpoint, every=True, reader=reader))
-                for name, reader in known.items()
+            channels: dict[Channel[Recorded], str] = {TRACKS: reader, MODELS: "", HEALTH: ""}
+            self._subscribers = [
+                stack.enter_context(Subscriber(channel, endpoint, every=True, reader=name))
+                for channel, name in channels.items()
             ]
             self._stack = stack.pop_all()
 
     def listen(self) -> None:
         """Write the messages that were received."""
-        for channel in self._channels:
-            for message in channel.waiting():
-                if self._new(message):
-                    self.keep(message)
+        for subscriber in self._subscribers:
+            for message in subscriber.receive_all():
+                self.keep(message)
 
     def keep(self, message: Recorded) -> None:
         """Write a message."""
@@ -67,19 +64,6 @@ class Recorder:
         except RecordingError as error:
             self.failed = str(error)
             _log.error("%s: the run continues without it", error)
-
-    def _new(self, message: Recorded) -> bool:
-        """Return whether a message is new: a channel sends its last message again whenever a subscriber connects."""
-        mark: tuple[float, ...]
-        if isinstance(message, Model):
-            name, mark = "", (message.version, message.frame)
-        elif isinstance(message, Health):
-            name, mark = message.process, (message.time,)
-        else:
-            return True
-        known = self._last.get(name)
-        self._last[name] = mark
-        return mark != known
 
     def close(self) -> None:
         """Close the subscriptions."""

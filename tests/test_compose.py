@@ -25,9 +25,9 @@ from catstream.settings import Settings
 from catstream.subscription import subscribe
 from catstream.web.server import Server
 from catstream.wire import keys
-from catstream.wire.channels import CHANNELS
+from catstream.wire.channels import CHANNELS, HEALTH
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Publisher
+from catstream.wire.newest import Publisher
 
 ROOT = Path(__file__).parents[1]
 SERVICES = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
@@ -156,10 +156,10 @@ def test_the_health_check_hears_its_process_and_notices_silence(name):
     endpoint = Endpoint.parse(f"tcp://127.0.0.1:{first}")
     check = [sys.executable, "-c", script, endpoint.address(CHANNELS["health"], name)]
     assert subprocess.run([*check[:2], script.replace("5000", "300"), check[3]]).returncode == 1
-    with Publisher("health", endpoint, name) as health, subprocess.Popen(check) as hearing:
+    with Publisher(HEALTH, endpoint, name) as health, subprocess.Popen(check) as hearing:
         health.send(Health(name, 0.0))
         while hearing.poll() is None:
-            health.welcome()
+            health.serve_late_joiners()
             time.sleep(0.01)
     assert hearing.returncode == 0
 

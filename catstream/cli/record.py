@@ -16,8 +16,9 @@ from catstream.messages import End, Features, Run
 from catstream.recording.file import Recording, RecordingWriter
 from catstream.services.recorder import Recorder
 from catstream.wire.announced import Announcement
+from catstream.wire.channels import TRAINING
 from catstream.wire.endpoint import Endpoint, find
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 __all__ = ["record"]
 
@@ -47,27 +48,27 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     place = find(endpoint, keys)
     with (
-        Announcement(place, ("lessons", "tracks")) as waits,
-        Subscriber("lessons", place, reader=waits.reader) as lessons,
+        Announcement(place, ("training", "tracks")) as waits,
+        Subscriber(TRAINING, place, reader=waits.reader) as training,
     ):
         wait_for_pipeline(endpoint, keys, wait)
         with suppress(KeyboardInterrupt):
-            _record(output, place, lessons, waits.reader)
+            _record(output, place, training, waits.reader)
     if output.exists():
         click.echo(f"{output}: {Recording(output)}", err=True)
 
 
-def _record(output: Path, place: Endpoint, lessons: Subscriber, reader: str) -> None:
+def _record(output: Path, place: Endpoint, training: Subscriber[Run | Features | End], reader: str) -> None:
     with ExitStack() as stack:
         status = stack.enter_context(Console(stderr=True).status("waiting for the settings of the pipeline"))
-        while not isinstance(run := lessons.receive(0.1), Run):
+        while not isinstance(run := training.receive(0.1), Run):
             if isinstance(run, End):
                 raise RecordingError(f"nothing was recorded, because the pipeline has ended: {run.reason}")
         writer = stack.enter_context(RecordingWriter(output, run))
         recorder = stack.enter_context(Recorder(writer, place, reader))
         seq, last, deadline = 0, None, float("inf")
         while (last is None or recorder.end is None) and time.monotonic() < deadline:
-            message = lessons.receive(0.05)
+            message = training.receive(0.05)
             if isinstance(message, End):
                 last = message
             # A restarted detector repeats frames whose features the compressor has already taken.

@@ -15,8 +15,9 @@ from catstream.services.options import with_part
 from catstream.settings import Settings
 from catstream.sinks.sink import check, open_sink
 from catstream.subscription import subscribe
+from catstream.wire.channels import TRAINING
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 __all__ = ["sink"]
 
@@ -86,6 +87,6 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
 
 def _reach(place: Endpoint) -> int:
     """How many tracks a restarted detector repeats at most: those that may be on their way, as the run was told."""
-    with Subscriber("lessons", place, only=Run) as runs:
+    with Subscriber(TRAINING, place, only=Run) as runs:
         run = runs.receive(_RUN_SECONDS)
-    return int(run.settings["run.unstored_frames"]) if run is not None else Settings().run.unstored_frames
+    return int(run.settings["run.unstored_frames"]) if isinstance(run, Run) else Settings().run.unstored_frames

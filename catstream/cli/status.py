@@ -38,7 +38,7 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
       model      the version that the detector uses
       trees      the coreset trees of the compressor
       source     whether a camera or a stream is there, and the frames skipped
-      refused    messages that were not what their channel carries
+      rejected   messages that were not what their channel carries
       trouble    what is wrong with a process, where something is
       heard      each process, and how long ago it said so
 
@@ -104,7 +104,7 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
         "reopened": whole(detector, "reopened"),
         "lost_seconds": detector.get("lost_seconds"),
         "trouble": {name: heard[-1].trouble for name, heard in reports.items() if heard[-1].trouble},
-        "refused": {name: int(counters[name].get("refused", 0)) for name in reports},
+        "rejected": {name: int(counters[name].get("rejected", 0)) for name in reports},
         "processes": {
             name: {"seconds_ago": round(max(0.0, time.time() - heard[-1].time), 2), "counters": heard[-1].counters}
             for name, heard in reports.items()
@@ -143,7 +143,7 @@ def _text(found: dict[str, Any]) -> str:
             f"model      {shown('model_version')}",
             f"trees      {shown('leaves')} leaves, {shown('nodes')} nodes, level {shown('level')}, {size} MB",
             *([source] if found["skipped"] is not None else []),  # a file skips none
-            f"refused    {sum(found['refused'].values())} messages",
+            f"rejected   {sum(found['rejected'].values())} messages",
             f"heard      {', '.join(heard)}",
             *(f"trouble    {name}: {trouble}" for name, trouble in found["trouble"].items()),
         )

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 from catstream.messages import End
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 __all__ = ["arrivals", "rounds"]
 
@@ -18,7 +18,7 @@ Key = TypeVar("Key")
 
 
 def arrivals(
-    readers: Mapping[Key, Subscriber], is_over: Callable[[], bool] = lambda: False
+    readers: Mapping[Key, Subscriber[Any]], is_over: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Key, float, Any]]:
     """Yield (key of the subscriber, arrival time by `time.monotonic`, message) until `is_over` or all have ended."""
     poller, keys = select.poll(), {}
@@ -36,7 +36,7 @@ def arrivals(
                     break
 
 
-def rounds(readers: Mapping[Key, Subscriber], pause: float, most: int) -> Iterator[tuple[Key, Any]]:
+def rounds(readers: Mapping[Key, Subscriber[Any]], pause: float, most: int) -> Iterator[tuple[Key, Any]]:
     """Yield (key of the subscriber, message): at most `most` messages of each, then a pause, until all have ended."""
     left = set(readers)
     while left:

@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 
 from catstream.loadtest.listening import arrivals
 from catstream.messages import Health, Model, Track
+from catstream.wire.channels import HEALTH, MODELS, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 __all__ = ["Observations", "Observer"]
+
+_CHANNELS: tuple[Channel[object], ...] = (TRACKS, MODELS, HEALTH)
 
 
 @dataclass(slots=True)
@@ -56,9 +59,9 @@ class Observer(threading.Thread):
     def run(self) -> None:
         with ExitStack() as stack:
             readers = {
-                (number, channel): stack.enter_context(Subscriber(channel, place))
+                (number, channel.name): stack.enter_context(Subscriber(channel, place))
                 for number, place in enumerate(self._endpoints)
-                for channel in ("tracks", "models", "health")
+                for channel in _CHANNELS
             }
             for (number, _), moment, message in arrivals(readers, self._ended.is_set):
                 match message:

@@ -12,8 +12,9 @@ from catstream.loadtest.listening import rounds
 from catstream.messages import End
 from catstream.services.loop import die_with
 from catstream.subscription import GapCounter
+from catstream.wire.channels import TRACKS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 __all__ = ["Subscribers"]
 
@@ -106,7 +107,7 @@ def _read_until_end(
     """Run some of the subscribers until the pipeline ends."""
     die_with(parent)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    readers = {number: Subscriber("tracks", Endpoint.parse(endpoint, keys)) for number in numbers}
+    readers = {number: Subscriber(TRACKS, Endpoint.parse(endpoint, keys)) for number in numbers}
     gaps = {number: GapCounter() for number in numbers}
     most, pause = pace
     for number, message in rounds(readers, pause, most):

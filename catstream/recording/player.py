@@ -12,12 +12,12 @@ from catstream.messages import End, Features, Health, Model, Run, Track
 from catstream.recording.file import Recorded, Recording
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Publisher
+from catstream.wire.newest import Publisher
 
 __all__ = ["Player"]
 
 _TURN_SECONDS = 0.05  # between two checks for new subscribers
-_CHANNEL = {Features: "lessons", Model: "models", Track: "tracks"}
+_CHANNEL = {Features: "training", Model: "models", Track: "tracks"}
 
 
 class Player:
@@ -36,16 +36,16 @@ class Player:
         self._recording = recording
         with ExitStack() as stack:
             self._publishers = {
-                name: stack.enter_context(Publisher(name, endpoint, greeting=greeting))
-                for name, greeting in (("lessons", recording.run), ("models", None), ("tracks", None))
+                name: stack.enter_context(Publisher(CHANNELS[name], endpoint, greeting=greeting))
+                for name, greeting in (("training", recording.run), ("models", None), ("tracks", None))
             }
             for name in CHANNELS["health"].senders:
-                self._publishers[name] = stack.enter_context(Publisher("health", endpoint, name))
+                self._publishers[name] = stack.enter_context(Publisher(CHANNELS["health"], endpoint, name))
             self._stack = stack.pop_all()
 
     def wait(self) -> None:
         """Wait until the tracks have a subscriber."""
-        while not self._publishers["tracks"].heard:
+        while not self._publishers["tracks"].has_subscribers:
             self._rest(_TURN_SECONDS)
 
     def play(self, speed: float | None = 1.0) -> Iterator[Recorded]:
@@ -70,13 +70,13 @@ class Player:
                 seq = message.seq
             yield message
         end = self._recording.end or End(seq + 1, "the recording ends here")
-        for channel in ("tracks", "lessons"):
+        for channel in ("tracks", "training"):
             self._publishers[channel].send(end)
         yield end
 
     def _rest(self, seconds: float) -> None:
         for publisher in self._publishers.values():
-            publisher.welcome()
+            publisher.serve_late_joiners()
         time.sleep(seconds)
 
     def close(self) -> None:

@@ -86,14 +86,14 @@ class _Collector:
         ages = GaugeMetricFamily(
             "catstream_health_age_seconds", "Seconds since the last health report of a process.", labels=["process"]
         )
-        refused = CounterMetricFamily(
-            "catstream_refused_messages", "Messages that do not conform to the protocol.", labels=["process"]
+        rejected = CounterMetricFamily(
+            "catstream_rejected_messages", "Messages that do not conform to the protocol.", labels=["process"]
         )
         for process in CHANNELS["health"].senders:
             if process in self._feed.dashboard.health:
                 ages.add_metric([process], max(0.0, time() - self._feed.dashboard.health[process].time))
-                refused.add_metric([process], self._feed.dashboard.counter(process, "refused") or 0)
-        yield from (ages, refused)
+                rejected.add_metric([process], self._feed.dashboard.counter(process, "rejected") or 0)
+        yield from (ages, rejected)
 
 
 def _gauge(name: str, meaning: str, value: float) -> Metric:

@@ -1,8 +1,8 @@
-"""Subscribers that wait for a pipeline announce it, so that the pipeline begins once they are connected.
+"""Subscribers that wait for a pipeline announce themselves, so that the pipeline begins once they are connected.
 
-An announcement is a file beside the private folders of this user's pipelines, locked for as long as its subscriber
-lives. It says at which endpoint the subscriber waits, and for which channels. The detector reads it before its first
-frame, and waits until the subscriber's own topic (`Subscriber`, parameter `reader`) has come in at each of them.
+An announcement is a file beside the private folders of this user's pipelines. It is locked as long as its subscriber
+lives, and names the endpoint and the channels. The detector reads it before its first frame, and waits until the
+subscriber has subscribed to its own topic (`Subscriber`, parameter `reader`) on each of the channels.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ _PREFIX = "catstream-reader-"
 
 
 class Announcement:
-    """Says that a subscriber waits at an endpoint; until it is closed, or its process is gone.
+    """Announces that a subscriber waits at an endpoint, until it is closed or its process ends.
 
     Parameters
     ----------
     endpoint : Endpoint
-        Where it waits.
+        Where the subscriber waits.
     channels : iterable of str
-        Names of the channels of which it wants every message.
+        Names of the channels whose messages it receives from the first one on.
 
     Attributes
     ----------
     reader : str
-        Name of the subscriber, to be given to its `Subscriber` of each of these channels.
+        Name of the subscriber, for its `Subscriber` of each channel.
     """
 
     def __init__(self, endpoint: Endpoint, channels: Iterable[str]) -> None:
         self.reader = secrets.token_hex(8)
         self._file: IO[str] | None = None
         text = "\n".join([_place(endpoint), *channels])
-        # Without a folder to write to nothing is announced: messages are then missed, and counted.
+        # If no folder can be written to, nothing is announced: the first messages are then missed, and counted.
         with contextlib.suppress(OSError, IndexError):
             path = homes()[0] / f"{_PREFIX}{self.reader}"
             hidden = path.with_name(f".{path.name}")
@@ -51,10 +51,10 @@ class Announcement:
             lock(self._file.fileno(), math.inf)
             self._file.write(text)
             self._file.flush()
-            self._path = hidden.rename(path)  # never there without its lock
+            self._path = hidden.rename(path)  # atomic: the file is never visible without its lock
 
     def close(self) -> None:
-        """Take it back."""
+        """Withdraw the announcement."""
         if self._file is not None:
             self._path.unlink(missing_ok=True)
             self._file.close()
@@ -68,11 +68,14 @@ class Announcement:
 
 
 def readers_of(endpoint: Endpoint) -> dict[str, set[str]]:
-    """Names of this user's subscribers that wait at an endpoint, by channel; the files of dead ones are removed."""
+    """Names of this user's subscribers that wait at an endpoint, by channel; removes the files of dead ones."""
     readers: dict[str, set[str]] = {}
     for home in set(homes()):
         for path in home.glob(f"{_PREFIX}*"):
-            with contextlib.suppress(OSError), path.open() as file:  # it may be gone by now, or another user's
+            with (
+                contextlib.suppress(OSError),
+                path.open() as file,
+            ):  # it may be removed by now, or belong to another user
                 if os.fstat(file.fileno()).st_uid != os.geteuid():
                     continue
                 if not is_locked(file.fileno()):
@@ -86,5 +89,5 @@ def readers_of(endpoint: Endpoint) -> dict[str, set[str]]:
 
 
 def _place(endpoint: Endpoint) -> str:
-    """The same for all that name this endpoint in their own way."""
+    """A name of the endpoint that does not depend on how its folder was written."""
     return str(Path(endpoint.folder).resolve()) if endpoint.folder is not None else str(endpoint)

@@ -1,9 +1,8 @@
-"""Endpoints: the one place where the processes of a pipeline meet, and the address of each channel there.
+"""Endpoints: where the sockets of a pipeline are, and how a running pipeline is found.
 
-A folder holds a Unix socket a channel, for this user alone: `FOLDER/features`. Or, from
-`tcp://127.0.0.1:5700` on, each channel takes a port, as its row in the table says. With keys the
-host may be one that others can reach, and processes may have hosts of their own:
-`tcp://10.0.0.1,compressor=10.0.0.2,trainer=10.0.0.3:5700`.
+An endpoint is a folder with one Unix socket for each channel (`FOLDER/features`), which only this user may enter; or
+`tcp://127.0.0.1:5700`, from which each channel takes the port that its row in the table says. With keys other machines
+may reach the host, and processes may have hosts of their own: `tcp://10.0.0.1,compressor=10.0.0.2,trainer=10.0.0.3:5700`.
 """
 
 from __future__ import annotations
@@ -27,22 +26,22 @@ from catstream.wire.keys import Keys
 
 __all__ = ["Endpoint", "find", "homes", "meeting_place", "private_folder", "running"]
 
-_LONGEST_PATH = 107  # bytes that the kernel takes for the name of a Unix socket
+_MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
-_MARK = "owner"  # file in a private folder, locked while its owner lives
-_SOURCE = "source"  # file beside the note below that says which source the pipeline follows
-_NOTE = "endpoint"  # file in the private folder of a running pipeline that says where its processes meet
+_OWNER = "owner"  # file in a private folder, locked while its owner lives
+_SOURCE = "source"  # file beside the next one that names the source of the pipeline
+_NOTE = "endpoint"  # file in the private folder of a running pipeline that holds its endpoint
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where the processes meet: a folder, or hosts and the first port; and what is asked of who comes.
+    """Where the sockets of a pipeline are: a folder, or hosts and the first port; and the keys to connect with.
 
-    host    of all processes, as ZeroMQ takes it, but of those in `hosts`
-    hosts   of processes by name
-    keys    what all connect with, None where nobody is asked
-    source  that the pipeline follows, without a password; empty if it is not known here
+    host    of all processes that `hosts` does not name, as ZeroMQ takes it
+    hosts   of single processes, by name
+    keys    to connect with; None if the pipeline has no keys
+    source  of the pipeline's frames, without a password; empty if it is not known here
 
     >>> Endpoint.parse("tcp://localhost:5700").address(CHANNELS["models"])
     'tcp://127.0.0.1:5702'
@@ -70,10 +69,10 @@ class Endpoint:
         Raises
         ------
         ServiceError
-            Where one is not what it should be, or others can reach the host and there are no keys.
+            If one of them is not valid, or other machines can reach the host and there are no keys.
         """
         if not text:
-            raise ServiceError("this process was not told where to meet the others: --set run.endpoint=FOLDER")
+            raise ServiceError("this process needs the endpoint of its pipeline: --set run.endpoint=FOLDER")
         known = Keys.load(keys) if keys else None
         if text.startswith("tcp://"):
             return cls._tcp(text, known)
@@ -82,7 +81,7 @@ class Endpoint:
         folder = Path(text)
         for channel in CHANNELS.values():
             for sender in channel.senders:
-                if len(os.fsencode(folder / _file(channel, sender))) > _LONGEST_PATH:
+                if len(os.fsencode(folder / _file(channel, sender))) > _MAX_PATH_BYTES:
                     raise ServiceError(f"the name of the folder {text!r} is too long for a Unix socket: give another")
         return cls(folder=folder, keys=known)
 
@@ -96,7 +95,7 @@ class Endpoint:
             port = ""
         elif keys is None and not all(map(_is_loopback, map(_plain, [first, *named.values()]))):
             raise ServiceError(
-                f"{text} can be reached from other machines, and nothing on it asks who is there: make keys "
+                f"other machines can reach {text}, and without keys anybody could connect: make keys "
                 "(catstream keys new DIR) and give them to all (--set run.keys=DIR), or give a folder or "
                 "tcp://127.0.0.1:PORT"
             )
@@ -107,16 +106,16 @@ class Endpoint:
         first, named = _plain(first), {name: _plain(host) for name, host in named.items()}
         return cls(host=first, port=int(port), hosts=named, keys=keys)
 
-    def address(self, channel: Channel, sender: str | None = None) -> str:
-        """Of a channel, as ZeroMQ takes it; of the given sender where there are several."""
+    def address(self, channel: Channel[object], sender: str | None = None) -> str:
+        """The address of a channel, as ZeroMQ takes it; of the given sender if there are several."""
         sender = sender or channel.senders[0]
         if self.folder is not None:
             return f"ipc://{self.folder / _file(channel, sender)}"
         host = self.hosts.get(channel.receiver or sender, self.host)
         return f"tcp://{host}:{self.port + channel.port + channel.senders.index(sender)}"
 
-    def listening(self, channel: Channel, sender: str | None = None) -> str:
-        """The address to listen on: of a host by name, what that means here."""
+    def listening(self, channel: Channel[object], sender: str | None = None) -> str:
+        """The address to listen on; the name of a host is resolved."""
         address = self.address(channel, sender)
         protocol, _, place = address.partition("://")
         host, _, port = place.rpartition(":")
@@ -125,14 +124,14 @@ class Endpoint:
         try:
             return f"tcp://{socket.gethostbyname(host)}:{port}"
         except OSError:
-            return address  # ZeroMQ says what is wrong with it
+            return address  # ZeroMQ reports what is wrong with it
 
-    def taken(self, channel: Channel, sender: str | None = None) -> bool:
-        """Whether a process listens at a channel's Unix socket: ZeroMQ would push it aside, and not say so."""
+    def taken(self, channel: Channel[object], sender: str | None = None) -> bool:
+        """Whether a process listens at a channel's Unix socket; ZeroMQ would replace it without an error."""
         if self.folder is None:
             return False
-        with socket.socket(socket.AF_UNIX) as knock:
-            return knock.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
+        with socket.socket(socket.AF_UNIX) as probe:
+            return probe.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
 
 
 #: Processes that listen, the name of `hosts`.
@@ -142,12 +141,12 @@ _LISTENERS = {
 
 
 def _plain(host: str) -> str:
-    """As ZeroMQ takes it, to listen and to connect."""
+    """A host as ZeroMQ takes it, to listen and to connect."""
     return {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
 
 
 def _is_host(host: str) -> bool:
-    """Whether it is a name, or an address; of IPv6 in brackets."""
+    """Whether a text is the name of a host, or an address; an IPv6 address is in brackets."""
     if host.startswith("["):
         return host.endswith("]") and _address(host) is not None
     return bool(_HOST.fullmatch(host))
@@ -165,19 +164,19 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return None
 
 
-def _file(channel: Channel, sender: str) -> str:
+def _file(channel: Channel[object], sender: str) -> str:
     return channel.name if len(channel.senders) == 1 else f"{channel.name}-{sender}"
 
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A fresh folder that only this user may enter, gone afterwards; those of processes that were killed go with it."""
+    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes."""
     home = homes()[0]
     _sweep(home)
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=home))
     with (folder / ".mark").open("w") as mark:
-        lock(mark.fileno(), math.inf)  # until this process is gone
-        (folder / ".mark").rename(folder / _MARK)  # never there without its lock
+        lock(mark.fileno(), math.inf)  # until this process ends
+        (folder / ".mark").rename(folder / _OWNER)  # atomic: it is never visible without its lock
         try:
             yield folder
         finally:
@@ -186,26 +185,29 @@ def private_folder() -> Iterator[Path]:
 
 def _sweep(home: Path) -> None:
     """Remove the private folders whose owner was killed."""
-    for path in home.glob(f"{_PREFIX}*/{_MARK}"):
-        with contextlib.suppress(OSError), path.open("r+") as mark:  # it may be gone by now, or another user's
+    for path in home.glob(f"{_PREFIX}*/{_OWNER}"):
+        with (
+            contextlib.suppress(OSError),
+            path.open("r+") as mark,
+        ):  # it may be removed by now, or belong to another user
             if os.fstat(mark.fileno()).st_uid == os.geteuid() and not is_locked(mark.fileno()):
                 shutil.rmtree(path.parent, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def meeting_place(text: str, default: Path, keys: str = "", source: str = "") -> Iterator[Endpoint]:
-    """The endpoint for one pipeline, held for it alone; afterwards no socket file is left.
+    """The endpoint of one pipeline, locked for it; removes all socket files afterwards.
 
     Parameters
     ----------
     text, keys : the settings `endpoint` and `keys`
-    default : the pipeline's private folder, to use where that is empty; `running` finds the pipeline by it
-    source : that the pipeline follows, without a password, for people who have several pipelines running
+    default : the pipeline's private folder, used if `text` is empty; `running` finds the pipeline by it
+    source : of the pipeline's frames, without a password, by which a user tells several pipelines apart
 
     Raises
     ------
     ServiceError
-        Where another pipeline is there, or other users could be.
+        If another pipeline uses the folder, or other users may write to it.
     """
     endpoint = Endpoint.parse(text or str(default), keys)
     if endpoint.folder is None:  # the kernel gives a port to one process only
@@ -217,7 +219,9 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "") ->
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
-        raise ServiceError(f"the processes cannot meet in {text!r} ({error.strerror}): give another folder") from None
+        raise ServiceError(
+            f"cannot use the folder {text!r} as an endpoint ({error.strerror}): give another folder"
+        ) from None
     try:
         facts = os.fstat(handle)
         if facts.st_uid != os.geteuid() or facts.st_mode & 0o022:
@@ -241,10 +245,7 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "") ->
 
 @contextlib.contextmanager
 def _noted(endpoint: Endpoint, folder: Path, source: str) -> Iterator[None]:
-    """Leave a note that says where a pipeline is and which source it follows.
-
-    The note is locked for as long as the process lives, however that ends.
-    """
+    """Keep a file with the endpoint and the source of a running pipeline, locked until the process ends."""
     path = folder / _NOTE
     with path.open("w") as note:
         lock(note.fileno(), math.inf)
@@ -259,11 +260,14 @@ def _noted(endpoint: Endpoint, folder: Path, source: str) -> Iterator[None]:
 
 
 def running() -> list[Endpoint]:
-    """Where this user's pipelines run, in no order."""
+    """Endpoints of this user's running pipelines, in no order."""
     endpoints = []
     for home in set(homes()):
         for path in home.glob(f"{_PREFIX}*/{_NOTE}"):
-            with contextlib.suppress(OSError), path.open() as note:  # it may be gone by now, or another user's
+            with (
+                contextlib.suppress(OSError),
+                path.open() as note,
+            ):  # it may be removed by now, or belong to another user
                 text = note.read()
                 if text and os.fstat(note.fileno()).st_uid == os.geteuid() and is_locked(note.fileno()):
                     endpoint = Endpoint.parse(*text.split("\n"))
@@ -272,12 +276,12 @@ def running() -> list[Endpoint]:
 
 
 def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
-    """The endpoint of a running pipeline: the one given, or the one that follows `source`, or the user's only one.
+    """The endpoint of a running pipeline: the given one, the one with this source, or the user's only one.
 
     Parameters
     ----------
-    text, keys : the settings `endpoint` and `keys`; a pipeline of this user has its keys noted
-    source : that a pipeline of this user follows, as it was given, or its file name
+    text, keys : the settings `endpoint` and `keys`; the keys of this user's pipelines are known
+    source : of a pipeline of this user, as it was given, or its file name
 
     Raises
     ------
@@ -291,9 +295,9 @@ def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
     if source:
         found = [endpoint for endpoint in endpoints if _follows(endpoint, source)]
         if not found:
-            raise ServiceError(f"no pipeline of yours follows {source!r}{_told(endpoints)}")
+            raise ServiceError(f"no pipeline of yours follows {source!r}{_listed(endpoints)}")
         if len(found) > 1:
-            raise ServiceError(f"{len(found)} pipelines follow {source!r}: say which (--endpoint){_told(found)}")
+            raise ServiceError(f"{len(found)} pipelines follow {source!r}: say which (--endpoint){_listed(found)}")
         return found[0]
     if not endpoints:
         raise ServiceError(
@@ -301,7 +305,7 @@ def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
         )
     if len(endpoints) > 1:
         raise ServiceError(
-            f"{len(endpoints)} pipelines are running: say which (--endpoint or --source){_told(endpoints)}"
+            f"{len(endpoints)} pipelines are running: say which (--endpoint or --source){_listed(endpoints)}"
         )
     return endpoints[0]
 
@@ -313,23 +317,23 @@ def _read(path: Path) -> str:
     return ""
 
 
-def _told(endpoints: list[Endpoint]) -> str:
-    """The pipelines that are running, for the end of an error's line."""
+def _listed(endpoints: list[Endpoint]) -> str:
+    """List the running pipelines, for the end of an error message."""
     return "".join(f"; {place.source or 'a pipeline'} at {place}" for place in sorted(endpoints, key=str))
 
 
 def _source_at(endpoint: Endpoint) -> str:
-    """The source of a pipeline of this user that runs there; empty if it is not known."""
+    """The source of this user's pipeline at an endpoint; empty if it is not known."""
     place = str(endpoint.folder.absolute()) if endpoint.folder is not None else str(endpoint)
     return next((other.source for other in running() if str(other) == place), "")
 
 
 def _follows(endpoint: Endpoint, source: str) -> bool:
-    """Whether a pipeline follows this source: the same text, the same file, or a file of that name."""
+    """Whether a pipeline has this source: the same text, the same file, or a file of that name."""
     return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
 
 
 def homes() -> list[Path]:
-    """Where private folders are made, the best place first: a pipeline of a timer has no runtime folder."""
+    """Where private folders are made, the preferred one first; a pipeline started by a timer has no runtime folder."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     return [Path(home) for home in (runtime, tempfile.gettempdir()) if os.access(home, os.W_OK)]

@@ -1,15 +1,15 @@
-"""Keys: who may connect, and as what.
+"""CURVE keys of a pipeline, and the list of clients that may connect, with their roles.
 
 A pipeline that can be reached from other machines has a folder of keys, made by `catstream keys new`:
 
     server.key       key pair of the sockets that listen
-    server.pub       its public half, by which all others know them
+    server.pub       its public key, by which clients recognise the pipeline
     client.key       key pair of the pipeline's own processes, for the sockets that connect
     clients/NAME     a client that may connect: its role and its public key
 
-A client has a folder of `server.pub` and its own `client.key`. Every file is TOML, and from its
-first byte for its owner alone. The files in `clients` are read at each handshake: who is added or
-removed needs no restart.
+A client has a folder with `server.pub` and its own `client.key`. Every file is TOML, and only its owner can read it,
+from its first byte on. The files in `clients` are read at each handshake, so a client can be added or removed without
+a restart.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from catstream.wire.channels import Role
 
 __all__ = ["ROLES", "Client", "Keys", "allow", "clients", "create", "revoke"]
 
-#: What a client may be: each may do what those before it may.
+#: What a client may do: each role includes those before it.
 ROLES: tuple[Role, ...] = get_args(Role)
 
 _SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS = "server.key", "server.pub", "client.key", "clients"
@@ -41,7 +41,7 @@ _LONGEST = 4096  # bytes of a file
 
 @dataclass(frozen=True, slots=True)
 class Client:
-    """Who may connect: the role, and the public key."""
+    """A client that may connect: its role and its public key."""
 
     role: Role
     public: str
@@ -49,7 +49,7 @@ class Client:
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """What a process connects with, and where it looks up who may connect to it.
+    """The keys with which a process connects, and the folder of the clients that may connect to it.
 
     server          public key of the sockets that listen
     public, secret  key pair of the sockets that connect
@@ -67,7 +67,7 @@ class Keys:
         Raises
         ------
         ServiceError
-            Where one is missing, damaged, or can be read by others.
+            If a file is missing, damaged, or can be read by other users.
         """
         folder = Path(folder).absolute()
         server, own = _read(folder / _SERVER_PUBLIC), _read(folder / _CLIENT)
@@ -79,7 +79,7 @@ class Keys:
         Raises
         ------
         ServiceError
-            Where this is the folder of a client.
+            If this is the folder of a client.
         """
         if not (self.folder / _SERVER).exists():
             raise ServiceError(
@@ -89,7 +89,7 @@ class Keys:
         return _key(_read(self.folder / _SERVER), "secret", self.folder)
 
     def client(self, public: str) -> tuple[str, Role] | None:
-        """Name and role of the client with this public key, as of now; None where it may not connect."""
+        """Current name and role of the client with this public key; None if it may not connect."""
         for name, client in clients(self.folder).items():
             if client.public == public:
                 return name, client.role
@@ -97,15 +97,15 @@ class Keys:
 
 
 def create(folder: Path) -> None:
-    """Make the keys of a pipeline: of its sockets that listen, and of its processes that connect.
+    """Make the keys of a pipeline: a pair for its sockets that listen, and one for its processes that connect.
 
     Raises
     ------
     ServiceError
-        Where the folder holds keys already, or cannot be written.
+        If the folder holds keys already, or cannot be written.
     """
     if any((folder / name).exists() for name in (_SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS)):
-        raise ServiceError(f"{folder} holds keys already, and who has them would be locked out: give another folder")
+        raise ServiceError(f"{folder} holds keys already, and clients that have them would be locked out: give another")
     server = zmq.curve_keypair()
     _write(folder / _SERVER, public=server[0], secret=server[1])
     _write(folder / _SERVER_PUBLIC, public=server[0])
@@ -113,17 +113,17 @@ def create(folder: Path) -> None:
 
 
 def allow(folder: Path, name: str, role: Role, output: Path | None = None, public: str | None = None) -> None:
-    """Let a client connect from now on.
+    """Add a client, which may connect from now on.
 
     Parameters
     ----------
-    output : folder for the keys of the client, to be given to it; or
-    public : the public key of a client that has its pair already
+    output : new folder for the keys of the client; or
+    public : the public key of a client that has a key pair already
 
     Raises
     ------
     ServiceError
-        Where there is a client of that name, or of that key, or something in `output`.
+        If there is a client with that name or key, or `output` holds keys already.
     """
     if not _NAME.fullmatch(name):
         raise ServiceError(f"a client's name is of letters, digits, dots and dashes, at most 64, got {name!r}")
@@ -145,12 +145,12 @@ def allow(folder: Path, name: str, role: Role, output: Path | None = None, publi
 
 
 def revoke(folder: Path, name: str) -> None:
-    """Let a client connect no more.
+    """Remove a client: it may not connect any more.
 
     Raises
     ------
     ServiceError
-        Where there is no client of that name.
+        If there is no client of that name.
     """
     known = clients(folder)
     if name not in known:
@@ -159,19 +159,19 @@ def revoke(folder: Path, name: str) -> None:
 
 
 def clients(folder: Path) -> dict[str, Client]:
-    """Who may connect, by name.
+    """The clients that may connect, by name.
 
     Raises
     ------
     ServiceError
-        Where the folder holds no keys, or one of its files is damaged.
+        If the folder holds no keys, or one of its files is damaged.
     """
     found = {}
     for path in _listed(folder):
         try:
             facts = _read(path)
         except ServiceError:
-            if not path.exists():  # revoked in this moment
+            if not path.exists():  # it was revoked meanwhile
                 continue
             raise
         role = facts.get("role")
@@ -191,14 +191,14 @@ def _listed(folder: Path) -> list[Path]:
 
 
 def _pair(folder: Path) -> bytes:
-    """Make the key pair of what connects; returns its public half."""
+    """Make a key pair for sockets that connect; returns the public key."""
     public, secret = zmq.curve_keypair()
     _write(folder / _CLIENT, public=public, secret=secret)
     return public
 
 
 def _write(path: Path, **facts: bytes) -> None:
-    """A new file, whole or not at all, that only its owner can ever read."""
+    """Write a new file atomically; only its owner can read it at any time."""
     text = b"".join(b'%s = "%s"\n' % (name.encode(), value) for name, value in facts.items())
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -208,22 +208,24 @@ def _write(path: Path, **facts: bytes) -> None:
                 file.write(text)
                 file.flush()
                 os.fsync(handle)
-            os.link(part, path)  # unlike a rename it takes no other file's place
+            os.link(part, path)  # unlike a rename, this never replaces a file
         finally:
             Path(part).unlink()
     except FileExistsError:
-        raise ServiceError(f"{path} is there already, and is not written over: give another folder") from None
+        raise ServiceError(f"{path} exists already and is not written over: give another folder") from None
     except OSError as error:
         raise ServiceError(f"cannot write {path} ({error.strerror}): give another folder") from None
 
 
 def _read(path: Path) -> dict[str, object]:
-    others = 0o077 if path.suffix == ".key" else 0o022  # a secret is not read by others, the rest not written
+    others = 0o077 if path.suffix == ".key" else 0o022  # others may not read a secret key, nor write any file
     try:
         with path.open("rb") as file:
             facts = os.fstat(file.fileno())
             if facts.st_uid not in (os.geteuid(), 0) or facts.st_mode & others:
-                raise ServiceError(f"{path} is not yours alone: chmod 600, and make new keys if others had it")
+                raise ServiceError(
+                    f"other users can access {path}: chmod 600, and make new keys if somebody may have read it"
+                )
             return tomllib.loads(file.read(_LONGEST).decode())
     except OSError as error:
         raise ServiceError(

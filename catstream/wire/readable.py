@@ -1,4 +1,4 @@
-"""Waits for sockets in an event loop."""
+"""Waits for sockets in an asyncio event loop."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class _HasFileno(Protocol):
 
 
 async def readable(sockets: Sequence[_HasFileno], seconds: float) -> None:
-    """Return once something may have come at one of these sockets, or after so many seconds."""
-    loop, came = asyncio.get_running_loop(), asyncio.Event()
+    """Return once something may have arrived at one of the sockets, or after so many seconds."""
+    loop, arrived = asyncio.get_running_loop(), asyncio.Event()
     handles = [socket.fileno() for socket in sockets]
     for handle in handles:
-        loop.add_reader(handle, came.set)
+        loop.add_reader(handle, arrived.set)
     try:
         async with asyncio.timeout(seconds):
-            await came.wait()
+            await arrived.wait()
     except TimeoutError:
         pass
     finally:

@@ -13,8 +13,9 @@ from catstream.messages import Health, Run, Track
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.source import open_source
+from catstream.wire.channels import HEALTH, TRACKS, TRAINING
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Publisher
+from catstream.wire.newest import Publisher
 
 FILES = ["tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet"]
 
@@ -67,9 +68,9 @@ def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the
 ):
     endpoint, file = Endpoint.parse(str(folder)), tmp_path / "tracks.ndjson"
     with (
-        Publisher("health", endpoint, "detector") as health,
-        Publisher("tracks", endpoint) as tracks,
-        Publisher("lessons", endpoint, greeting=Run.of(Settings(run={"unstored_frames": 100}).portable())) as lessons,
+        Publisher(HEALTH, endpoint, "detector") as health,
+        Publisher(TRACKS, endpoint) as tracks,
+        Publisher(TRAINING, endpoint, greeting=Run.of(Settings(run={"unstored_frames": 100}).portable())) as training,
     ):
         sink = catstream("sink", file, "--endpoint", folder)
         until(file.exists, lambda: health.send(Health("detector", time.time())))
@@ -77,9 +78,9 @@ def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the
         def follow(first, last, written):
             for frame in range(first, last):
                 tracks.send(Track(frame + 1, frame, frame / 30, "absent", None, 0.0, 0))
-            until(lambda: len(file.read_text().splitlines()) == written, lessons.welcome)
+            until(lambda: len(file.read_text().splitlines()) == written, training.serve_late_joiners)
 
-        until(lambda: tracks.heard, tracks.welcome)
+        until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
         follow(0, 300, written=300)
         follow(205, 310, written=310)
         follow(0, 200, written=310)

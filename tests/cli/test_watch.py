@@ -119,7 +119,7 @@ def test_status_tells_of_all_processes(resting, said):
     code, output, errors = said("status", "--endpoint", resting.endpoint, "--wait", SECONDS)
     assert (code, errors) == (0, "")
     assert [line.split()[0] for line in output.splitlines()] == [
-        "pipeline", "state", "frames", "learning", "model", "trees", "refused", "heard",
+        "pipeline", "state", "frames", "learning", "model", "trees", "rejected", "heard",
     ]  # fmt: skip
     assert all(name in output for name in NAMES)
 

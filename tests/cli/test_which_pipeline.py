@@ -12,8 +12,8 @@ from click.testing import CliRunner, _NamedTextIOWrapper
 
 from catstream.cli import group
 from catstream.messages import Answer
+from catstream.wire.commands import Responder
 from catstream.wire.endpoint import meeting_place, private_folder
-from catstream.wire.sockets import Responder
 
 
 @pytest.fixture
@@ -34,14 +34,14 @@ def _commanded(source):
 
     def serve():
         while not over.wait(0.01):
-            for command in responder.waiting():
+            for command in responder.receive_all():
                 heard.append(command.verb)
                 responder.answer(Answer(command.id, True, f"{command.verb} was done", 7, None, 1))
 
     with (
         private_folder() as folder,
         meeting_place("", folder, source=source) as place,
-        Responder("control", place) as responder,
+        Responder(place) as responder,
         ThreadPoolExecutor(1) as pool,
     ):
         serving = pool.submit(serve)

@@ -35,7 +35,7 @@ def test_a_pipeline_with_keys_loses_no_frame_and_is_heard_by_who_may(video, fold
         named = {next(health).process for _ in NAMES}
         rest = list(tracks)
         assert next(heard).state
-        assert pipeline.health["detector"]["refused"] == 0
+        assert pipeline.health["detector"]["rejected"] == 0
     assert (first.frame, rest[-1].frame) == (0, pipeline.frames - 1)
     assert pipeline.totals == {"sent": pipeline.frames, "stored": pipeline.frames}
     assert pipeline.restarts == 0
@@ -52,7 +52,7 @@ def test_a_stranger_at_the_door_of_a_pipeline_is_counted_in_its_health(video, ke
         next(tracks)
         create(keys.parent / "wrong")
         with subscribe(tcp, "tracks", keys=str(keys.parent / "wrong")) as stranger:
-            while not next(health).counters.get("refused_handshake"):
+            while not next(health).counters.get("rejected_handshake"):
                 next(tracks, None)
             assert not stranger._messages.pending()
 

@@ -17,8 +17,9 @@ from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
+from catstream.wire.channels import HEALTH, MODELS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 #: A small window keeps the detector near the frame that a test has reached.
 SETTINGS = Settings(run={"unstored_frames": 16})
@@ -68,7 +69,7 @@ def test_what_a_process_said_after_the_last_track_was_taken_counts_too(video, un
 
     with (
         Pipeline(path, boxes[0], SETTINGS) as pipeline,
-        Subscriber("health", Endpoint.parse(pipeline.endpoint)) as health,
+        Subscriber(HEALTH, Endpoint.parse(pipeline.endpoint)) as health,
     ):
         next(iter(pipeline))
         heard = pipeline.health.get("detector", {}).get("sent", 0)
@@ -127,7 +128,7 @@ def test_a_restarted_trainer_goes_on_learning(video, until):
                 os.kill(pipeline.pids["trainer"], signal.SIGKILL)
             if pipeline.restarts and len(pipeline.pids) == 3:
                 break
-        with Subscriber("models", Endpoint.parse(pipeline.endpoint)) as models:
+        with Subscriber(MODELS, Endpoint.parse(pipeline.endpoint)) as models:
             model = until(lambda: models.receive(0.1))
     assert model.version > versions[25]
 
@@ -183,7 +184,7 @@ def test_who_attaches_late_gets_the_last_model(video, until):
             if track.frame == 30:
                 break
         # Nobody takes tracks now: with a full window the detector waits, and no newer model comes.
-        with Subscriber("models", Endpoint.parse(pipeline.endpoint)) as models:
+        with Subscriber(MODELS, Endpoint.parse(pipeline.endpoint)) as models:
             model = until(lambda: models.receive(0.1))
     assert model.version >= track.model_version > 0
 

@@ -28,7 +28,7 @@ def looks(folder, previews, until):
 
     def begin():
         reader = subscribe(str(folder), "previews", timeout=60)
-        until(lambda: previews.heard, previews.turn)
+        until(lambda: previews.has_subscribers, previews.turn)
         return reader
 
     return begin

@@ -21,8 +21,9 @@ from catstream.services.supervisor import NAMES, Supervisor
 from catstream.settings import Settings
 from catstream.state import TREES
 from catstream.video.source import open_source
+from catstream.wire.channels import HEALTH, TRACKS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 
 @pytest.mark.parametrize(
@@ -35,7 +36,7 @@ def test_started_by_hand_in_any_order_they_complete_a_run(video, folder, tcp, se
         "trainer": [],
         "detector": ["--resume", path, "--box", ",".join(map(str, boxes[0]))],
     }
-    with Subscriber("tracks", Endpoint.parse(tcp)) as tracks:
+    with Subscriber(TRACKS, Endpoint.parse(tcp)) as tracks:
         processes = [service(name, "--set", f"run.endpoint={tcp}", *arguments[name]) for name in order]
         end = until(lambda: next((m for m in iter(lambda: tracks.receive(0.1), None) if isinstance(m, End)), None))
     assert end.totals == {"sent": len(boxes), "stored": len(boxes)}
@@ -91,7 +92,7 @@ def test_all_that_are_asked_to_end_at_once_do_so_in_order_and_all_is_stored(vide
         "trainer": [],
         "detector": ["--record", folder / "run.rec", path, "--box", ",".join(map(str, boxes[0]))],
     }
-    with Subscriber("tracks", Endpoint.parse(str(folder))) as tracks:
+    with Subscriber(TRACKS, Endpoint.parse(str(folder))) as tracks:
         place = ["--set", f"run.endpoint={folder}", "--set", "run.lockstep=true"]  # in which the video is long
         processes = [service(name, *place, *given) for name, given in arguments.items()]
         until(lambda: isinstance(track := tracks.receive(0.1), Track) and track.frame >= 20)
@@ -115,7 +116,7 @@ def test_a_compressor_that_is_asked_to_end_alone_stores_what_it_has_and_leaves(v
         "--set",
         "run.unstored_frames=2000",
     ]
-    with Subscriber("health", Endpoint.parse(str(folder))) as health:
+    with Subscriber(HEALTH, Endpoint.parse(str(folder))) as health:
         compressor, detector = (service(name, *place, *given) for name, given in arguments.items())
         # Without a trainer the detector stands still, with features that were taken and not stored.
         told = (report.counters for report in iter(lambda: health.receive(60), None) if report.process == "detector")

@@ -12,8 +12,9 @@ from catstream.box import Box
 from catstream.messages import End, Features, Health, Model, Track
 from catstream.recording.file import Recording
 from catstream.recording.player import Player
+from catstream.wire.channels import TRACKS, TRAINING
 from catstream.wire.codec import encode
-from catstream.wire.sockets import Subscriber
+from catstream.wire.newest import Subscriber
 
 
 @pytest.fixture
@@ -49,11 +50,11 @@ def test_a_subscriber_gets_what_was_recorded_until_the_end(said, written, playin
 
 def test_features_and_settings_travel_too_and_a_cut_recording_has_an_end(said, written, playing, endpoint):
     recording = Recording(written([message for message in said if not isinstance(message, Model)][:40]))
-    with Subscriber("lessons", endpoint) as lessons, Subscriber("tracks", endpoint):
+    with Subscriber(TRAINING, endpoint) as training, Subscriber(TRACKS, endpoint):
         playing(recording)
         heard, deadline = [], time.monotonic() + 30
         while not (heard and isinstance(heard[-1], End)) and time.monotonic() < deadline:
-            if (message := lessons.receive(0.1)) is not None:
+            if (message := training.receive(0.1)) is not None:
                 heard.append(message)
     assert recording.run in heard
     seqs = [message.seq for message in heard if isinstance(message, Features)]

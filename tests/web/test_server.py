@@ -21,8 +21,9 @@ from catstream.messages import Health
 from catstream.web.dashboard import Dashboard
 from catstream.web.guard import Guard, TokenBucket
 from catstream.web.server import Server
+from catstream.wire.channels import HEALTH, PREVIEWS, TRACKS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Publisher
+from catstream.wire.newest import Publisher
 
 TOKEN = "correct-horse-battery"
 PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics"]
@@ -44,13 +45,12 @@ def pipeline(folder):
     place = Endpoint.parse(str(folder))
     with ExitStack() as stack:
         health = {
-            name: stack.enter_context(Publisher("health", place, name))
-            for name in ("detector", "compressor", "trainer")
+            name: stack.enter_context(Publisher(HEALTH, place, name)) for name in ("detector", "compressor", "trainer")
         }
         yield {
             **health,
-            "tracks": stack.enter_context(Publisher("tracks", place)),
-            "previews": stack.enter_context(Publisher("previews", place)),
+            "tracks": stack.enter_context(Publisher(TRACKS, place)),
+            "previews": stack.enter_context(Publisher(PREVIEWS, place)),
         }
 
 
@@ -105,14 +105,14 @@ def test_it_is_healthy_by_itself_and_ready_with_all_processes(page, pipeline, un
 
     def ready():
         for name in ("detector", "compressor", "trainer"):
-            pipeline[name].send(Health(name, 1.0, {"sent": 3.0, "refused": 1.0}))
+            pipeline[name].send(Health(name, 1.0, {"sent": 3.0, "rejected": 1.0}))
         return page.get("/readyz").status_code == 200
 
     until(ready)
     shown = page.get("/metrics").text
     assert "\ncatstream_up 1.0\n" in shown
     assert "\ncatstream_frames_total 3.0\n" in shown
-    assert '\ncatstream_refused_messages_total{process="trainer"} 1.0\n' in shown
+    assert '\ncatstream_rejected_messages_total{process="trainer"} 1.0\n' in shown
 
 
 def test_it_is_not_ready_where_one_process_is_silent(page, pipeline, until, monkeypatch):
@@ -159,10 +159,10 @@ def test_pictures_are_asked_of_the_pipeline_only_while_somebody_looks(page, pipe
         return True
 
     until(lambda: turn() and page.get("/metrics").text.count("\ncatstream_up 1.0\n"))
-    assert not pipeline["previews"].heard
+    assert not pipeline["previews"].has_subscribers
     frame = updates(page, "picture", turn)["frame"]
     assert page.get(f"/pictures/{frame}.jpg").content == facts.preview(frame).jpeg
-    until(lambda: turn() and not pipeline["previews"].heard)
+    until(lambda: turn() and not pipeline["previews"].has_subscribers)
 
 
 def test_the_live_picture_has_the_track_of_its_frame_drawn_in(page, pipeline, facts):

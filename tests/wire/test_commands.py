@@ -15,7 +15,7 @@ from catstream.messages import Answer, Command
 from catstream.steering import Control
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import decode, encode
-from catstream.wire.sockets import Requester, Responder
+from catstream.wire.commands import Requester, Responder
 
 PAUSE = Command("one", "pause")
 
@@ -27,11 +27,11 @@ def answering(endpoint, answer):
 
     def serve():
         while not over.wait(0.01):
-            for command in responder.waiting():
+            for command in responder.receive_all():
                 heard.append(command)
                 responder.answer(answer(command))
 
-    with Responder("control", endpoint) as responder, ThreadPoolExecutor(1) as pool:
+    with Responder(endpoint) as responder, ThreadPoolExecutor(1) as pool:
         serving = pool.submit(serve)
         try:
             yield responder, heard
@@ -54,13 +54,13 @@ def raw(endpoint):
 
 
 def test_a_command_gets_its_answer(endpoint):
-    with answering(endpoint, done) as (_, heard), Requester("control", endpoint) as requester:
+    with answering(endpoint, done) as (_, heard), Requester(endpoint) as requester:
         assert requester.ask(PAUSE, 20) == done(PAUSE)
     assert heard == [PAUSE]
 
 
 def test_who_asks_before_anybody_is_there_is_answered_once_somebody_is(endpoint):
-    with ThreadPoolExecutor(1) as pool, Requester("control", endpoint) as requester:
+    with ThreadPoolExecutor(1) as pool, Requester(endpoint) as requester:
         assert requester.ask(PAUSE, 0.3) is None
         answer = pool.submit(requester.ask, PAUSE, 20)
         with answering(endpoint, done) as (_, heard):
@@ -69,18 +69,18 @@ def test_who_asks_before_anybody_is_there_is_answered_once_somebody_is(endpoint)
 
 
 def test_a_command_that_comes_again_is_answered_again_and_carried_out_once(endpoint, raw, until):
-    with Responder("control", endpoint) as responder:
+    with Responder(endpoint) as responder:
         heard = []
         for _ in range(3):  # on its way when the first is taken, and after its answer
             raw.send(encode(PAUSE))
-        until(lambda: heard, lambda: heard.extend(responder.waiting()))
-        until(lambda: not heard[1:] and not raw.poll(20), lambda: heard.extend(responder.waiting()))
+        until(lambda: heard, lambda: heard.extend(responder.receive_all()))
+        until(lambda: not heard[1:] and not raw.poll(20), lambda: heard.extend(responder.receive_all()))
         responder.answer(done(PAUSE))
         raw.send(encode(PAUSE))
         answers = []
 
         def turn():
-            heard.extend(responder.waiting())
+            heard.extend(responder.receive_all())
             answers.extend([decode(raw.recv(), Answer)] if raw.poll(20) else [])
 
         until(lambda: len(answers) == 2, turn)
@@ -91,8 +91,8 @@ def test_a_command_that_comes_again_is_answered_again_and_carried_out_once(endpo
 def test_of_two_who_ask_each_gets_its_own_answer(endpoint):
     with (
         answering(endpoint, done),
-        Requester("control", endpoint) as one,
-        Requester("control", endpoint) as two,
+        Requester(endpoint) as one,
+        Requester(endpoint) as two,
         ThreadPoolExecutor(2) as pool,
     ):
         answers = [pool.submit(who.ask, Command(name, "pause"), 20) for name, who in (("one", one), ("two", two))]
@@ -111,22 +111,22 @@ def test_what_is_no_command_is_counted_and_the_next_one_is_answered(endpoint, ra
         assert raw.poll(20_000)
         assert decode(raw.recv(), Answer) == done(PAUSE)
     assert heard == [PAUSE]
-    assert responder.refused == 1
+    assert responder.rejected == 1
 
 
 def test_a_flood_of_commands_is_bounded_and_those_that_were_dropped_may_come_again(endpoint, raw, until):
-    with Responder("control", endpoint) as responder:
+    with Responder(endpoint) as responder:
         heard = []
         for number in range(60):
             raw.send(encode(Command(f"{number}", "pause")))
-        until(lambda: len(heard) == 60, lambda: heard.extend(responder.waiting()))
+        until(lambda: len(heard) == 60, lambda: heard.extend(responder.receive_all()))
         for number in range(60, 100):
             raw.send(encode(Command(f"{number}", "pause")))
-        until(lambda: len(heard) == 64 and not responder._wait(0.1), lambda: heard.extend(responder.waiting()))
+        until(lambda: len(heard) == 64 and not responder._wait(0.1), lambda: heard.extend(responder.receive_all()))
         for command in heard:
             responder.answer(done(command))
         raw.send(encode(Command("99", "pause")))
-        until(lambda: heard[-1].id == "99", lambda: heard.extend(responder.waiting()))
+        until(lambda: heard[-1].id == "99", lambda: heard.extend(responder.receive_all()))
     assert len(heard) == 65
 
 

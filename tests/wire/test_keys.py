@@ -13,12 +13,14 @@ import zmq
 import catstream
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import Answer, Command, End, Health, Model, Position, Preview, Run, Sample, Track
-from catstream.wire.channels import CHANNELS
+from catstream.wire.acknowledged import Receiver, Sender
+from catstream.wire.channels import CHANNELS, MODELS, RESULTS, TRACKS
 from catstream.wire.codec import encode
+from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import ROLES, Keys, allow, clients, create, revoke
-from catstream.wire.refusals import refusals
-from catstream.wire.sockets import Publisher, Receiver, Requester, Responder, Sender, Subscriber
+from catstream.wire.newest import Publisher, Subscriber
+from catstream.wire.rejects import rejects
 
 WINDOW = 4
 CLIENTS = {"watcher": "watch", "helm": "steer", "host": "pipeline"}  # name and role of some
@@ -48,8 +50,8 @@ SAID = {
 }
 
 
-def refused(reason):
-    return refusals().get(f"refused_{reason}", 0)
+def rejected(reason):
+    return rejects().get(f"rejected_{reason}", 0)
 
 
 @pytest.fixture
@@ -81,12 +83,12 @@ def listener(place):
         def listen(name):
             channel = CHANNELS[name]
             if channel.acknowledged and name != "control":
-                receiver = stack.enter_context(Receiver(name, place(), Position(), WINDOW))
+                receiver = stack.enter_context(Receiver(CHANNELS[name], place(), Position(), WINDOW))
                 return lambda: receiver.receive(0.02)
             if name == "control":
-                responder = stack.enter_context(Responder(name, place()))
-                return lambda: responder.waiting() or None
-            publisher = stack.enter_context(Publisher(name, place(), channel.senders[0]))
+                responder = stack.enter_context(Responder(place()))
+                return lambda: responder.receive_all() or None
+            publisher = stack.enter_context(Publisher(CHANNELS[name], place(), channel.senders[0]))
             return lambda: publisher.send(SAID[channel.messages[0]])
 
         yield listen
@@ -109,7 +111,7 @@ def stranger():
             socket.connect(endpoint.address(CHANNELS[name]))
             if kind == zmq.DEALER:
                 said = Command("1", "stop") if name == "control" else End(1, "forged")
-                with suppress(zmq.Again):  # it may be turned away already
+                with suppress(zmq.Again):  # it may be rejected already
                     socket.send(encode(said), zmq.NOBLOCK)
             return socket
 
@@ -177,23 +179,23 @@ def test_a_secret_is_not_printed(keys):
 
 def test_a_client_cannot_listen_in_the_pipelines_place(place):
     with pytest.raises(ServiceError, match="keys of a client"):
-        Publisher("tracks", place("watcher"))
+        Publisher(TRACKS, place("watcher"))
 
 
 @pytest.mark.parametrize("name", WATCHED)
 def test_who_may_watch_hears(name, place, listener, until):
     turn, heard = listener(name), []
-    with Subscriber(name, place("watcher")) as reader:
-        until(lambda: heard, lambda: (turn(), heard.extend(reader.waiting())))
+    with Subscriber(CHANNELS[name], place("watcher")) as reader:
+        until(lambda: heard, lambda: (turn(), heard.extend(reader.receive_all())))
     assert heard
 
 
 def test_who_may_steer_is_answered(place, until):
-    with Responder("control", place()) as detector, Requester("control", place("helm")) as helm:
+    with Responder(place()) as detector, Requester(place("helm")) as helm:
         answers = []
 
         def turn():
-            for command in detector.waiting():
+            for command in detector.receive_all():
                 detector.answer(Answer(command.id, True, "", 1))
             answers.append(helm.ask(Command("1", "pause"), 0.2))
 
@@ -203,10 +205,10 @@ def test_who_may_steer_is_answered(place, until):
 
 def test_the_pipelines_own_keys_carry_an_acknowledged_channel(place, until):
     taken = []
-    with Receiver("results", place(), Position(), WINDOW) as receiver, Sender("results", place(), WINDOW) as sender:
+    with Receiver(RESULTS, place(), Position(), WINDOW) as receiver, Sender(RESULTS, place(), WINDOW) as sender:
 
         def turn():
-            sender.send(track(sender.sent + 1)) if sender.sent < 50 else sender.listen(0)
+            sender.send(track(sender.sent + 1)) if sender.sent < 50 else sender.poll(0)
             if (message := receiver.receive(0.02)) is not None:
                 taken.append(message.seq)
                 receiver.acknowledge(Position(message.seq))
@@ -223,13 +225,13 @@ def test_who_may_not_take_part_gets_nothing_is_counted_and_named_once(
     if who == "revoked":
         who, reason = "host", "key"
         revoke(keys, who)
-    turn, taken, before = listener(name), [], refused(reason)
+    turn, taken, before = listener(name), [], rejected(reason)
     one, two = stranger(name, place(who)), stranger(name, place("none" if who == "wrong" else who))
-    until(lambda: refused(reason) >= before + 2, lambda: taken.append(turn()))
+    until(lambda: rejected(reason) >= before + 2, lambda: taken.append(turn()))
     assert not any(taken)
     assert not one.poll(50)
     assert not two.poll(0)
-    told = [record.message for record in caplog.records if "turned away" in record.message]
+    told = [record.message for record in caplog.records if "rejected" in record.message]
     assert len(told) <= 1, "once for all, where it was not told before"
     if reason != "handshake":
         assert who in told[0] if reason == "role" else Keys.load(keys.parent / who).public.decode() in told[0]
@@ -238,52 +240,52 @@ def test_who_may_not_take_part_gets_nothing_is_counted_and_named_once(
 @pytest.mark.parametrize("name", ["features", "results", "control"])
 def test_an_allowed_watcher_that_sends_is_told_why_it_cannot(name, place, listener, until):
     turn = listener(name)
-    client = Requester(name, place("watcher")) if name == "control" else Sender(name, place("watcher"), WINDOW)
+    client = Requester(place("watcher")) if name == "control" else Sender(CHANNELS[name], place("watcher"), WINDOW)
     with client, pytest.raises(ServiceError, match=f"does not let this key take part in {name}"):
         until(lambda: False, lambda: (turn(), client._wait(0.02)))
 
 
 def test_a_revoked_client_hears_until_its_connection_ends_and_never_again(keys, place, until):
     heard = []
-    with Subscriber("tracks", place("watcher")) as reader:
-        with Publisher("tracks", place()) as tracks:
-            until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.waiting())))
+    with Subscriber(TRACKS, place("watcher")) as reader:
+        with Publisher(TRACKS, place()) as tracks:
+            until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.receive_all())))
             revoke(keys, "watcher")
             until(
                 lambda: heard[-1].seq == 2,
-                lambda: (tracks.send(track(2)), heard.extend(reader.waiting())),
+                lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())),
             )
             with (
-                Subscriber("tracks", place("watcher")) as another,
+                Subscriber(TRACKS, place("watcher")) as another,
                 pytest.raises(ServiceError, match="does not let this key"),
             ):
                 until(lambda: False, lambda: (tracks.send(track(3)), another.receive(0.02)))
         list(iter(lambda: reader.receive(0.05), None))  # what was on its way
-        with Publisher("tracks", place()) as tracks, pytest.raises(ServiceError, match="does not let this key"):
+        with Publisher(TRACKS, place()) as tracks, pytest.raises(ServiceError, match="does not let this key"):
             until(lambda: False, lambda: (tracks.send(track(4)), heard.append(reader.receive(0.02))))
     assert {message.seq for message in heard if message} <= {1, 2, 3}
 
 
 def test_who_is_allowed_later_needs_no_restart(keys, place, until):
     heard = []
-    with Publisher("tracks", place()) as tracks:
+    with Publisher(TRACKS, place()) as tracks:
         tracks.send(track(1))
         allow(keys, "late", "watch", output=keys.parent / "late")
-        with Subscriber("tracks", place("late")) as reader:
-            until(lambda: heard, lambda: (tracks.send(track(2)), heard.extend(reader.waiting())))
+        with Subscriber(TRACKS, place("late")) as reader:
+            until(lambda: heard, lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())))
 
 
 def test_while_the_clients_cannot_be_read_nobody_comes_in_and_afterwards_they_do(keys, place, until):
-    heard, before = [], refused("unreadable")
+    heard, before = [], rejected("unreadable")
     good = (keys / "clients" / "helm").read_bytes()
     (keys / "clients" / "helm").write_bytes(b"role = ")
-    with Publisher("tracks", place()) as tracks, Subscriber("tracks", place("watcher")) as reader:
+    with Publisher(TRACKS, place()) as tracks, Subscriber(TRACKS, place("watcher")) as reader:
 
         def turn():
             tracks.send(track(1))
-            heard.extend(reader.waiting())
+            heard.extend(reader.receive_all())
 
-        until(lambda: refused("unreadable") > before, turn)
+        until(lambda: rejected("unreadable") > before, turn)
         assert not heard
         (keys / "clients" / "helm").write_bytes(good)
         until(lambda: heard, turn)
@@ -295,22 +297,22 @@ def test_two_pipelines_of_one_program_have_each_their_own_clients(place, keys, f
     (folder / "second.d").mkdir(mode=0o700)
     model, heard = SAID[Model], []
     with (
-        Publisher("models", place()) as one,
-        Publisher("models", Endpoint.parse(*second)) as two,
-        Subscriber("models", Endpoint.parse(*second)) as reader,
-        Subscriber("models", Endpoint.parse(second[0], str(keys))) as stranger,
+        Publisher(MODELS, place()) as one,
+        Publisher(MODELS, Endpoint.parse(*second)) as two,
+        Subscriber(MODELS, Endpoint.parse(*second)) as reader,
+        Subscriber(MODELS, Endpoint.parse(second[0], str(keys))) as stranger,
     ):
-        until(lambda: heard, lambda: (one.send(model), two.send(model), heard.extend(reader.waiting())))
+        until(lambda: heard, lambda: (one.send(model), two.send(model), heard.extend(reader.receive_all())))
         assert stranger.receive(0.1) is None
 
 
 def test_sockets_with_keys_come_and_go_as_they_like(place, until):
     for _ in range(50):
-        with Publisher("tracks", place()):
+        with Publisher(TRACKS, place()):
             pass
-    with Publisher("tracks", place()) as tracks, Subscriber("tracks", place()) as reader:
+    with Publisher(TRACKS, place()) as tracks, Subscriber(TRACKS, place()) as reader:
         heard = []
-        until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.waiting())))
+        until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.receive_all())))
     assert heard[0] == track(1)
 
 
@@ -319,7 +321,7 @@ def test_a_client_without_keys_is_told_that_the_pipeline_asks_for_them(place, li
     listens = listener("tracks" if attach == "subscribe" else "control")
     endpoint = str(place("none"))
 
-    def refused():
+    def rejected():
         listens()
         if attach == "subscribe":
             with catstream.subscribe(endpoint, "tracks", timeout=0.2) as tracks, suppress(SilenceError):
@@ -329,4 +331,4 @@ def test_a_client_without_keys_is_told_that_the_pipeline_asks_for_them(place, li
                 pipeline.pause()
 
     with pytest.raises(ServiceError, match=r"asks for keys, and none were given.*--keys DIR"):
-        until(refused)
+        until(rejected)

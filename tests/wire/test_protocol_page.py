@@ -20,9 +20,9 @@ from catstream.heads import HEADS
 from catstream.messages import DetectorState, End, Motion, Stored, Summary, Track, TrainingRows
 from catstream.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Bytes, Named, OnlyWith, Whole, fields
 from catstream.wire import codec
-from catstream.wire.channels import CHANNELS
+from catstream.wire.channels import CHANNELS, TRACKS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Publisher
+from catstream.wire.newest import Publisher
 
 PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
@@ -137,7 +137,7 @@ def test_the_address_of_the_example_is_that_of_the_channel(text):
 def test_the_subscriber_of_the_page_hears_every_track(endpoint, until):
     address = endpoint.address(CHANNELS["tracks"])
     with (
-        Publisher("tracks", endpoint) as tracks,
+        Publisher(TRACKS, endpoint) as tracks,
         subprocess.Popen([sys.executable, "-c", block("python"), address], stdout=subprocess.PIPE, text=True) as reader,
     ):
         hello = Track(1, 0, 0.0, "absent", None, 0.0, 0)

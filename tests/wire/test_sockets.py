@@ -14,10 +14,11 @@ import zmq
 
 from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import End, Health, Model, Position, Sample, Stored, Summary, Track
-from catstream.wire.channels import CHANNELS
+from catstream.wire.acknowledged import Receiver, Sender
+from catstream.wire.channels import CHANNELS, FEATURES, HEALTH, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.codec import decode, encode
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Publisher, Receiver, Sender, Subscriber
+from catstream.wire.newest import Publisher, Subscriber
 
 WINDOW = 4
 
@@ -36,13 +37,15 @@ def take(receiver, taken, *, store):
     if message is not None:
         taken.append(message.seq)
         receiver.acknowledge(Position(message.seq if store else 0))
+    if receiver.asked:
+        receiver.answer(Position(receiver.taken if store else 0))
 
 
 def first(publisher, endpoint, until):
     """What a new reader hears first."""
     heard = []
-    with Subscriber(publisher.channel.name, endpoint) as reader:
-        until(lambda: heard, lambda: (publisher.welcome(), heard.extend(reader.waiting())))
+    with Subscriber(publisher.channel, endpoint) as reader:
+        until(lambda: heard, lambda: (publisher.serve_late_joiners(), heard.extend(reader.receive_all())))
     return heard[0]
 
 
@@ -62,13 +65,13 @@ def stranger(endpoint):
 
 def test_an_acknowledged_channel_delivers_every_message_once_in_order(endpoint, until):
     taken = []
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
 
         def turn():
             if sender.sent < 50:
                 sender.send(track(sender.sent + 1))
             else:
-                sender.listen(0)
+                sender.poll(0)
             take(receiver, taken, store=True)
 
         until(lambda: sender.stored == 50, turn)
@@ -78,13 +81,13 @@ def test_an_acknowledged_channel_delivers_every_message_once_in_order(endpoint, 
 
 def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
     taken = []
-    with Sender("results", endpoint, WINDOW) as sender:
-        assert sender.position() is None
+    with Sender(RESULTS, endpoint, WINDOW) as sender:
+        assert sender.ask_position() is None
         assert sender.send(track(1))
-        with Receiver("results", endpoint, Position(), WINDOW) as receiver:
+        with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
 
             def turn():
-                sender.listen(0.05)
+                sender.poll(0.05)
                 take(receiver, taken, store=True)
 
             until(lambda: sender.stored == 1, turn)
@@ -93,15 +96,15 @@ def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
 
 def test_a_sender_that_asked_a_slow_receiver_still_learns_what_it_has_taken(endpoint, until):
     taken = []
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
 
         def turn():
             take(receiver, taken, store=False)
-            sender.listen(0.05)
+            sender.poll(0.05)
 
         sender.send(track(1))
         for _ in range(10):
-            sender.listen(0.05)  # nobody answers: it asks where the receiver is, and will send all again
+            sender.poll(0.05)  # nobody answers: it asks where the receiver is, and will send all again
         for _ in range(10):
             turn()
         until(lambda: sender.taken == 1, turn)
@@ -109,59 +112,59 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_what_it_has_taken(endp
 
 
 def test_a_sender_knows_which_sample_its_messages_led_to(endpoint, until):
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
 
         def turn():
             message = receiver.receive(0.05)
             if message is not None:  # every other message leads to a sample
                 receiver.acknowledge(Position(message.seq, version=message.seq // 2))
-            sender.listen(0)
+            sender.poll(0)
 
         led_to = []
         for seq in range(1, 8):
             sender.send(track(seq))
             until(lambda seq=seq: sender.taken == seq, turn)
         for seq in range(1, 8):
-            led_to.append(sender.made(seq))
+            led_to.append(sender.sample_of(seq))
     assert led_to == [0, 1, 1, 2, 2, 3, 3]
 
 
 def test_a_full_window_takes_no_more(endpoint, until):
     taken = []
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         assert [sender.send(track(seq)) for seq in range(1, WINDOW + 2)] == [True] * WINDOW + [False]
 
         def turn():
-            sender.listen(0)
+            sender.poll(0)
             take(receiver, taken, store=False)
 
         until(lambda: sender.taken == WINDOW, turn)
         assert not sender.send(track(WINDOW + 1)), "taken is not yet stored"
         receiver.acknowledge(Position(1))
-        until(lambda: sender.stored == 1, lambda: sender.listen(0.05))
+        until(lambda: sender.stored == 1, lambda: sender.poll(0.05))
         assert sender.send(track(WINDOW + 1))
 
 
 def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
     taken = []
-    with Sender("results", endpoint, 10) as sender:
-        with Receiver("results", endpoint, Position(), 10) as receiver:
+    with Sender(RESULTS, endpoint, 10) as sender:
+        with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
             for seq in range(1, 9):
                 sender.send(track(seq))
 
             def turn():
-                sender.listen(0)
+                sender.poll(0)
                 take(receiver, taken, store=len(taken) < 3)
 
             until(lambda: len(taken) == 6, turn)
             receiver.acknowledge(Position(3))
         again = []
-        with Receiver("results", endpoint, Position(3), 10) as receiver:
+        with Receiver(RESULTS, endpoint, Position(3), 10) as receiver:
 
             def on():
                 if sender.sent < 20:
                     sender.send(track(sender.sent + 1))
-                sender.listen(0)
+                sender.poll(0)
                 take(receiver, again, store=True)
 
             until(lambda: sender.stored == 20, on)
@@ -171,21 +174,21 @@ def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
 
 def test_a_restarted_sender_repeats_nothing_that_was_taken(endpoint, until):
     taken = []
-    with Receiver("results", endpoint, Position(), 10) as receiver:
-        with Sender("results", endpoint, 10) as sender:
+    with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
+        with Sender(RESULTS, endpoint, 10) as sender:
             for seq in range(1, 6):
                 sender.send(track(seq))
 
             def turn():
-                sender.listen(0)
+                sender.poll(0)
                 take(receiver, taken, store=True)
 
             until(lambda: len(taken) == 5, turn)
-        with Sender("results", endpoint, 10) as sender:
+        with Sender(RESULTS, endpoint, 10) as sender:
             found = []
 
             def ask():
-                found.append(sender.position())
+                found.append(sender.ask_position())
                 take(receiver, taken, store=True)
 
             until(lambda: found and found[-1] is not None, ask)
@@ -195,7 +198,7 @@ def test_a_restarted_sender_repeats_nothing_that_was_taken(endpoint, until):
             def on():
                 if sender.sent < 9:
                     sender.send(track(sender.sent + 1))
-                sender.listen(0)
+                sender.poll(0)
                 take(receiver, taken, store=True)
 
             until(lambda: sender.stored == 9, on)
@@ -204,21 +207,21 @@ def test_a_restarted_sender_repeats_nothing_that_was_taken(endpoint, until):
 
 def test_a_restarted_sender_may_hear_that_more_was_stored_since_it_asked(endpoint, until):
     taken, found = [], []
-    with Receiver("results", endpoint, Position(), 10) as receiver:
-        with Sender("results", endpoint, 10) as sender:
+    with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
+        with Sender(RESULTS, endpoint, 10) as sender:
             for seq in range(1, 6):
                 sender.send(track(seq))
-            until(lambda: len(taken) == 5, lambda: (sender.listen(0), take(receiver, taken, store=False)))
-        with Sender("results", endpoint, 10) as sender:
+            until(lambda: len(taken) == 5, lambda: (sender.poll(0), take(receiver, taken, store=False)))
+        with Sender(RESULTS, endpoint, 10) as sender:
             until(
                 lambda: found and found[-1] is not None,
-                lambda: (found.append(sender.position()), take(receiver, taken, store=False)),
+                lambda: (found.append(sender.ask_position()), take(receiver, taken, store=False)),
             )
             sender.resume(0, found[-1].seq)
             receiver.acknowledge(Position(5))
 
             def on():
-                sender.listen(0)
+                sender.poll(0)
                 if sender.sent < 9:
                     sender.send(track(sender.sent + 1))
                 take(receiver, taken, store=True)
@@ -227,21 +230,29 @@ def test_a_restarted_sender_may_hear_that_more_was_stored_since_it_asked(endpoin
     assert taken == list(range(1, 10))
 
 
-def test_a_receiver_that_is_asked_stores_what_it_has_taken_first(endpoint, until):
+def test_a_receiver_that_is_asked_stores_what_it_has_taken_in_a_step_of_its_own(endpoint, until):
     taken, found = [], []
-    with Receiver("results", endpoint, Position(), 10, lambda: Position(len(taken), version=7)) as receiver:
-        with Sender("results", endpoint, 10) as sender:
+    with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
+
+        def turn():
+            found.append(sender.ask_position())
+            assert receiver.receive(0) is None
+            if receiver.asked:
+                receiver.answer(Position(len(taken), version=7))
+                assert not receiver.asked
+
+        with Sender(RESULTS, endpoint, 10) as sender:
             for seq in range(1, 6):
                 sender.send(track(seq))
-            until(lambda: len(taken) == 5, lambda: (sender.listen(0), take(receiver, taken, store=False)))
-        with Sender("results", endpoint, 10) as sender:
-            until(lambda: found and found[-1], lambda: (found.append(sender.position()), receiver.receive(0)))
+            until(lambda: len(taken) == 5, lambda: (sender.poll(0), take(receiver, taken, store=False)))
+        with Sender(RESULTS, endpoint, 10) as sender:
+            until(lambda: found and found[-1], turn)
     assert found[-1] == Position(5, version=7)
 
 
 def test_a_message_that_comes_again_is_answered_as_it_was_before(endpoint, stranger, until):
     told = []
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver:
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
         sender = stranger(zmq.DEALER, "results")
         for _ in range(2):
             sender.send(encode(track(1)))
@@ -257,12 +268,12 @@ def test_a_message_that_comes_again_is_answered_as_it_was_before(endpoint, stran
 
 
 def test_a_receiver_of_another_stream_is_noticed(endpoint, until):
-    with Receiver("results", endpoint, Position(99), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    with Receiver(RESULTS, endpoint, Position(99), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         sender.send(track(1))
 
         def turn():
             receiver.receive(0.05)
-            sender.listen(0.05)
+            sender.poll(0.05)
 
         with pytest.raises(ProtocolError, match="another stream"):
             until(lambda: False, turn)
@@ -279,16 +290,16 @@ JUNK = [
 
 def test_the_bytes_of_a_stranger_are_counted_and_dropped(endpoint, stranger, until):
     taken = []
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         other = stranger(zmq.DEALER, "results")
         for parts in JUNK:
             other.send_multipart(parts)
 
         def turn():
-            sender.listen(0)
+            sender.poll(0)
             take(receiver, taken, store=True)
 
-        until(lambda: receiver.refused == len(JUNK), turn)
+        until(lambda: receiver.rejected == len(JUNK), turn)
         sender.send(track(1))
         until(lambda: sender.stored == 1, turn)
     assert taken == [1]
@@ -298,9 +309,10 @@ def test_the_bytes_of_a_stranger_are_counted_and_dropped(endpoint, stranger, unt
 BUSY_RECEIVER = """
 import sys, time
 from catstream.messages import Position
+from catstream.wire.acknowledged import Receiver
+from catstream.wire.channels import RESULTS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Receiver
-with Receiver("results", Endpoint.parse(sys.argv[1]), Position(), 1) as receiver:
+with Receiver(RESULTS, Endpoint.parse(sys.argv[1]), Position(), 1) as receiver:
     print("ready", flush=True)
     sys.stdin.readline()
     time.sleep(1.5)
@@ -312,37 +324,37 @@ def test_a_receiver_with_a_full_queue_survives_its_sender(endpoint):
     command = [sys.executable, "-c", BUSY_RECEIVER, str(endpoint)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as busy:
         assert busy.stdout.readline() == "ready\n"
-        with Sender("results", endpoint, 8) as sender:
+        with Sender(RESULTS, endpoint, 8) as sender:
             for seq in range(1, 9):
                 sender.send(track(seq))
             for _ in range(5):
-                sender.listen(0.1)
+                sender.poll(0.1)
         assert busy.communicate("gone\n", timeout=60)[0] == "1\n"
     assert busy.returncode == 0
 
 
 def test_a_message_above_the_limit_is_not_even_read(endpoint, stranger, until):
     taken = []
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         other = stranger(zmq.DEALER, "results")
         other.send(bytes(CHANNELS["results"].limit + 1))
         sender.send(track(1))
 
         def turn():
-            sender.listen(0)
+            sender.poll(0)
             take(receiver, taken, store=True)
 
         until(lambda: sender.stored == 1, turn)
         assert not other.poll(0)
     assert taken == [1]
-    assert not receiver.refused
+    assert not receiver.rejected
 
 
 def test_a_reader_that_never_reads_holds_nobody_up(endpoint, until):
     messages, long = 8000, "x" * 4000  # more than all buffers on the way hold
-    with Publisher("tracks", endpoint) as tracks, Subscriber("tracks", endpoint) as idle:
+    with Publisher(TRACKS, endpoint) as tracks, Subscriber(TRACKS, endpoint) as idle:
         heard = []
-        until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(idle.waiting())))
+        until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(idle.receive_all())))
         for seq in range(2, messages + 2):
             tracks.send(End(seq, long))
         rest = [message.seq for message in iter(lambda: idle.receive(0.2), None)]
@@ -351,22 +363,22 @@ def test_a_reader_that_never_reads_holds_nobody_up(endpoint, until):
 
 
 def test_where_the_newest_counts_a_slow_reader_skips_the_older(endpoint, until):
-    with Publisher("models", endpoint) as models, Subscriber("models", endpoint) as reader:
+    with Publisher(MODELS, endpoint) as models, Subscriber(MODELS, endpoint) as reader:
         until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))
         for version in range(2, 101):
             models.send(model(version))
         seen = []
 
         def turn():
-            models.welcome()
-            seen.extend(message.version for message in reader.waiting())
+            models.serve_late_joiners()
+            seen.extend(message.version for message in reader.receive_all())
 
         until(lambda: seen and seen[-1] == 100, turn)
     assert len(seen) < 100
 
 
 def test_who_comes_late_gets_the_last_model(endpoint, until):
-    with Publisher("models", endpoint) as models:
+    with Publisher(MODELS, endpoint) as models:
         models.send(model(1))
         models.send(model(2))
         assert first(models, endpoint, until).version == 2
@@ -376,9 +388,9 @@ def test_who_comes_late_gets_the_last_model(endpoint, until):
 
 
 def test_who_comes_late_gets_no_old_tracks(endpoint, until):
-    with Publisher("tracks", endpoint) as tracks:
+    with Publisher(TRACKS, endpoint) as tracks:
         tracks.send(track(1))
-        with Subscriber("tracks", endpoint) as late:
+        with Subscriber(TRACKS, endpoint) as late:
             got, seq = [], iter(range(2, 10_000))
 
             def turn():
@@ -394,20 +406,20 @@ def test_who_comes_late_gets_no_old_tracks(endpoint, until):
 def test_all_three_processes_are_heard_on_one_channel(endpoint, until):
     with ExitStack() as stack:
         names = CHANNELS["health"].senders
-        publishers = {name: stack.enter_context(Publisher("health", endpoint, name)) for name in names}
-        reader = stack.enter_context(Subscriber("health", endpoint))
+        publishers = {name: stack.enter_context(Publisher(HEALTH, endpoint, name)) for name in names}
+        reader = stack.enter_context(Subscriber(HEALTH, endpoint))
         heard = set()
 
         def turn():
             for name, publisher in publishers.items():
                 publisher.send(Health(name, 0.0))
-            heard.update(message.process for message in reader.waiting())
+            heard.update(message.process for message in reader.receive_all())
 
         until(lambda: heard == set(names), turn)
 
 
 def test_the_end_comes_through_like_any_other_message(endpoint, until):
-    with Publisher("samples", endpoint) as samples:
+    with Publisher(SAMPLES, endpoint) as samples:
         samples.send(End(1, "the source came to its end"))
         assert first(samples, endpoint, until).reason == "the source came to its end"
 
@@ -418,13 +430,13 @@ def test_what_was_sent_last_arrives_though_its_sender_closes_at_once(endpoint, u
 
     def run():
         heard = []
-        with Subscriber("samples", endpoint) as reader, Publisher("samples", endpoint) as samples:
+        with Subscriber(SAMPLES, endpoint) as reader, Publisher(SAMPLES, endpoint) as samples:
             samples.send(large)
-            until(lambda: reader.receive(0.05), samples.welcome)
+            until(lambda: reader.receive(0.05), samples.serve_late_joiners)
             samples.send(large)
             samples.send(End(1, "it was the last"))
             samples.close()
-            until(lambda: heard and isinstance(heard[-1], End), lambda: heard.extend(reader.waiting()))
+            until(lambda: heard and isinstance(heard[-1], End), lambda: heard.extend(reader.receive_all()))
 
     for _ in range(10):  # a race, as the next
         run()
@@ -432,13 +444,13 @@ def test_what_was_sent_last_arrives_though_its_sender_closes_at_once(endpoint, u
 
 def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_once(endpoint, until):
     def run():
-        with ThreadPoolExecutor(1) as pool, Sender("results", endpoint, WINDOW) as sender:
-            receiver = Receiver("results", endpoint, Position(), WINDOW)
+        with ThreadPoolExecutor(1) as pool, Sender(RESULTS, endpoint, WINDOW) as sender:
+            receiver = Receiver(RESULTS, endpoint, Position(), WINDOW)
             sender.send(End(1, "it was the last"))
-            until(lambda: receiver.receive(0.05), lambda: sender.listen(0))
+            until(lambda: receiver.receive(0.05), lambda: sender.poll(0))
             receiver.acknowledge(Position(1))
             pool.submit(receiver.close)
-            until(lambda: sender.stored == 1, lambda: sender.listen(0.02))
+            until(lambda: sender.stored == 1, lambda: sender.poll(0.02))
 
     for _ in range(10):  # a race, which was lost every other time
         run()
@@ -447,8 +459,8 @@ def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_on
 @pytest.mark.parametrize(
     "bind",
     [
-        lambda endpoint: Receiver("features", endpoint, Position(), WINDOW),
-        lambda endpoint: Publisher("models", endpoint),
+        lambda endpoint: Receiver(FEATURES, endpoint, Position(), WINDOW),
+        lambda endpoint: Publisher(MODELS, endpoint),
     ],
     ids=["receiver", "publisher"],
 )
@@ -469,5 +481,5 @@ def test_ipv6_loopback_is_an_endpoint(until):
     except OSError:
         pytest.skip("this machine has no IPv6")
     endpoint = Endpoint.parse(f"tcp://[::1]:{min(port, 65000)}")
-    with Publisher("models", endpoint) as models, Subscriber("models", endpoint) as reader:
+    with Publisher(MODELS, endpoint) as models, Subscriber(MODELS, endpoint) as reader:
         until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))

@@ -26,10 +26,12 @@ from catstream.messages import (
     TrainingRows,
 )
 from catstream.settings import Settings
-from catstream.wire.channels import CHANNELS
+from catstream.wire.acknowledged import Receiver, Sender
+from catstream.wire.channels import CHANNELS, FEATURES, RESULTS
 from catstream.wire.codec import VERSION, encode
-from catstream.wire.refusals import refusals
-from catstream.wire.sockets import Publisher, Receiver, Responder, Sender, Subscriber
+from catstream.wire.commands import Responder
+from catstream.wire.newest import Publisher, Subscriber
+from catstream.wire.rejects import rejects
 
 WINDOW = 4
 PUBLISHED = [name for name, channel in CHANNELS.items() if not channel.acknowledged]
@@ -73,8 +75,8 @@ WRONG = {
 }
 
 
-def refused(reason):
-    return refusals().get(f"refused_{reason}", 0)
+def rejected(reason):
+    return rejects().get(f"rejected_{reason}", 0)
 
 
 @pytest.fixture
@@ -97,14 +99,14 @@ def stranger(endpoint):
 def test_a_wrong_message_is_counted_by_what_is_wrong_and_costs_the_true_sender_nothing(
     reason, endpoint, stranger, until
 ):
-    compressor, before, taken = Compressor(Settings(coreset={"size": 2})), refused(reason), []
+    compressor, before, taken = Compressor(Settings(coreset={"size": 2})), rejected(reason), []
     with (
-        Receiver("features", endpoint, Position(), WINDOW, check=compressor.check) as receiver,
-        Sender("features", endpoint, WINDOW) as sender,
+        Receiver(FEATURES, endpoint, Position(), WINDOW, check=compressor.check) as receiver,
+        Sender(FEATURES, endpoint, WINDOW) as sender,
     ):
 
         def turn():
-            sender.send(features(sender.sent + 1)) if sender.sent < len(taken) + 1 else sender.listen(0.01)
+            sender.send(features(sender.sent + 1)) if sender.sent < len(taken) + 1 else sender.poll(0.01)
             if (message := receiver.receive(0.01)) is not None:
                 taken.append(message.seq)
                 compressor.take(message)
@@ -112,22 +114,24 @@ def test_a_wrong_message_is_counted_by_what_is_wrong_and_costs_the_true_sender_n
 
         until(lambda: sender.stored >= 1, turn)
         stranger(zmq.DEALER, "features").send_multipart(WRONG[reason])
-        until(lambda: refused(reason) == before + 1, turn)
+        until(lambda: rejected(reason) == before + 1, turn)
         until(lambda: sender.stored > 5, turn)
     assert taken == list(range(1, len(taken) + 1)), "each once, in order"
     assert compressor.seq == taken[-1]
-    assert refusals()["refused"] >= 1
+    assert rejects()["rejected"] >= 1
 
 
 def test_a_stranger_hears_only_what_it_asked_and_the_sender_all_that_is_its_own(endpoint, stranger, until):
     taken = []
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         other = stranger(zmq.DEALER, "results")
 
         def turn():
             if (message := receiver.receive(0.01)) is not None:
                 taken.append(message.seq)
-            sender.listen(0)
+            if receiver.asked:
+                receiver.answer(Position())
+            sender.poll(0)
 
         sender.send(End(1, "the source came to its end"))
         until(lambda: taken == [1], turn)
@@ -138,32 +142,32 @@ def test_a_stranger_hears_only_what_it_asked_and_the_sender_all_that_is_its_own(
         until(lambda: other.poll(0), turn)
         other.recv()
         receiver.acknowledge(Position(1))  # stored only now
-        until(lambda: sender.stored == 1, lambda: sender.listen(0.01))
+        until(lambda: sender.stored == 1, lambda: sender.poll(0.01))
         assert not other.poll(50)
 
 
 def test_parts_without_number_are_one_refused_message(endpoint, stranger, until):
-    before = refused("parts")
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver:
+    before = rejected("parts")
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
         stranger(zmq.DEALER, "results").send_multipart([b"x"] * 20_000)
-        until(lambda: refused("parts") == before + 1, lambda: receiver.receive(0.05))
+        until(lambda: rejected("parts") == before + 1, lambda: receiver.receive(0.05))
 
 
 def test_an_acknowledgement_that_comes_again_takes_nothing_back(endpoint, until):
-    before = refused("acknowledgement")
-    with zmq.Context.instance().socket(zmq.ROUTER) as receiver, Sender("results", endpoint, WINDOW) as sender:
+    before = rejected("acknowledgement")
+    with zmq.Context.instance().socket(zmq.ROUTER) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         receiver.bind(endpoint.address(CHANNELS["results"]))
         for seq in (1, 2):
             sender.send(Track(seq, seq, 0.0, "absent", None, 0.0, 0))
-        until(lambda: receiver.poll(10), lambda: sender.listen(0))
+        until(lambda: receiver.poll(10), lambda: sender.poll(0))
         peer = receiver.recv_multipart()[0]
         for answer in (Stored(1, 1), Stored(2, 2), Stored(1, 1)):
             receiver.send_multipart([peer, encode(answer)])
-        until(lambda: refused("acknowledgement") == before + 1, lambda: sender.listen(0.01))
+        until(lambda: rejected("acknowledgement") == before + 1, lambda: sender.poll(0.01))
         assert (sender.stored, sender.taken) == (2, 2)
         receiver.send_multipart([peer, encode(Position(9))])
         with pytest.raises(ProtocolError, match="another stream"):
-            until(lambda: False, lambda: sender.listen(0.01))
+            until(lambda: False, lambda: sender.poll(0.01))
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -176,36 +180,36 @@ def test_what_is_said_to_a_publisher_is_counted_and_its_readers_go_on(name, endp
         Preview: Preview(1, 64, 48, None, b"\xff\xd8\xff"),
         Run: End(1, "nothing was learned"),
     }[CHANNELS[name].messages[0]]
-    before, heard = refused("subscription"), []
+    before, heard = rejected("subscription"), []
     with (
-        Publisher(name, endpoint, CHANNELS[name].senders[0]) as publisher,
-        Subscriber(name, endpoint) as reader,
+        Publisher(CHANNELS[name], endpoint, CHANNELS[name].senders[0]) as publisher,
+        Subscriber(CHANNELS[name], endpoint) as reader,
     ):
         other = stranger(zmq.XSUB, name)
         for junk in (b"GET / HTTP/1.1", b"\x01topic", encode(End(9, "forged"))):
             other.send(junk)
         other.send(b"\x01" + bytes(10_000))  # above the limit: ZeroMQ ends the connection
         until(
-            lambda: refused("subscription") >= before + 3 and heard,
-            lambda: (publisher.send(said), heard.extend(reader.waiting())),
+            lambda: rejected("subscription") >= before + 3 and heard,
+            lambda: (publisher.send(said), heard.extend(reader.receive_all())),
         )
     assert {type(message) for message in heard} == {type(said)}
 
 
 def test_a_flood_of_commands_is_counted_and_the_next_one_is_heard(endpoint, stranger, until):
-    before, heard = refused("msgpack"), []
-    with Responder("control", endpoint) as responder:
+    before, heard = rejected("msgpack"), []
+    with Responder(endpoint) as responder:
         other = stranger(zmq.DEALER, "control")
         for _ in range(50):
             other.send(b"\xc1")
         stranger(zmq.DEALER, "control").send(encode(Command("1", "stop")))
-        until(lambda: refused("msgpack") == before + 50 and heard, lambda: heard.extend(responder.waiting()))
+        until(lambda: rejected("msgpack") == before + 50 and heard, lambda: heard.extend(responder.receive_all()))
     assert [command.verb for command in heard] == ["stop"]
 
 
 def test_a_message_above_the_limit_ends_its_connection_and_is_counted_so(endpoint, stranger, until):
-    before = refusals().get("disconnected", 0)
-    with Receiver("results", endpoint, Position(), WINDOW) as receiver:
+    before = rejects().get("disconnected", 0)
+    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
         stranger(zmq.DEALER, "results").send(bytes(CHANNELS["results"].limit + 1))
-        until(lambda: refusals().get("disconnected", 0) > before, lambda: receiver.receive(0.05))
+        until(lambda: rejects().get("disconnected", 0) > before, lambda: receiver.receive(0.05))
     assert receiver.taken == 0

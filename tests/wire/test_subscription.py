@@ -14,9 +14,9 @@ from catstream.box import Box
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Run, Track, TrainingRows
 from catstream.wire.announced import Announcement, readers_of
-from catstream.wire.channels import CHANNELS
+from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.sockets import Publisher
+from catstream.wire.newest import Publisher
 
 
 def track(seq):
@@ -35,7 +35,7 @@ def features(seq):
 @pytest.fixture
 def tracks(endpoint):
     """The detector's side: sends tracks."""
-    with Publisher("tracks", endpoint) as publisher:
+    with Publisher(TRACKS, endpoint) as publisher:
         yield publisher
 
 
@@ -97,14 +97,14 @@ def test_a_reader_that_lost_the_end_among_its_tracks_still_ends(endpoint, tracks
 
 
 def test_a_model_comes_to_who_is_late_once_and_the_end_of_the_tracks_is_that_of_all(endpoint, tracks):
-    with Publisher("models", endpoint) as models:
+    with Publisher(MODELS, endpoint) as models:
         models.send(model(1))
         models.send(model(2))
         ended, seen = threading.Event(), []
 
         def publish():
             while not ended.wait(0.01):
-                models.welcome()
+                models.serve_late_joiners()
                 if seen:  # the subscriber is there
                     tracks.send(End(2, "the source came to its end"))
 
@@ -124,14 +124,14 @@ def test_a_model_comes_to_who_is_late_once_and_the_end_of_the_tracks_is_that_of_
 def test_each_process_is_heard_and_nothing_twice(endpoint):
     names = CHANNELS["health"].senders
     with contextlib.ExitStack() as stack:
-        publishers = [stack.enter_context(Publisher("health", endpoint, name)) for name in names]
+        publishers = [stack.enter_context(Publisher(HEALTH, endpoint, name)) for name in names]
         subscription = stack.enter_context(catstream.subscribe(str(endpoint), "health", timeout=0.3))
         heard = []
         for name, publisher in zip(names, publishers, strict=True):
             publisher.send(Health(name, 1.0))
         for _ in range(100):
             for publisher in publishers:
-                publisher.welcome()
+                publisher.serve_late_joiners()
             with contextlib.suppress(SilenceError):
                 heard.append(next(subscription).process)
                 continue
@@ -142,13 +142,13 @@ def test_each_process_is_heard_and_nothing_twice(endpoint):
 
 def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, until):
     with (
-        Publisher("lessons", endpoint, greeting=Run("0", {"coreset.size": "64"})) as lessons,
+        Publisher(TRAINING, endpoint, greeting=Run("0", {"coreset.size": "64"})) as training,
         catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
     ):
-        until(lambda: lessons.heard, lessons.welcome)
+        until(lambda: training.has_subscribers, training.serve_late_joiners)
         for seq in (3, 4, 7):
-            lessons.send(features(seq))
-        lessons.send(End(9, "the source came to its end"))
+            training.send(features(seq))
+        training.send(End(9, "the source came to its end"))
         subscription.timeout = 20
         heard = list(subscription)
     assert [message.seq for message in heard] == [3, 4, 7]
@@ -160,14 +160,14 @@ def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, un
 
 def test_what_nobody_listens_to_is_not_even_made(endpoint, until):
     no_message = object()
-    with Publisher("lessons", endpoint) as lessons:
-        lessons.send(no_message)
+    with Publisher(TRAINING, endpoint) as training:
+        training.send(no_message)
         with catstream.subscribe(str(endpoint), "features"):
-            until(lambda: lessons.heard, lessons.welcome)
+            until(lambda: training.has_subscribers, training.serve_late_joiners)
             with pytest.raises(TypeError):
-                lessons.send(no_message)
-        until(lambda: not lessons.heard, lessons.welcome)
-        lessons.send(no_message)
+                training.send(no_message)
+        until(lambda: not training.has_subscribers, training.serve_late_joiners)
+        training.send(no_message)
 
 
 def test_silence_is_an_error_after_the_time_given_and_one_may_go_on(endpoint, tracks):
@@ -214,7 +214,7 @@ def test_a_waiting_task_can_be_cancelled_and_hears_silence(endpoint, tracks):
         assert asyncio.run(waits()).seq == 2
 
 
-@pytest.mark.parametrize("channel", ["lessons", "results", "frames"])
+@pytest.mark.parametrize("channel", ["training", "results", "frames"])
 def test_a_channel_for_one_receiver_is_refused(endpoint, channel):
     with pytest.raises(ServiceError, match="expected one of the channels samples, models, tracks, health"):
         catstream.subscribe(str(endpoint), channel)
@@ -222,7 +222,7 @@ def test_a_channel_for_one_receiver_is_refused(endpoint, channel):
 
 def test_who_hears_only_the_end_has_missed_all(endpoint, tracks, until):
     with catstream.subscribe(str(endpoint), "tracks", timeout=20) as subscription:
-        until(lambda: tracks.heard, tracks.welcome)
+        until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
         tracks.send(End(61, "the source came to its end"))
         assert list(subscription) == []
         assert (subscription.missed, subscription.missed_before) == (60, 60)
@@ -233,10 +233,10 @@ def test_a_subscriber_that_was_there_first_is_expected_until_it_is_connected(end
     with catstream.subscribe(str(endpoint), channel, timeout=20) as subscription:
         (name, readers), *others = readers_of(endpoint).items()
         assert not others
-        with Publisher(name, endpoint) as publisher:
+        with Publisher(CHANNELS[name], endpoint) as publisher:
             publisher.expect(readers)
-            assert not publisher.complete
-            until(lambda: publisher.complete, publisher.welcome)
+            assert not publisher.all_connected
+            until(lambda: publisher.all_connected, publisher.serve_late_joiners)
             message = track(1) if channel == "tracks" else features(1)
             publisher.send(message)
             assert next(subscription).seq == 1

@@ -1,0 +1,226 @@
+"""Acknowledged channels (`features`, `results`): every message arrives once and in order, whichever side is restarted.
+
+The receiver binds a ROUTER socket, the sender connects a DEALER. The protocol is go-back-N with a window of
+`window` messages; `catstream.wire.go_back_n` describes and implements it. Here its two state machines are connected to
+sockets and to the clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from time import monotonic
+from typing import Protocol, TypeVar
+
+import zmq
+
+from catstream.messages import End, Position, Stored
+from catstream.wire.channels import Channel
+from catstream.wire.codec import encode
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow
+from catstream.wire.socket import LINGER_MILLISECONDS, ChannelSocket
+
+__all__ = ["Receiver", "Sender"]
+
+_REPLIES: tuple[type[Stored | Position], ...] = (Stored, Position)
+
+
+class _Numbered(Protocol):
+    @property
+    def seq(self) -> int: ...
+
+
+Message = TypeVar("Message", bound=_Numbered)
+
+
+class Sender(ChannelSocket[Message]):
+    """The sending side of an acknowledged channel.
+
+    Parameters
+    ----------
+    window : messages that may be sent and not acknowledged
+    """
+
+    def __init__(self, channel: Channel[Message], endpoint: Endpoint, window: int) -> None:
+        super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=window + 1)
+        self._window = SendWindow(channel.name, window, monotonic())
+        self._socket.set(zmq.IMMEDIATE, 1)  # nothing is queued before the receiver is connected
+        self._connect()
+
+    @property
+    def sent(self) -> int:
+        """Newest seq that was given to `send`."""
+        return self._window.sent
+
+    @property
+    def taken(self) -> int:
+        """Newest seq that the receiver has received."""
+        return self._window.taken
+
+    @property
+    def acknowledged(self) -> int:
+        """Newest seq that the receiver will not ask for again while it lives."""
+        return self._window.acknowledged
+
+    @property
+    def stored(self) -> int:
+        """Newest seq that survives the receiver's death; less than `acknowledged` while its disk takes nothing."""
+        return self._window.stored
+
+    @property
+    def version(self) -> int:
+        """Newest sample that the receiver has made."""
+        return self._window.version
+
+    def sample_of(self, seq: int) -> int:
+        """Newest sample that the messages up to `seq` led to: see `SendWindow.sample_of`."""
+        return self._window.sample_of(seq)
+
+    def ask_position(self) -> Position | None:
+        """Ask once for the receiver's position; None if it does not answer in time."""
+        self._say_hello()
+        if self._wait(PATIENCE):
+            answer = self._decode(self._socket.recv(), *_REPLIES)
+            return answer if isinstance(answer, Position) else None
+        return None
+
+    def resume(self, seq: int, known: int) -> None:
+        """Continue after message `seq` of an earlier sender, of which the receiver has stored `known`."""
+        self._window.resume(seq, known)
+
+    def send(self, message: Message) -> bool:
+        """Send the message with the next seq, without waiting; False if the window is full."""
+        self.poll(0)
+        if self._window.full:
+            return False
+        self._window.push(message.seq, encode(message))
+        self._transmit()
+        return True
+
+    def poll(self, seconds: float) -> None:
+        """Process acknowledgements, waiting at most this long for the first; retransmit what is missing.
+
+        Raises
+        ------
+        ProtocolError
+            If the receiver holds another stream.
+        SetBackError
+            If the receiver has lost messages that it had acknowledged.
+        """
+        if self._wait(seconds):
+            with contextlib.suppress(zmq.Again):
+                while True:
+                    self._process(self._socket.recv(zmq.NOBLOCK))
+        if self._window.must_ask(monotonic()):
+            self._say_hello()
+        self._transmit()
+
+    def _process(self, data: bytes) -> None:
+        answer = self._decode(data, *_REPLIES)
+        if answer is not None and (rejected := self._window.receive(answer, monotonic())) is not None:
+            self._reject(rejected.reason, rejected.text)
+
+    def _transmit(self) -> None:
+        with contextlib.suppress(zmq.Again):  # tried again at the next poll
+            while (frame := self._window.next_frame()) is not None:
+                self._socket.send(frame, zmq.NOBLOCK, copy=False)
+                self._window.transmitted()
+
+    def _say_hello(self) -> None:
+        self._window.asked(monotonic())
+        with contextlib.suppress(zmq.Again):  # no receiver is connected yet: it is asked again
+            self._socket.send(HELLO, zmq.NOBLOCK)
+
+
+class Receiver(ChannelSocket[Message]):
+    """The receiving side of an acknowledged channel; it binds.
+
+    Receiving stores nothing. If a sender asks for the position while more was taken than is stored, `asked` becomes
+    true; the owner then stores what it has, and calls `answer`. In a loop:
+
+        message = receiver.receive(0.1)
+        ...                                     # process the message
+        if receiver.asked:
+            receiver.answer(store())
+        elif message is not None:
+            receiver.acknowledge(position)
+
+    Parameters
+    ----------
+    position : where the stream continues; the next message taken is the one after `position.seq`
+    window : as the sender's
+    check : raises ProtocolError if a message does not belong to this stream; it then does not count as taken
+    """
+
+    def __init__(
+        self,
+        channel: Channel[Message],
+        endpoint: Endpoint,
+        position: Position,
+        window: int,
+        check: Callable[[Message], None] | None = None,
+    ) -> None:
+        super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=window + 1)
+        self._window, self._check = ReceiveWindow(position, window), check
+        self._bind()
+
+    @property
+    def taken(self) -> int:
+        """Newest seq that was received."""
+        return self._window.taken
+
+    @property
+    def asked(self) -> bool:
+        """Whether a sender waits for `answer`."""
+        return self._window.asked
+
+    @property
+    def has_sender(self) -> bool:
+        """Whether the sender of the last message is still connected and has not sent its end."""
+        self._read_events()
+        return self._window.connected and not self._window.ended
+
+    def receive(self, seconds: float) -> Message | None:
+        """The next message in order, None if none arrived in time."""
+        if not self._wait(seconds):
+            return None
+        peer, data = self._receive_from_peer()
+        if data is None:
+            return None
+        if not data:
+            self._reply(self._window.hello(peer))
+            return None
+        message = self._decode(data, *self.channel.messages, check=self._check)
+        if message is None:
+            return None
+        actions = self._window.receive(peer, message.seq, monotonic(), last=isinstance(message, End))
+        self._reply(actions)
+        return message if Deliver() in actions else None
+
+    def acknowledge(self, position: Position) -> None:
+        """Acknowledge all that was received; it is stored up to `position.seq`, except the last `position.unsaved`."""
+        self._reply(self._window.acknowledge(position))
+
+    def answer(self, position: Position) -> None:
+        """Tell the senders that asked where to go on: after `position.seq`, up to which all is stored."""
+        self._reply(self._window.answer(position))
+
+    def close(self) -> None:
+        """Close, after the sender if it has sent its end: a connection that breaks may cost it the last reply."""
+        if self._window.ended and self._window.connected:
+            self._read_events(LINGER_MILLISECONDS, until=lambda event: event.disconnected)
+        super().close()
+
+    def _disconnected(self) -> None:
+        super()._disconnected()
+        self._window.disconnected()
+
+    def _reply(self, actions: Sequence[Deliver | Reply | Reject]) -> None:
+        for action in actions:
+            match action:
+                case Reply(peer, answer):
+                    with contextlib.suppress(zmq.Again):  # a sender that does not read asks again
+                        self._socket.send_multipart([peer, encode(answer)], zmq.NOBLOCK)
+                case Reject(reason, text):
+                    self._reject(reason, text)

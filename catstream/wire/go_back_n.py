@@ -1,0 +1,250 @@
+"""The acknowledged window: go-back-N retransmission as two state machines, without sockets and without a clock.
+
+Events and the time in seconds go in; frames to transmit and replies come out. `catstream.wire.acknowledged`
+connects the machines to sockets.
+
+The sender numbers its messages 1, 2, 3 ... (`seq`). It keeps a copy of each until the receiver acknowledges
+it, and keeps at most `size` copies. The receiver takes each message once and in order, and replies:
+
+    Stored      acknowledges a message: `taken` is the newest received, `seq` the newest that may be forgotten
+    Position    says where the sender has to go on: retransmit everything after `seq`
+
+The receiver replies with a Position if a message is missing, and if the sender asks (with an empty frame, the
+hello). The sender asks if it was started anew, and after `PATIENCE` seconds without a reply while messages wait.
+So either side may be restarted, and any frame may be lost or arrive twice: each message is still taken once, in order.
+
+`Stored.seq` may include messages that the receiver has only in memory, because its disk takes nothing; `unsaved`
+says how many. If such a receiver is restarted, the sender cannot retransmit them and raises `SetBackError`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from catstream.errors import ProtocolError, SetBackError
+from catstream.messages import Position, Stored
+
+__all__ = ["HELLO", "PATIENCE", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
+
+#: The frame by which a sender asks for the receiver's position.
+HELLO = b""
+
+#: Seconds without a reply after which a sender asks for the position, and between two reports of a missing message.
+PATIENCE = 0.2
+
+_MAX_SAMPLES = 65536  # samples that a sender remembers, at most one a message: as many as `run.lag_frames` may be
+_MAX_ASKING = 64  # peers that may wait for a position at a time; any other asks again
+
+
+@dataclass(frozen=True, slots=True)
+class Deliver:
+    """The message that was just received is the next one in order: give it to the application."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """Send a message to a peer."""
+
+    peer: bytes
+    message: Stored | Position
+
+
+@dataclass(frozen=True, slots=True)
+class Reject:
+    """A frame broke the protocol: count it under `reason`, log `text`."""
+
+    reason: str
+    text: str
+
+
+class SendWindow:
+    """The sender's side.
+
+    Parameters
+    ----------
+    channel : name of the channel, for errors
+    size : unacknowledged messages that are kept at most
+    now : the time
+
+    Attributes
+    ----------
+    sent : newest seq that was pushed
+    acknowledged : newest seq that the receiver will not ask for again while it lives
+    stored : newest seq that survives the receiver's death; less than `acknowledged` while its disk takes nothing
+    taken : newest seq that the receiver has received
+    version : newest sample that the receiver has made
+    """
+
+    def __init__(self, channel: str, size: int, now: float) -> None:
+        self.sent = self.acknowledged = self.stored = self.taken = self.version = 0
+        self._channel, self._size = channel, size
+        self._unacknowledged: deque[tuple[int, bytes]] = deque()  # oldest first
+        self._in_flight = 0  # how many of them were transmitted since the last Position
+        self._sent_before = 0  # newest seq that a sender before this one may have sent
+        self._last_reply = now
+        self._samples: deque[tuple[int, int]] = deque(maxlen=_MAX_SAMPLES)  # seq that led to a sample, its version
+        self._sample = 0  # version that `sample_of` returned last
+
+    def resume(self, seq: int, known: int) -> None:
+        """Continue after message `seq` of an earlier sender, of which the receiver has stored `known`."""
+        self.sent = self.acknowledged = self.stored = self.taken = seq
+        self._sent_before = known + self._size  # a whole window of the earlier sender may still be on its way
+
+    @property
+    def full(self) -> bool:
+        """Whether no message can be pushed now."""
+        return len(self._unacknowledged) >= self._size
+
+    def push(self, seq: int, frame: bytes) -> None:
+        """Accept the next message for transmission; only if the window is not full."""
+        self._unacknowledged.append((seq, frame))
+        self.sent = seq
+
+    def next_frame(self) -> bytes | None:
+        """The frame to transmit next, None if all were transmitted; call `transmitted` once the socket took it."""
+        if self._in_flight < len(self._unacknowledged):
+            return self._unacknowledged[self._in_flight][1]
+        return None
+
+    def transmitted(self) -> None:
+        """Note that the socket took the frame of `next_frame`."""
+        self._in_flight += 1
+
+    def must_ask(self, now: float) -> bool:
+        """Whether to send a hello now: messages wait, and the last reply or hello is PATIENCE seconds ago."""
+        if not self._unacknowledged or now - self._last_reply <= PATIENCE:
+            return False
+        self.asked(now)
+        return True
+
+    def asked(self, now: float) -> None:
+        """Note that a hello was sent."""
+        self._last_reply = now
+
+    def receive(self, reply: Stored | Position, now: float) -> Reject | None:
+        """Process a reply.
+
+        Raises
+        ------
+        ProtocolError
+            If the receiver has stored messages that were never sent: it holds another stream.
+        SetBackError
+            If the receiver needs messages that it had acknowledged before, and that were forgotten here.
+        """
+        if reply.seq > max(self.sent, self._sent_before):
+            raise ProtocolError(
+                f"the receiver of {self._channel} has stored message {reply.seq}, only {self.sent} were sent: "
+                "it holds another stream, start it anew or this process with --resume"
+            )
+        if isinstance(reply, Position):
+            self._go_back(reply)
+        elif reply.seq < self.acknowledged or reply.taken < self.taken:
+            before = f"{self.taken} were taken and {self.acknowledged} acknowledged before"
+            return Reject("acknowledgement", f"expected no step back ({before}), got {reply.taken} and {reply.seq}")
+        self._last_reply = now
+        if reply.version > self.version:
+            self.version = reply.version
+            self._samples.append((self.taken + 1, reply.version))
+        self._forget(reply)
+        self.taken = self.acknowledged if isinstance(reply, Position) else min(reply.taken, self.sent)
+        return None
+
+    def sample_of(self, seq: int) -> int:
+        """Version of the newest sample that the messages up to `seq` led to; ask with a `seq` that never falls.
+
+        If the receiver did not reply to each message, a sample counts from the first message that it may be of.
+        """
+        while self._samples and self._samples[0][0] <= seq:
+            self._sample = self._samples.popleft()[1]
+        return self._sample
+
+    def _go_back(self, position: Position) -> None:
+        """Transmit everything again that the receiver has not."""
+        if position.seq < self.acknowledged:
+            raise SetBackError(
+                f"the receiver of {self._channel} had {self.acknowledged} messages and now has {position.seq}: "
+                "what came between is made again from the source"
+            )
+        self._in_flight = 0
+
+    def _forget(self, reply: Stored | Position) -> None:
+        while self._unacknowledged and self._unacknowledged[0][0] <= reply.seq:
+            self._unacknowledged.popleft()
+            self._in_flight = max(self._in_flight - 1, 0)
+        self.acknowledged = max(self.acknowledged, min(reply.seq, self.sent))
+        self.stored = max(self.stored, min(reply.seq - reply.unsaved, self.sent))
+
+
+class ReceiveWindow:
+    """The receiver's side.
+
+    Parameters
+    ----------
+    position : where the stream continues; the next message taken is the one after `position.seq`
+    size : unacknowledged messages that the sender keeps at most
+
+    Attributes
+    ----------
+    taken : newest seq that was delivered
+    ended : whether the sender has sent the end of the stream
+    connected : whether the sender of the newest message is still connected
+    """
+
+    def __init__(self, position: Position, size: int) -> None:
+        self.taken = position.seq
+        self.ended = self.connected = False
+        self._position, self._size = position, size
+        self._peer: bytes | None = None  # the sender of the last message: acknowledgements go to it only
+        self._asking: dict[bytes, None] = {}  # peers that wait for `answer`, in order
+        self._gap_reported = -math.inf  # when a missing message was last reported
+
+    @property
+    def asked(self) -> bool:
+        """Whether a sender waits for `answer`: it asked for the position, and more was taken than is stored."""
+        return bool(self._asking)
+
+    def hello(self, peer: bytes) -> list[Reply]:
+        """A sender asks for the position; it is answered at once if all that was taken is stored."""
+        if self._position.seq >= self.taken:
+            return [Reply(peer, self._position)]
+        if len(self._asking) < _MAX_ASKING:
+            self._asking[peer] = None
+        return []
+
+    def receive(self, peer: bytes, seq: int, now: float, last: bool = False) -> list[Deliver | Reply | Reject]:
+        """A message arrived; `last` says whether it is the end of the stream."""
+        if seq <= self.taken:  # retransmitted: the sender does not know that it was taken
+            return [Reply(peer, self._stored())]
+        if seq == self.taken + 1:
+            self.taken, self.ended = seq, last
+            self._peer, self.connected, self._gap_reported = peer, True, -math.inf
+            return [Deliver()]
+        actions: list[Deliver | Reply | Reject] = []
+        if seq > self.taken + self._size + 1:  # more than a sender may have in flight
+            actions.append(Reject("sequence", f"message {seq} came after {self.taken}"))
+        if now - self._gap_reported > PATIENCE:
+            self._gap_reported = now
+            actions.append(Reply(peer, self._position))
+        return actions
+
+    def acknowledge(self, position: Position) -> list[Reply]:
+        """All that was taken is processed, and stored up to `position.seq`, except the last `position.unsaved`."""
+        self._position = position
+        return [] if self._peer is None else [Reply(self._peer, self._stored())]
+
+    def answer(self, position: Position) -> list[Reply]:
+        """Answer all that asked for the position."""
+        self._position = position
+        replies = [Reply(peer, position) for peer in self._asking]
+        self._asking.clear()
+        return replies
+
+    def disconnected(self) -> None:
+        """A connection ended: it may be the sender's."""
+        self.connected = False
+
+    def _stored(self) -> Stored:
+        at = self._position
+        return Stored(at.seq, self.taken, at.version, at.unsaved)

@@ -1,0 +1,212 @@
+"""What all sockets of a channel have in common: limits, keys, connection events, and the check of what arrives.
+
+Every queue, message and handshake has a limit. A frame that is not a message of the channel is counted, logged
+once and dropped (`catstream.wire.rejects`). If the endpoint has keys, everything is encrypted (CURVE), and a peer that
+connects needs a key with the role of the channel (`catstream.wire.zap`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, Self, TypeVar
+
+import zmq
+
+from catstream.errors import ProtocolError, ServiceError
+from catstream.wire.channels import Channel
+from catstream.wire.codec import decode
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.monitor import Event, Monitor
+from catstream.wire.rejects import count, reject
+from catstream.wire.zap import ZAP
+
+__all__ = ["LINGER_MILLISECONDS", "ChannelSocket"]
+
+LINGER_MILLISECONDS = 2000  #: that a closed socket still has to transmit its last messages
+
+#: No ZeroMQ heartbeats: libzmq aborts the process if one is due to a peer that disconnected while its queue was full
+#: (libzmq issue 4767). On one machine the kernel reports that a peer is gone. If a host loses its power, TCP keepalive
+#: reports it after 11 s, or once the host is up again.
+_OPTIONS = {
+    zmq.LINGER: LINGER_MILLISECONDS,
+    zmq.HANDSHAKE_IVL: 5000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 5,
+    zmq.TCP_KEEPALIVE_INTVL: 2,
+    zmq.TCP_KEEPALIVE_CNT: 3,
+    zmq.RECONNECT_IVL: 20,
+    zmq.RECONNECT_IVL_MAX: 500,
+}
+
+Message = TypeVar("Message")
+Kind = TypeVar("Kind")
+
+
+class ChannelSocket(Generic[Message]):
+    """One ZeroMQ socket of a channel.
+
+    Parameters
+    ----------
+    kind : of ZeroMQ's socket types
+    high_water_mark : messages that are queued for each peer at most
+
+    Attributes
+    ----------
+    channel : row of the table
+    rejected : messages that were dropped because they were not what the channel carries
+    """
+
+    def __init__(self, kind: int, channel: Channel[Message], endpoint: Endpoint, high_water_mark: int) -> None:
+        self.channel = channel
+        self.rejected = 0
+        self._endpoint = endpoint
+        self._listens = False
+        self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
+        self._monitor: Monitor | None = None
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+        for option, value in _OPTIONS.items():
+            self._socket.set(option, value)
+        self._socket.set(zmq.IPV6, int("[" in str(endpoint)))
+        self._socket.set(zmq.SNDHWM, high_water_mark)
+        self._socket.set(zmq.RCVHWM, high_water_mark)
+        self._socket.set(zmq.MAXMSGSIZE, channel.limit)
+
+    def fileno(self) -> int:
+        """Readable if something may have arrived since this socket was last asked for a message."""
+        return int(self._socket.get(zmq.FD))
+
+    def close(self) -> None:
+        """Transmit what is queued, then close; the address is free for the next socket."""
+        if self._listens:
+            self._socket.close()
+            # libzmq stops listening some time later, and would remove the socket file of the next one with its own.
+            # Unbinding first would be faster, but drops queued messages.
+            self._read_events(2 * LINGER_MILLISECONDS, until=lambda event: event.stopped)
+            self._listens = False
+        elif not self._socket.closed:
+            self._socket.disable_monitor()
+            self._socket.close()
+        if self._monitor is not None:
+            self._monitor.close()
+        if self._domain:
+            ZAP.unregister(self._domain)
+            self._domain = b""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _bind(self, sender: str | None = None) -> None:
+        address = self._endpoint.listening(self.channel, sender)
+        keys = self._endpoint.keys
+        try:
+            if keys is not None:
+                self._socket.set(zmq.CURVE_SECRETKEY, keys.listening())
+                self._socket.set(zmq.CURVE_SERVER, 1)
+                self._domain = ZAP.register(self.channel, keys)
+                self._socket.set(zmq.ZAP_DOMAIN, self._domain)
+                self._socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without a ZAP handler nobody may connect
+            if self._endpoint.taken(self.channel, sender):
+                raise zmq.ZMQError(zmq.EADDRINUSE)
+            self._monitor = Monitor(self._socket)
+            self._socket.bind(address)
+            self._listens = True
+        except zmq.ZMQError as error:
+            self.close()
+            raise ServiceError(
+                f"cannot listen on {address} ({error.strerror}): another pipeline may be running there, "
+                "wait for it or give another endpoint (--set run.endpoint=...)"
+            ) from None
+        except ServiceError:
+            self.close()
+            raise
+
+    def _connect(self) -> None:
+        if (keys := self._endpoint.keys) is not None:
+            self._socket.set(zmq.CURVE_SERVERKEY, keys.server)
+            self._socket.set(zmq.CURVE_PUBLICKEY, keys.public)
+            self._socket.set(zmq.CURVE_SECRETKEY, keys.secret)
+        self._monitor = Monitor(self._socket)
+        for sender in self.channel.senders:
+            self._socket.connect(self._endpoint.address(self.channel, sender))
+
+    def _wait(self, seconds: float) -> bool:
+        """Whether something arrives within so many seconds; handles the events of connections first."""
+        self._read_events()
+        return bool(self._socket.poll(max(0, round(seconds * 1000))))
+
+    def _decode(
+        self, data: bytes | memoryview, *kinds: type[Kind], check: Callable[[Kind], None] | None = None
+    ) -> Kind | None:
+        """The message in `data`, None if it is rejected."""
+        try:
+            message: Kind = decode(data, *kinds)
+            if check is not None:
+                check(message)
+        except ProtocolError as error:
+            self._reject(error.reason, f"a message was dropped: {error}")
+            return None
+        return message
+
+    def _receive_from_peer(self) -> tuple[bytes, memoryview | None]:
+        """Peer and data of a ROUTER's next message; the data is None if the message has not exactly one part."""
+        peer = self._socket.recv()
+        data = self._socket.recv(copy=False).buffer
+        parts = 1
+        while self._socket.get(zmq.RCVMORE):  # one by one: a peer may send any number
+            self._socket.recv(copy=False)
+            parts += 1
+        if parts > 1:
+            self._reject("parts", f"a message was dropped: it has {parts} parts")
+            return peer, None
+        return peer, data
+
+    def _reject(self, reason: str, text: str) -> None:
+        """Count a message that is not what the channel carries, and log it once."""
+        self.rejected += 1
+        reject(self.channel.name, reason, text)
+
+    def _read_events(self, milliseconds: int = 0, until: Callable[[Event], bool] = lambda _: False) -> None:
+        """Handle what was reported about connections; wait so long for each event, until a certain one.
+
+        Raises
+        ------
+        ServiceError
+            If this side connects and is denied: its key lacks the role, or it has none and the pipeline asks for some.
+        """
+        if self._monitor is None:
+            return
+        for event in self._monitor.events(milliseconds):
+            if event.disconnected:
+                self._disconnected()
+            elif self._listens:
+                self._failed_to_connect(event)
+            else:
+                self._raise_if_denied(event)
+            if until(event):
+                break
+
+    def _disconnected(self) -> None:
+        """A connection ended."""
+        if self._listens:
+            count("disconnected")
+
+    def _failed_to_connect(self, event: Event) -> None:
+        """A peer failed the handshake; a key that was denied is counted by the ZAP handler already."""
+        if not event.stopped and not event.denied:
+            missing = "does not speak ZeroMQ" if self._endpoint.keys is None else "has not the pipeline's keys"
+            reject(self.channel.name, "handshake", f"a peer was rejected: it {missing}")
+
+    def _raise_if_denied(self, event: Event) -> None:
+        if event.denied:
+            raise ServiceError(
+                f"{self._endpoint} does not let this key take part in {self.channel.name}: "
+                "ask who runs it for one that may (catstream keys allow)"
+            )
+        if event.other_mechanism and self._endpoint.keys is None:
+            raise ServiceError(
+                f"the pipeline at {self._endpoint} asks for keys, and none were given: give a folder of keys "
+                "that it lets in (--keys DIR, see catstream keys)"
+            )

@@ -1,0 +1,363 @@
+"""The acknowledged window, in random histories: each message is taken once and in order, whatever is lost or restarted.
+
+No process, no socket, no clock: the two state machines, a network that loses and repeats frames, and a disk.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from catstream.errors import ProtocolError, SetBackError
+from catstream.messages import Position, Stored
+from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow
+
+STRANGER = b"stranger"
+
+
+def payload(seq):
+    """What message `seq` holds."""
+    return b"message %d" % seq
+
+
+class Histories(RuleBasedStateMachine):
+    """A sender, a receiver with a disk, and the connection between them, which keeps order while it lasts."""
+
+    @initialize(size=st.integers(1, 6))
+    def begin(self, size):
+        self.size, self.now, self.senders = size, 0.0, 0
+        self.to_receiver, self.to_sender = deque(), deque()
+        self.disk = self.promised = 0  # newest seq on disk; newest seq that was ever reported as stored
+        self.full, self.in_memory = False, False  # the disk takes nothing; messages were acknowledged nevertheless
+        self.position = Position()
+        self.receiver = ReceiveWindow(self.position, size)
+        self.start_sender()
+
+    def start_sender(self):
+        self.senders += 1
+        self.peer = b"sender %d" % self.senders
+        self.sender, self.resumed = SendWindow("features", self.size, self.now), self.senders == 1
+
+    # What the shells do.
+
+    def transmit(self):
+        while (frame := self.sender.next_frame()) is not None:
+            self.to_receiver.append((self.peer, frame))
+            self.sender.transmitted()
+
+    def reply(self, actions):
+        for action in actions:
+            assert isinstance(action, Reply | Deliver | Reject)
+            if isinstance(action, Reply) and action.peer == self.peer:
+                self.to_sender.append(action.message)
+
+    def store(self):
+        """Write a checkpoint, if the disk takes it."""
+        if not self.full:
+            self.disk = self.receiver.taken
+        self.in_memory |= self.receiver.taken > self.disk
+        self.position = Position(self.receiver.taken, unsaved=self.receiver.taken - self.disk)
+        return self.position
+
+    def arrives(self, peer, frame):
+        """A frame arrives at the receiver, which takes a message only if it is the next one."""
+        if frame == HELLO:
+            return self.reply(self.receiver.hello(peer))
+        seq, before = int(frame.split()[1]), self.receiver.taken
+        actions = self.receiver.receive(peer, seq, self.now)
+        if Deliver() in actions:
+            assert (seq, self.receiver.taken) == (before + 1, before + 1)
+            self.reply(self.receiver.acknowledge(self.position))
+        else:
+            assert self.receiver.taken == before
+        return self.reply(actions)
+
+    def replied(self, message):
+        """A reply arrives at the sender."""
+        if not self.resumed:
+            if isinstance(message, Position):
+                self.sender.resume(message.seq, message.seq)
+                self.resumed = True
+            return
+        try:
+            assert self.sender.receive(message, self.now) is None or isinstance(message, Stored)
+        except SetBackError:
+            assert self.in_memory, "only what was never stored may be asked for again after it was acknowledged"
+            self.sender_dies()
+
+    # What happens.
+
+    @rule()
+    def send(self):
+        if self.resumed and not self.sender.full:
+            self.sender.push(self.sender.sent + 1, payload(self.sender.sent + 1))
+            self.transmit()
+
+    @rule()
+    def send_while_nobody_is_connected(self):
+        if self.resumed and not self.sender.full:
+            self.sender.push(self.sender.sent + 1, payload(self.sender.sent + 1))
+
+    @rule(seconds=st.sampled_from([0.01, PATIENCE / 2, 2 * PATIENCE]))
+    def time_passes(self, seconds):
+        self.now += seconds
+        if not self.resumed or self.sender.must_ask(self.now):
+            self.to_receiver.append((self.peer, HELLO))
+        self.transmit()
+
+    @precondition(lambda self: self.to_receiver)
+    @rule(twice=st.booleans())
+    def frame_arrives(self, twice):
+        peer, frame = self.to_receiver.popleft()
+        for _ in range(1 + twice):
+            self.arrives(peer, frame)
+
+    @precondition(lambda self: self.to_sender)
+    @rule(twice=st.booleans())
+    def reply_arrives(self, twice):
+        message = self.to_sender.popleft()
+        for _ in range(1 + twice):
+            self.replied(message)
+        self.transmit()
+
+    @precondition(lambda self: self.to_receiver)
+    @rule()
+    def frame_is_lost(self):
+        self.to_receiver.popleft()
+
+    @precondition(lambda self: self.to_sender)
+    @rule()
+    def reply_is_lost(self):
+        self.to_sender.popleft()
+
+    @rule(full=st.booleans())
+    def receiver_stores(self, full):
+        """Or tries to: the disk may be full."""
+        self.full = full
+        self.store()
+        self.reply(self.receiver.acknowledge(self.position))
+
+    @precondition(lambda self: self.receiver.asked)
+    @rule()
+    def receiver_answers(self):
+        self.reply(self.receiver.answer(self.store()))
+        assert not self.receiver.asked
+
+    @rule()
+    def receiver_dies(self):
+        self.to_receiver.clear()
+        self.to_sender.clear()
+        self.position = Position(self.disk)
+        self.receiver = ReceiveWindow(self.position, self.size)
+
+    @rule()
+    def sender_dies(self):
+        """What it has transmitted may still arrive."""
+        self.to_sender.clear()
+        self.start_sender()
+
+    @rule(seq=st.integers(0, 50))
+    def stranger_repeats_a_frame(self, seq):
+        if seq <= self.receiver.taken:  # one that is not of the stream is rejected before it is counted
+            self.arrives(STRANGER, payload(seq) if seq else HELLO)
+
+    # What holds at any moment.
+
+    @invariant()
+    def the_window_is_never_exceeded(self):
+        if self.senders:
+            kept = [frame for _, frame in self.sender._unacknowledged]
+            assert len(kept) <= self.size
+            assert kept == [payload(seq) for seq in range(self.sender.sent - len(kept) + 1, self.sender.sent + 1)]
+            assert self.sender._in_flight <= len(kept)
+
+    @invariant()
+    def what_is_reported_as_stored_is_on_disk(self):
+        if self.senders and self.resumed:
+            self.promised = max(self.promised, self.sender.stored)
+            assert self.promised <= self.disk
+
+    @invariant()
+    def what_is_forgotten_is_with_the_receiver(self):
+        if self.senders and self.resumed and not self.in_memory:
+            assert self.sender.sent - len(self.sender._unacknowledged) <= self.disk
+
+    @invariant()
+    def counts_are_in_order(self):
+        if self.senders and self.resumed:
+            assert self.sender.stored <= self.sender.acknowledged <= self.sender.taken <= self.sender.sent
+
+    @invariant()
+    def memory_is_bounded(self):
+        if self.senders:
+            assert len(self.receiver._asking) <= 64
+            assert len(self.sender._samples) <= 65536
+
+    def teardown(self):
+        """Once nothing is lost any more, everything that was sent is taken and stored."""
+        if not self.senders:
+            return
+        for _ in range(20):
+            self.time_passes(2 * PATIENCE)
+            while self.to_receiver or self.to_sender:
+                if self.to_receiver:
+                    self.frame_arrives(twice=False)
+                if self.receiver.asked:
+                    self.receiver_answers()
+                if self.to_sender:
+                    self.reply_arrives(twice=False)
+            self.receiver_stores(full=False)
+        assert self.resumed
+        assert self.receiver.taken >= self.sender.sent
+        assert self.sender.acknowledged == self.sender.taken == self.sender.sent
+        assert not self.sender._unacknowledged
+
+
+TestHistories = Histories.TestCase
+TestHistories.settings = settings(max_examples=150, stateful_step_count=60, deadline=None)
+
+
+def filled(size, count):
+    """A sender that has transmitted so many messages."""
+    window = SendWindow("features", size, 0.0)
+    for seq in range(1, count + 1):
+        window.push(seq, payload(seq))
+    frames(window)
+    return window
+
+
+def frames(window):
+    """What a sender transmits now."""
+    sent = []
+    while (frame := window.next_frame()) is not None:
+        sent.append(frame)
+        window.transmitted()
+    return sent
+
+
+def test_a_message_that_is_missing_is_reported_at_once_and_then_only_now_and_then():
+    window = ReceiveWindow(Position(), size=8)
+    window.receive(b"peer", 1, now=0.0)
+    report = [Reply(b"peer", Position())]
+    assert window.receive(b"peer", 3, now=0.0) == report
+    assert window.receive(b"peer", 4, now=PATIENCE) == []
+    assert window.receive(b"peer", 5, now=PATIENCE + 0.01) == report
+
+
+def test_a_message_that_was_taken_before_is_acknowledged_again_each_time():
+    window = ReceiveWindow(Position(), size=8)
+    window.receive(b"peer", 1, now=0.0)
+    window.acknowledge(Position(1, version=4))
+    for peer in (b"peer", b"restarted", b"restarted"):
+        assert window.receive(peer, 1, now=0.0) == [Reply(peer, Stored(1, 1, version=4))]
+
+
+def test_a_gap_after_a_gap_is_reported_at_once():
+    window = ReceiveWindow(Position(), size=8)
+    window.receive(b"peer", 2, now=0.0)
+    window.receive(b"peer", 1, now=0.0)
+    assert window.receive(b"peer", 3, now=0.0) == [Reply(b"peer", Position())]
+
+
+def test_a_position_makes_the_sender_go_back_to_it_whatever_is_in_flight():
+    window = filled(size=4, count=4)
+    window.receive(Position(2), now=0.0)
+    assert frames(window) == [payload(3), payload(4)]
+
+
+def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_patience():
+    window = SendWindow("features", 4, now=0.0)
+    assert not window.must_ask(99.0)
+    window.push(1, payload(1))
+    assert [window.must_ask(now) for now in (99.0, 99.1, 99.15, 99.3)] == [True, False, False, True]
+    window.push(2, payload(2))
+    window.receive(Stored(1, 1), now=99.4)
+    assert [window.must_ask(now) for now in (99.55, 99.65)] == [False, True]
+    window.receive(Stored(2, 2), now=99.7)
+    assert not window.must_ask(200.0)
+
+
+def test_who_asks_while_all_is_stored_is_answered_at_once_and_otherwise_waits_for_the_owner():
+    window = ReceiveWindow(Position(), size=4)
+    assert window.hello(b"one") == [Reply(b"one", Position())]
+    window.receive(b"one", 1, now=0.0)
+    assert window.hello(b"one") == window.hello(b"two") == window.hello(b"one") == []
+    assert window.asked
+    assert window.answer(Position(1)) == [Reply(b"one", Position(1)), Reply(b"two", Position(1))]
+    assert not window.asked
+
+
+def test_of_a_flood_of_peers_that_ask_only_some_are_remembered():
+    window = ReceiveWindow(Position(), size=4)
+    window.receive(b"peer", 1, now=0.0)
+    for number in range(1000):
+        window.hello(b"peer %d" % number)
+    assert len(window.answer(Position(1))) == 64
+
+
+def test_acknowledgements_go_to_the_peer_whose_message_was_taken_last():
+    window = ReceiveWindow(Position(), size=4)
+    assert window.acknowledge(Position()) == [], "nobody has sent anything"
+    window.receive(b"old", 1, now=0.0)
+    window.receive(b"new", 2, now=0.0)
+    window.receive(b"old", 2, now=0.0)
+    assert window.acknowledge(Position(1, version=3, unsaved=1)) == [Reply(b"new", Stored(1, 2, 3, 1))]
+
+
+def test_a_message_that_no_sender_can_have_in_flight_is_rejected():
+    window = ReceiveWindow(Position(), size=4)
+    assert not any(isinstance(action, Reject) for action in window.receive(b"peer", 5, now=0.0))
+    assert [action.reason for action in window.receive(b"peer", 6, now=0.0) if isinstance(action, Reject)] == [
+        "sequence"
+    ]
+
+
+def test_the_end_and_a_broken_connection_are_noticed_and_a_new_message_takes_them_back():
+    window = ReceiveWindow(Position(), size=4)
+    assert (window.connected, window.ended) == (False, False)
+    window.receive(b"peer", 1, now=0.0)
+    window.disconnected()
+    assert (window.connected, window.ended) == (False, False)
+    window.receive(b"peer", 2, now=0.0, last=True)
+    assert (window.connected, window.ended) == (True, True)
+
+
+@pytest.mark.parametrize("late", [Stored(1, 3), Stored(2, 2)], ids=["stored less", "taken less"])
+def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late):
+    window = filled(size=4, count=4)
+    window.receive(Stored(2, 3), now=0.0)
+    rejected = window.receive(late, now=50.0)
+    assert rejected is not None
+    assert rejected.reason == "acknowledgement"
+    assert (window.acknowledged, window.stored, window.taken) == (2, 2, 3)
+    assert window.must_ask(50.0), "it is no sign of life"
+
+
+def test_what_a_full_disk_keeps_in_memory_is_acknowledged_and_does_not_count_as_stored():
+    window = filled(size=4, count=3)
+    window.receive(Stored(3, 3, unsaved=2), now=0.0)
+    assert (window.acknowledged, window.stored, window.full) == (3, 1, False)
+    with pytest.raises(SetBackError, match="had 3 messages and now has 1"):
+        window.receive(Position(1), now=0.0)
+
+
+def test_a_receiver_of_another_stream_is_noticed_and_what_an_earlier_sender_had_in_flight_is_not_one():
+    window = SendWindow("features", 4, now=0.0)
+    window.resume(3, known=5)
+    window.receive(Stored(9, 9), now=0.0)
+    assert (window.acknowledged, window.stored, window.taken) == (3, 3, 3)
+    with pytest.raises(ProtocolError, match="another stream"):
+        window.receive(Stored(10, 10), now=0.0)
+
+
+def test_a_sample_counts_from_the_message_that_led_to_it_or_an_earlier_one():
+    window = filled(size=9, count=9)
+    for reply in (Stored(0, 2, version=1), Stored(0, 3, version=1), Stored(0, 4, version=2), Stored(0, 9, version=5)):
+        window.receive(reply, now=0.0)
+    assert window.version == 5
+    assert [window.sample_of(seq) for seq in range(1, 10)] == [1, 1, 1, 2, 5, 5, 5, 5, 5]
+    assert not window._samples, "what was asked for is forgotten"
