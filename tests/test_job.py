@@ -41,7 +41,7 @@ def test_a_job_is_read_as_it_was_written(tmp_path_factory, job):
     assert Job.load(job.save(folder)) == Job.load(folder) == job
 
 
-def test_a_job_is_for_its_owner_from_the_first_byte(tmp_path, monkeypatch):
+def test_the_file_of_a_job_is_private_from_its_first_byte(tmp_path, monkeypatch):
     before = os.umask(0)
     try:
         (tmp_path / ".job.safetensors.part").write_text("what a power cut left of an older catstream")

@@ -49,7 +49,7 @@ def found(source: str) -> list[str]:
     return wrong
 
 
-def test_nothing_runs_what_it_reads():
+def test_no_input_is_executed():
     wrong = {str(path.relative_to(ROOT)): found(path.read_text(encoding="utf-8")) for path in FILES}
     assert not {place: calls for place, calls in wrong.items() if calls}
 

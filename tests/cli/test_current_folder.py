@@ -63,7 +63,7 @@ def traps(tmp_path):
 
 
 @pytest.mark.parametrize("verb", ["track", "demo", "evaluate", "loadtest", "program", "all others"])
-def test_no_file_in_the_current_folder_is_run(verb, sequence, traps, tmp_path):
+def test_no_file_in_the_current_folder_is_imported(verb, sequence, traps, tmp_path):
     (tmp_path / "program.py").write_text(PROGRAM)
     (folder, box), out = sequence, tmp_path / "out"
     load = ["--rate", "20", "--duration", "1", "--size", "160x120", "--subscribers", "1"]

@@ -195,7 +195,7 @@ def test_an_output_that_cannot_be_written_to_is_refused(video, said, tmp_path, o
 
 
 @pytest.mark.parametrize("file", ["demo.txt", "demo.mp4.part"])
-def test_a_disk_that_fills_up_ends_the_run_in_one_line(video, said, tmp_path, file):
+def test_a_full_disk_ends_the_run_with_one_line(video, said, tmp_path, file):
     source, box = video
     (tmp_path / file).symlink_to("/dev/full")
     code, _, errors = said("track", source, "--box", box, "--output", tmp_path, "--video", "--overwrite")

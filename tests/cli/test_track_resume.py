@@ -69,7 +69,7 @@ def killed(wreck):
     return shutil.copytree(copy, place)
 
 
-def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed, whole_run, said, tmp_path):
+def test_a_run_whose_processes_were_all_killed_resumes_without_a_difference(killed, whole_run, said, tmp_path):
     kept, out = killed / "kept", killed / "out"
     before = len(frames(out))
     assert before < 60
@@ -89,7 +89,7 @@ def test_after_everything_was_killed_a_run_goes_on_as_if_nothing_had_been(killed
     assert frames(out) == list(range(60)), "a run that is complete gets no row more"
 
 
-def test_rows_that_a_power_cut_tore_are_cut_off_and_written_again(killed, whole_run, said):
+def test_rows_left_incomplete_by_a_power_failure_are_removed_and_written_again(killed, whole_run, said):
     out = killed / "out"
     for file, cut in [("demo.txt", 60), ("demo.csv", 100)]:
         path = out / file
@@ -105,7 +105,7 @@ def test_rows_that_a_power_cut_tore_are_cut_off_and_written_again(killed, whole_
         assert sum(1 for _ in film) == 60, "the video is drawn again, whole"
 
 
-def test_a_damaged_checkpoint_is_said_and_the_one_before_goes_on(killed, whole_run, said):
+def test_a_damaged_checkpoint_is_reported_and_the_previous_one_is_used(killed, whole_run, said):
     kept = killed / "kept"
     newest = max(checkpoints(kept))
     damaged = bytearray(newest.read_bytes())
@@ -117,7 +117,7 @@ def test_a_damaged_checkpoint_is_said_and_the_one_before_goes_on(killed, whole_r
     assert (killed / "out" / "demo.csv").read_bytes() == (whole_run / "out" / "demo.csv").read_bytes()
 
 
-def test_a_state_that_is_in_use_or_does_not_fit_is_refused(killed, video, said, catstream, tmp_path):
+def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed, video, said, catstream, tmp_path):
     kept, out, (source, box) = killed / "kept", killed / "out", video
     refusals = {
         "go on with it": ["track", source, "--box", box, "--state", kept],

@@ -49,7 +49,7 @@ def newest(folder):
     return max(folder.glob("*.safetensors"))
 
 
-def test_the_newest_two_are_kept_and_the_newest_is_used(kept):
+def test_the_newest_two_checkpoints_are_kept_and_the_newest_is_used(kept):
     assert files(kept) == ["000000000002.safetensors", "000000000003.safetensors"]
     assert CheckpointStore(kept).load(SETTINGS).seq == 60
 
@@ -59,7 +59,7 @@ def test_a_folder_without_any_begins_anew(tmp_path):
 
 
 @pytest.mark.parametrize("share", [0, 0.001, 0.5, 0.999])
-def test_a_torn_file_is_noticed_and_the_one_before_is_used(kept, share, caplog):
+def test_an_incomplete_checkpoint_is_detected_and_the_previous_one_is_used(kept, share, caplog):
     whole = newest(kept).read_bytes()
     newest(kept).write_bytes(whole[: int(share * len(whole))])
     store = CheckpointStore(kept)
@@ -68,7 +68,7 @@ def test_a_torn_file_is_noticed_and_the_one_before_is_used(kept, share, caplog):
     assert "cannot be used" in caplog.text
 
 
-def test_no_flipped_bit_goes_unnoticed(kept, rng):
+def test_any_flipped_bit_is_detected(kept, rng):
     """What is loaded is the one or the other, and never anything between."""
     path, whole = newest(kept), newest(kept).read_bytes()
     right = {
@@ -86,7 +86,7 @@ def test_no_flipped_bit_goes_unnoticed(kept, rng):
     assert noticed > 100
 
 
-def test_after_a_damaged_one_the_next_is_kept_beside_the_good_one(kept, grow):
+def test_after_a_damaged_checkpoint_the_next_one_is_kept_beside_the_valid_one(kept, grow):
     newest(kept).write_bytes(b"torn")
     store = CheckpointStore(kept)
     assert store.save(grow(store.load(SETTINGS), 5))
@@ -103,7 +103,7 @@ def test_where_none_is_whole_all_is_learned_anew_and_said(kept):
     assert "damaged checkpoints: 2, all is learned anew" in store.trouble
 
 
-def test_a_full_disk_is_said_and_costs_nothing_that_was_kept(kept, grow, monkeypatch):
+def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

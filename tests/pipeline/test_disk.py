@@ -51,7 +51,7 @@ DISKS = {
 
 
 @pytest.mark.parametrize(("spoil", "mend", "reason"), DISKS.values(), ids=DISKS)
-def test_a_disk_that_takes_nothing_stops_nothing_and_is_said(video, disk, until, spoil, mend, reason):
+def test_a_run_continues_and_reports_a_disk_that_cannot_be_written(video, disk, until, spoil, mend, reason):
     path, boxes = video
     state, tracks, said = disk / "kept", [], ""
     with Pipeline(path, boxes[0], SETTINGS, state=state) as pipeline:

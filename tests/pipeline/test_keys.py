@@ -20,7 +20,7 @@ def keys(folder):
     return folder / "keys"
 
 
-def test_a_pipeline_with_keys_loses_no_frame_and_is_heard_by_who_may(video, folder, keys, tcp):
+def test_a_pipeline_with_keys_loses_no_frame_and_sends_to_allowed_clients(video, folder, keys, tcp):
     path, boxes = video
     settings = Settings(run={"endpoint": tcp.replace("127.0.0.1", "0.0.0.0"), "keys": str(keys), "unstored_frames": 16})
     with (
@@ -60,7 +60,7 @@ def test_a_stranger_at_the_door_of_a_pipeline_is_counted_in_its_health(video, ke
 @pytest.mark.parametrize(
     "place", ["0.0.0.0:0", "192.0.2.1:5700", "example.org:5700", "127.0.0.1,trainer=192.0.2.1:5700"]
 )
-def test_a_pipeline_that_others_can_reach_does_not_start_without_keys(video, place):
+def test_a_pipeline_that_other_machines_can_reach_does_not_start_without_keys(video, place):
     path, boxes = video
     settings = Settings(run={"endpoint": f"tcp://{place}"})
     with pytest.raises(ServiceError, match="catstream keys new"), Pipeline(path, boxes[0], settings):

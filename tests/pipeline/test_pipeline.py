@@ -88,7 +88,7 @@ def test_three_processes_run_while_it_is_open_and_none_afterwards(run, alive):
     assert not pipeline.pids
 
 
-def test_processes_that_are_killed_one_after_the_other_cost_no_frame(video, alive):
+def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):
     path, boxes = video
     tracks, killed, victims = [], [], list(NAMES)
     with Pipeline(path, boxes[0], SETTINGS) as pipeline:
@@ -166,7 +166,7 @@ def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(in_locks
 
 
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
-def test_a_second_pipeline_at_the_same_place_is_refused(video, transport, folder, tcp):
+def test_a_second_pipeline_at_the_same_endpoint_is_rejected(video, transport, folder, tcp):
     path, boxes = video
     settings = Settings(run={"endpoint": str(folder) if transport == "ipc" else tcp, "unstored_frames": 16})
     with Pipeline(path, boxes[0], settings) as first:

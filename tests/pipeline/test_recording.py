@@ -37,7 +37,7 @@ def test_a_recording_that_is_there_is_not_written_over(video, tmp_path):
         Pipeline(path, boxes[0], record=tmp_path / "run.rec")
 
 
-def test_a_run_goes_on_where_its_recording_cannot(video, tmp_path, monkeypatch):
+def test_a_run_continues_if_its_recording_cannot_be_written(video, tmp_path, monkeypatch):
     path, boxes = video
     preload = tmp_path / "sitecustomize.py"
     preload.write_text("import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (5 << 20, resource.RLIM_INFINITY))")

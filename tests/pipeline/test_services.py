@@ -29,7 +29,7 @@ from catstream.wire.newest import Subscriber
 @pytest.mark.parametrize(
     "order", [("detector", "trainer", "compressor"), ("trainer", "compressor", "detector")], ids=" ".join
 )
-def test_started_by_hand_in_any_order_they_complete_a_run(video, folder, tcp, service, order, until):
+def test_processes_started_manually_in_any_order_complete_a_run(video, folder, tcp, service, order, until):
     path, boxes = video
     arguments = {
         "compressor": ["--state", folder],
@@ -134,7 +134,7 @@ def test_a_process_whose_parent_is_gone_already_ends_at_once(folder, service):
     assert service("child", "trainer", file, "--parent", 2**22 + 1).wait(60) == 0
 
 
-def test_a_process_that_would_fail_again_says_why_and_is_not_restarted(folder):
+def test_an_error_that_a_restart_cannot_resolve_is_reported_and_not_retried(folder):
     supervisor = Supervisor(Job(str(folder / "gone.mp4"), Box(1, 1, 9, 9), endpoint=str(folder)), folder)
     try:
         with pytest.raises(ServiceError, match=r"no video or folder .*gone\.mp4"):
@@ -144,7 +144,7 @@ def test_a_process_that_would_fail_again_says_why_and_is_not_restarted(folder):
         supervisor.stop()
 
 
-def test_a_process_that_keeps_dying_is_given_up(video, folder):
+def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder):
     path, boxes = video
     supervisor = Supervisor(Job(path, boxes[0], endpoint=str(folder), owned=True), folder)
 
@@ -168,7 +168,7 @@ def check_for_a_minute(supervisor, turn=lambda: None):
         time.sleep(0.01)
 
 
-def test_processes_that_hang_are_noticed_and_replaced(video):
+def test_processes_that_hang_are_detected_and_replaced(video):
     path, boxes = video
     stopped, tracks = [], []
     with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16})) as pipeline:

@@ -26,11 +26,11 @@ def test_who_watches_sees_each_turn(watchdog):
     assert watchdog.patience == PATIENCE
 
 
-def test_who_is_starting_has_longer_than_who_turns(watchdog):
+def test_a_starting_process_has_a_longer_time_limit_than_a_running_one(watchdog):
     assert watchdog.patience > 20 * PATIENCE
 
 
-def test_a_long_step_that_is_announced_has_its_time_and_the_next_has_not(watchdog):
+def test_only_the_announced_long_step_extends_the_time_limit(watchdog):
     watchdog.beat()
     watchdog.allow(60)
     assert watchdog.patience == 60
@@ -38,7 +38,7 @@ def test_a_long_step_that_is_announced_has_its_time_and_the_next_has_not(watchdo
     assert watchdog.patience == PATIENCE
 
 
-def test_where_turns_are_slow_patience_is_longer_until_they_are_quick_again(watchdog, monkeypatch):
+def test_the_time_limit_follows_the_duration_of_recent_iterations(watchdog, monkeypatch):
     clock = [time.monotonic()]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     for seconds in (0.0, 0.0, 4.0):

@@ -82,7 +82,7 @@ def test_a_file_that_was_cut_before_the_end_of_its_settings_is_no_recording(writ
 
 
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_a_changed_bit_costs_its_own_message_and_no_other(tmp_path_factory, share, bit):
+def test_a_changed_bit_invalidates_its_own_message_only(tmp_path_factory, share, bit):
     path = tmp_path_factory.mktemp("changed") / "run.rec"
     with RecordingWriter(path, Run.of(Settings().portable())) as writer:
         for seq in range(1, 10):

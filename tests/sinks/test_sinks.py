@@ -155,7 +155,7 @@ def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".ndjson", ".json", ".csv", ".txt"])
-def test_a_disk_that_is_full_is_said_in_one_line_and_what_was_written_stays(tmp_path, full, suffix):
+def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path, full, suffix):
     path = tmp_path / f"tracks{suffix}"
     sink = open_sink(path)
     sink.write(TRACKS[0])

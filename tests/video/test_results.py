@@ -67,7 +67,7 @@ def test_the_same_tracks_give_the_same_bytes(tmp_path):
 
 
 @pytest.mark.parametrize("file", ["walk.txt", "walk_confidence.value", "walk_time.txt", "walk.csv"])
-def test_a_disk_that_is_full_is_said_in_one_line_and_what_was_written_stays(tmp_path, full, file):
+def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path, full, file):
     results = ResultsWriter(tmp_path, "walk")
     results.write(track(0), 0.01)
     full(tmp_path / file)

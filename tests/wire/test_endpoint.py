@@ -177,7 +177,7 @@ def test_a_killed_pipeline_is_not_found():
         shutil.rmtree(place)
 
 
-def test_the_folder_of_a_killed_process_goes_with_the_next_one_and_that_of_a_living_one_stays(tmp_path, monkeypatch):
+def test_the_folder_of_a_killed_process_is_removed_by_the_next_one_and_of_a_running_one_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     script = "import os, signal; from catstream.wire.endpoint import private_folder\n"

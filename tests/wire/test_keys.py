@@ -118,7 +118,7 @@ def stranger():
         yield connect
 
 
-def test_keys_are_for_their_owner_from_the_first_byte(folder, monkeypatch):
+def test_key_files_are_private_from_their_first_byte(folder, monkeypatch):
     modes, fsync = [], os.fsync
     monkeypatch.setattr(os, "fsync", lambda handle: (modes.append(os.fstat(handle).st_mode), fsync(handle)))
     before = os.umask(0)
@@ -159,7 +159,7 @@ def test_a_client_has_a_name_that_is_no_path(keys, name):
     assert set(clients(keys)) == {*CLIENTS, "pipeline"}
 
 
-def test_a_secret_that_others_can_read_is_not_used(keys):
+def test_a_secret_key_that_other_users_can_read_is_rejected(keys):
     (keys / "client.key").chmod(0o640)
     with pytest.raises(ServiceError, match="chmod 600"):
         Keys.load(keys)
@@ -177,7 +177,7 @@ def test_a_secret_is_not_printed(keys):
     assert known.secret.decode() not in repr(known)
 
 
-def test_a_client_cannot_listen_in_the_pipelines_place(place):
+def test_a_client_cannot_impersonate_the_pipeline(place):
     with pytest.raises(ServiceError, match="keys of a client"):
         Publisher(TRACKS, place("watcher"))
 
@@ -203,7 +203,7 @@ def test_who_may_steer_is_answered(place, until):
         until(lambda: answers[-1] is not None, turn)
 
 
-def test_the_pipelines_own_keys_carry_an_acknowledged_channel(place, until):
+def test_an_acknowledged_channel_works_with_the_keys_of_the_pipeline(place, until):
     taken = []
     with Receiver(RESULTS, place(), Position(), WINDOW) as receiver, Sender(RESULTS, place(), WINDOW) as sender:
 
@@ -218,7 +218,7 @@ def test_the_pipelines_own_keys_carry_an_acknowledged_channel(place, until):
 
 
 @pytest.mark.parametrize(("name", "who"), OUTSIDE)
-def test_who_may_not_take_part_gets_nothing_is_counted_and_named_once(
+def test_a_client_without_permission_receives_nothing_and_is_counted_and_logged_once(
     name, who, keys, place, listener, stranger, until, caplog
 ):
     reason = "role" if who in CLIENTS else "handshake"
@@ -238,14 +238,14 @@ def test_who_may_not_take_part_gets_nothing_is_counted_and_named_once(
 
 
 @pytest.mark.parametrize("name", ["features", "results", "control"])
-def test_an_allowed_watcher_that_sends_is_told_why_it_cannot(name, place, listener, until):
+def test_a_client_that_may_only_watch_gets_an_error_if_it_sends(name, place, listener, until):
     turn = listener(name)
     client = Requester(place("watcher")) if name == "control" else Sender(CHANNELS[name], place("watcher"), WINDOW)
     with client, pytest.raises(ServiceError, match=f"does not let this key take part in {name}"):
         until(lambda: False, lambda: (turn(), client._wait(0.02)))
 
 
-def test_a_revoked_client_hears_until_its_connection_ends_and_never_again(keys, place, until):
+def test_a_revoked_client_receives_until_its_connection_ends_and_cannot_reconnect(keys, place, until):
     heard = []
     with Subscriber(TRACKS, place("watcher")) as reader:
         with Publisher(TRACKS, place()) as tracks:
@@ -266,7 +266,7 @@ def test_a_revoked_client_hears_until_its_connection_ends_and_never_again(keys, 
     assert {message.seq for message in heard if message} <= {1, 2, 3}
 
 
-def test_who_is_allowed_later_needs_no_restart(keys, place, until):
+def test_a_client_that_is_allowed_later_needs_no_restart(keys, place, until):
     heard = []
     with Publisher(TRACKS, place()) as tracks:
         tracks.send(track(1))

@@ -96,7 +96,7 @@ def stranger(endpoint):
 
 
 @pytest.mark.parametrize("reason", WRONG)
-def test_a_wrong_message_is_counted_by_what_is_wrong_and_costs_the_true_sender_nothing(
+def test_an_invalid_message_is_counted_by_its_reason_and_does_not_affect_the_legitimate_sender(
     reason, endpoint, stranger, until
 ):
     compressor, before, taken = Compressor(Settings(coreset={"size": 2})), rejected(reason), []
@@ -121,7 +121,7 @@ def test_a_wrong_message_is_counted_by_what_is_wrong_and_costs_the_true_sender_n
     assert rejects()["rejected"] >= 1
 
 
-def test_a_stranger_hears_only_what_it_asked_and_the_sender_all_that_is_its_own(endpoint, stranger, until):
+def test_acknowledgements_are_sent_only_to_the_sender_of_the_accepted_message(endpoint, stranger, until):
     taken = []
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         other = stranger(zmq.DEALER, "results")
@@ -146,7 +146,7 @@ def test_a_stranger_hears_only_what_it_asked_and_the_sender_all_that_is_its_own(
         assert not other.poll(50)
 
 
-def test_parts_without_number_are_one_refused_message(endpoint, stranger, until):
+def test_a_message_with_many_parts_is_one_rejected_message(endpoint, stranger, until):
     before = rejected("parts")
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
         stranger(zmq.DEALER, "results").send_multipart([b"x"] * 20_000)
@@ -171,7 +171,7 @@ def test_an_acknowledgement_that_comes_again_takes_nothing_back(endpoint, until)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_what_is_said_to_a_publisher_is_counted_and_its_readers_go_on(name, endpoint, stranger, until):
+def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(name, endpoint, stranger, until):
     said = {
         Track: Track(1, 0, 0.0, "absent", None, 0.0, 0),
         Sample: End(1, "nothing was learned"),
@@ -196,7 +196,7 @@ def test_what_is_said_to_a_publisher_is_counted_and_its_readers_go_on(name, endp
     assert {type(message) for message in heard} == {type(said)}
 
 
-def test_a_flood_of_commands_is_counted_and_the_next_one_is_heard(endpoint, stranger, until):
+def test_a_flood_of_commands_is_counted_and_the_next_command_is_received(endpoint, stranger, until):
     before, heard = rejected("msgpack"), []
     with Responder(endpoint) as responder:
         other = stranger(zmq.DEALER, "control")
@@ -207,7 +207,7 @@ def test_a_flood_of_commands_is_counted_and_the_next_one_is_heard(endpoint, stra
     assert [command.verb for command in heard] == ["stop"]
 
 
-def test_a_message_above_the_limit_ends_its_connection_and_is_counted_so(endpoint, stranger, until):
+def test_a_message_above_the_size_limit_closes_its_connection_and_is_counted(endpoint, stranger, until):
     before = rejects().get("disconnected", 0)
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
         stranger(zmq.DEALER, "results").send(bytes(CHANNELS["results"].limit + 1))
