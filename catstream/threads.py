@@ -12,7 +12,7 @@ import os
 import sys
 import threading
 from contextlib import ContextDecorator
-from typing import Any
+from typing import Protocol
 
 __all__ = ["limit_process", "one_thread"]
 
@@ -28,6 +28,16 @@ def limit_process() -> None:
         os.environ.setdefault(variable, "1")
 
 
+class _Library(Protocol):
+    """What is used of a controller of threadpoolctl."""
+
+    user_api: str
+    filepath: str
+
+    def get_num_threads(self) -> int | None: ...
+    def set_num_threads(self, num_threads: int) -> object: ...
+
+
 class _Libraries:
     """The threaded libraries that are loaded in this process, and a count of the users that limit them to one thread.
 
@@ -38,12 +48,12 @@ class _Libraries:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._modules = 0  # number of imported modules at the last search for libraries
-        self._blas: list[Any] = []
-        self._openmp: list[Any] = []
+        self._blas: list[_Library] = []
+        self._openmp: list[_Library] = []
         self._users = 0
-        self._original: dict[str, tuple[Any, int]] = {}  # path -> a BLAS, and its threads before the first holder
+        self._original: dict[str, tuple[_Library, int]] = {}  # path -> a BLAS, and its threads before the first holder
 
-    def limit(self) -> list[tuple[Any, int]]:
+    def limit(self) -> list[tuple[_Library, int]]:
         """Set one thread; return the argument for `restore`."""
         with self._lock:
             self._find()
@@ -57,7 +67,7 @@ class _Libraries:
                 _set(library, 1)
             return own
 
-    def restore(self, own: list[tuple[Any, int]]) -> None:
+    def restore(self, own: list[tuple[_Library, int]]) -> None:
         """Undo one `limit`."""
         with self._lock:
             for library, threads in own:
@@ -82,11 +92,11 @@ class _Libraries:
         self._blas = [library for library in libraries if not _is_openmp(library)]
 
 
-def _is_openmp(library: Any) -> bool:
+def _is_openmp(library: _Library) -> bool:
     return library.user_api == "openmp" or getattr(library, "threading_layer", "") == "openmp"
 
 
-def _set(library: Any, threads: int) -> None:
+def _set(library: _Library, threads: int) -> None:
     # threadpoolctl lets only one thread of a process set OpenBLAS; here any thread may be the last user.
     getattr(library, "_real_set_num_threads", library.set_num_threads)(threads)
 
@@ -114,7 +124,7 @@ class one_thread(ContextDecorator):
 
     def __init__(self, *, opencv: bool = False) -> None:
         self._opencv = opencv
-        self._entered: list[tuple[list[tuple[Any, int]], int | None]] = []
+        self._entered: list[tuple[list[tuple[_Library, int]], int | None]] = []
 
     def _recreate_cm(self) -> one_thread:
         return one_thread(opencv=self._opencv)  # a decorated function may run in several threads at once

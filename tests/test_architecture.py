@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 #: From the ground up. A module imports from the floors below its own, and from its own folder.
 FLOORS = [
-    {"errors", "threads"},
+    {"arrays", "errors", "threads"},
     {"box", "heads", "image", "schema", "storage", "extras"},
     {"messages", "packing", "settings", "ridge", "kalman", "html"},
     {"features"},

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from catstream.arrays import Float64, UInt8
 from catstream.errors import VideoError
 from catstream.video.source import natural_order, open_source
 
@@ -44,13 +45,13 @@ class Sequence:
 
     name: str
     path: Path
-    boxes: np.ndarray
+    boxes: Float64
     begin: int = 0
 
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def frames(self, start: int = 0) -> Iterator[np.ndarray]:
+    def frames(self, start: int = 0) -> Iterator[UInt8]:
         """Yield the images of boxes[start:], uint8 (h, w, 3), one for each box.
 
         Raises
@@ -110,7 +111,7 @@ def _sequences(folder: Path) -> list[Sequence]:
     return []
 
 
-def _sequence(name: str, folder: Path, file: Path, reader: Callable[[np.ndarray], np.ndarray]) -> Sequence:
+def _sequence(name: str, folder: Path, file: Path, reader: Callable[[Float64], Float64]) -> Sequence:
     boxes = reader(_numbers(file))
     boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
     if np.isnan(boxes).all():
@@ -118,7 +119,7 @@ def _sequence(name: str, folder: Path, file: Path, reader: Callable[[np.ndarray]
     return Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
 
 
-def _numbers(file: Path) -> np.ndarray:
+def _numbers(file: Path) -> Float64:
     """Read the table in a text file, float64 (lines, columns), with at least four columns."""
     rows: list[list[float]] = []
     try:
@@ -146,15 +147,15 @@ def _numbers(file: Path) -> np.ndarray:
     return np.array(rows)
 
 
-def _rectangles(table: np.ndarray) -> np.ndarray:
+def _rectangles(table: Float64) -> Float64:
     return table[:, :4].copy()
 
 
-def _corners(table: np.ndarray) -> np.ndarray:
+def _corners(table: Float64) -> Float64:
     return np.hstack([table[:, :2], table[:, 2:4] - table[:, :2]])
 
 
-def _polygons(table: np.ndarray) -> np.ndarray:
+def _polygons(table: Float64) -> Float64:
     if table.shape[1] < 6:
         return _rectangles(table)
     low, high = (np.stack([pick(table[:, axis::2], axis=1) for axis in (0, 1)], axis=1) for pick in (np.min, np.max))

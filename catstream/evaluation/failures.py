@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from catstream.arrays import Bool
 from catstream.evaluation.metrics import overlaps
 from catstream.evaluation.runs import EvaluationRun
 from catstream.video.annotate import thumbnail
@@ -54,14 +55,14 @@ def failure_strip(run: EvaluationRun) -> FailureStrip:
     return FailureStrip(run, first, length, pictures)
 
 
-def _bad(run: EvaluationRun) -> np.ndarray:
+def _bad(run: EvaluationRun) -> Bool:
     """Return the failed frames, bool (frames,): overlap of at most 0.5, or a box although the object is absent."""
     there = np.isfinite(run.truth).all(axis=1)
     found = np.isfinite(run.boxes).all(axis=1)
     return np.where(there, overlaps(run.boxes, run.truth) <= 0.5, found)
 
 
-def _longest(bad: np.ndarray) -> tuple[int, int]:
+def _longest(bad: Bool) -> tuple[int, int]:
     """Return the first index and the length of the longest run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(int), [0]])))
     begins, ends = edges[::2], edges[1::2]

@@ -20,6 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from catstream.arrays import Bool, Float64
+
 __all__ = [
     "OVERLAPS",
     "PIXELS",
@@ -59,7 +61,7 @@ class Score:
     long_term: LongTerm | None
 
 
-def overlaps(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def overlaps(boxes: Float64, truth: Float64) -> Float64:
     """Return the intersection over union of each pair of rows, float64 (frames, 4) both; 0 if either is NaN.
 
     >>> overlaps(np.array([[0., 0, 10, 10]]), np.array([[5., 0, 10, 10]]))
@@ -70,11 +72,11 @@ def overlaps(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
     shared = np.prod(np.maximum(high - low, 0), axis=1)
     union = np.prod(boxes[:, 2:], axis=1) + np.prod(truth[:, 2:], axis=1) - shared
     ratios = np.divide(shared, union, out=np.zeros(len(boxes)), where=union > 0)
-    shares: np.ndarray = np.minimum(np.nan_to_num(ratios), 1.0)  # rounding may exceed 1
+    shares: Float64 = np.minimum(np.nan_to_num(ratios), 1.0)  # rounding may exceed 1
     return shares
 
 
-def distances(boxes: np.ndarray, truth: np.ndarray, *, normalised: bool = False) -> np.ndarray:
+def distances(boxes: Float64, truth: Float64, *, normalised: bool = False) -> Float64:
     """Return the distances between the centres in pixels; infinite if either box is NaN.
 
     normalised : divide each coordinate by the width or height of the ground truth box
@@ -85,19 +87,19 @@ def distances(boxes: np.ndarray, truth: np.ndarray, *, normalised: bool = False)
     return np.nan_to_num(np.hypot(apart[:, 0], apart[:, 1]), nan=np.inf)
 
 
-def success_plot(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def success_plot(boxes: Float64, truth: Float64) -> Float64:
     """Return the share of frames with the object whose overlap exceeds each of `OVERLAPS`, float64 (21,)."""
-    shares: np.ndarray = (overlaps(boxes, truth)[_present(truth), None] > OVERLAPS).mean(axis=0)
+    shares: Float64 = (overlaps(boxes, truth)[_present(truth), None] > OVERLAPS).mean(axis=0)
     return shares
 
 
-def precision_plot(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def precision_plot(boxes: Float64, truth: Float64) -> Float64:
     """Return the share of frames with the object whose centre error is at most each of `PIXELS`, float64 (51,)."""
-    shares: np.ndarray = (distances(boxes, truth)[_present(truth), None] <= PIXELS).mean(axis=0)
+    shares: Float64 = (distances(boxes, truth)[_present(truth), None] <= PIXELS).mean(axis=0)
     return shares
 
 
-def long_term(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray) -> LongTerm:
+def long_term(boxes: Float64, truth: Float64, confidence: Float64) -> LongTerm:
     """Return precision, recall and F-score of VOT-LT (Lukezic et al. 2020).
 
     A box counts as reported if its confidence reaches a threshold. Precision is the mean overlap over the reported
@@ -123,7 +125,7 @@ def long_term(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray) -> L
     return LongTerm(float(precision[best]), float(recall[best]), float(f_score[best]))
 
 
-def score(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray | None = None) -> Score:
+def score(boxes: Float64, truth: Float64, confidence: Float64 | None = None) -> Score:
     """Return all measures of one run.
 
     Parameters
@@ -154,6 +156,6 @@ def score(boxes: np.ndarray, truth: np.ndarray, confidence: np.ndarray | None = 
     )
 
 
-def _present(boxes: np.ndarray) -> np.ndarray:
-    present: np.ndarray = np.isfinite(boxes).all(axis=1)
+def _present(boxes: Float64) -> Bool:
+    present: Bool = np.all(np.isfinite(boxes), axis=1)
     return present

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from catstream.arrays import Float64
 from catstream.evaluation.failures import FailureStrip, failure_strip, worst_runs
 from catstream.evaluation.metrics import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.evaluation.runs import EvaluationRun
@@ -59,9 +60,9 @@ def _plots(runs: list[EvaluationRun]) -> str:
     """Plot success and precision of each tracker, averaged over the sequences."""
 
     def curves(
-        places: np.ndarray, measure: Callable[..., np.ndarray], at: Callable[[np.ndarray], float]
-    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        by_tracker: dict[str, dict[str, list[np.ndarray]]] = {}
+        places: np.ndarray, measure: Callable[..., Float64], at: Callable[[Float64], float]
+    ) -> dict[str, tuple[np.ndarray, Float64]]:
+        by_tracker: dict[str, dict[str, list[Float64]]] = {}
         for run in runs:  # as in the table, the mean is taken first over the starts of a sequence
             by_tracker.setdefault(run.tracker, {}).setdefault(run.sequence.name, []).append(
                 measure(run.boxes, run.truth)

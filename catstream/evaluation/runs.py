@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from catstream.arrays import Float64
 from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.metrics import Score, score
@@ -45,9 +46,9 @@ class EvaluationRun:
     tracker: str
     sequence: Sequence
     start: int
-    boxes: np.ndarray
-    confidence: np.ndarray
-    seconds: np.ndarray
+    boxes: Float64
+    confidence: Float64
+    seconds: Float64
 
     @property
     def name(self) -> str:
@@ -55,7 +56,7 @@ class EvaluationRun:
         return run_name(self.sequence, self.start)
 
     @property
-    def truth(self) -> np.ndarray:
+    def truth(self) -> Float64:
         """Ground truth of the frames of this run, float64 (frames, 4)."""
         return self.sequence.boxes[self.start :]
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any
+from typing import TypeVar
 
 from catstream.errors import ServiceError
 from catstream.services.loop import die_with
@@ -19,10 +19,12 @@ from catstream.services.start import SPAWN
 
 __all__ = ["run_tasks"]
 
+_Result = TypeVar("_Result")
+
 _CTRL_C = {signal.SIGINT}
 
 
-def run_tasks(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
+def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], jobs: int) -> Iterator[_Result]:
     """Yield the result of `work(*task)` for each task, in order of completion, from `jobs` processes.
 
     If the caller stops early, for example on Ctrl-C, all workers are killed.
@@ -45,7 +47,9 @@ def run_tasks(work: Any, tasks: list[Any], jobs: int) -> Iterator[Any]:
             raise
 
 
-def _submit(pool: ProcessPoolExecutor, work: Any, tasks: list[Any]) -> list[Future[Any]]:
+def _submit(
+    pool: ProcessPoolExecutor, work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]]
+) -> list[Future[_Result]]:
     """Submit all tasks. The workers are started here, and inherit a blocked SIGINT; `_init_worker` unblocks it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _CTRL_C)
     try:

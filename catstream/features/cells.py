@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from catstream.arrays import Float32
 from catstream.features import colours
 from catstream.features.colours import SHADES
 from catstream.features.compiled import kernel
@@ -81,7 +82,7 @@ class Cells:
 
 
 @kernel("void(float32[:,:,::1], float32[:,::1])")
-def _add_shifted(parts, scores):
+def _add_shifted(parts: Float32, scores: Float32) -> None:
     rows, columns = scores.shape
     for row in range(rows):
         for column in range(columns):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from catstream.arrays import Float32, UInt8, UInt16
 from catstream.features.compiled import kernel
 from catstream.features.hog import CELL, WINDOW
 
@@ -71,7 +72,8 @@ def _table() -> np.ndarray:
     lab = cv2.cvtColor(colours.reshape(-1, 1, 3), cv2.COLOR_BGR2LAB).reshape(-1, 3).astype(int)
     light = lab[:, 0] * _LIGHT // 256
     chroma = ((lab[:, 1:] - 128) // _CHROMA_STEP + _CHROMA // 2).clip(0, _CHROMA - 1)
-    return ((light * _CHROMA + chroma[:, 0]) * _CHROMA + chroma[:, 1]).astype(np.uint16)
+    bins: np.ndarray = ((light * _CHROMA + chroma[:, 0]) * _CHROMA + chroma[:, 1]).astype(np.uint16)
+    return bins
 
 
 _TABLE = _table()
@@ -81,7 +83,7 @@ _STEPS = np.diff(_ROOTS)  # and what one more of a shade adds
 
 
 @kernel("void(uint8[:,:,:], uint16[::1], uint16[:,::1])")
-def _look_up(image, table, found):
+def _look_up(image: UInt8, table: UInt16, found: UInt16) -> None:
     for y in range(found.shape[0]):
         for x in range(found.shape[1]):
             place = 0  # the first 5 bits of each channel's mean, one after the other
@@ -94,7 +96,7 @@ def _look_up(image, table, found):
 
 
 @kernel("void(uint16[:,::1], int64, int64, float32[::1], float32[::1])")
-def _histogram(found, top, left, roots, features):
+def _histogram(found: UInt16, top: int, left: int, roots: Float32, features: Float32) -> None:
     counts = np.empty(len(features), np.int64)
     for shade in range(len(counts)):
         counts[shade] = 0
@@ -106,7 +108,7 @@ def _histogram(found, top, left, roots, features):
 
 
 @kernel("void(uint16[:,::1], float32[::1], float32[::1], float32[:,::1])")
-def _add_scores(found, weights, steps, scores):
+def _add_scores(found: UInt16, weights: Float32, steps: Float32, scores: Float32) -> None:
     counts = np.empty(len(weights), np.int64)
     for row in range(scores.shape[0]):
         for shade in range(len(counts)):

@@ -8,6 +8,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar, cast
 
 import numba
 from numba.core.event import Event, Listener, install_listener
@@ -16,20 +17,21 @@ from catstream.features import COMPILING
 
 __all__ = ["kernel"]
 
+_Kernel = TypeVar("_Kernel", bound=Callable[..., object])
+
 _log = logging.getLogger(__name__)
 
 
-def kernel(signature: str) -> Callable:
+def kernel(signature: str) -> Callable[[_Kernel], _Kernel]:
     """Compile a function of arrays and numbers, for these types, when its module is imported.
 
     Arithmetic may be reordered and nothing is checked: no index beyond the end, no division by 0.
     """
     compiler = numba.njit(signature, cache=True, nogil=True, fastmath=True, error_model="numpy")
 
-    def compiled(function: Callable) -> Callable:
+    def compiled(function: _Kernel) -> _Kernel:
         with install_listener("numba:compile", _ANNOUNCER):
-            kernel: Callable = compiler(function)
-        return kernel
+            return cast(_Kernel, compiler(function))  # numba calls it a Dispatcher
 
     return compiled
 

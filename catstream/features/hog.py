@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy import float32
 
+from catstream.arrays import Float32, UInt8
 from catstream.features.compiled import kernel
 
 __all__ = ["CELL", "CHANNELS", "MARGIN", "WINDOW", "grid"]
@@ -60,8 +61,8 @@ def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
     colour = np.empty((rows, columns, 3), np.uint8)
     cells = np.empty((max(rows - 2 * margin, 0), max(columns - 2 * margin, 0), CHANNELS), np.float32)
     if cells.size:
-        channels = cv2.split(image)
-        _count(*channels, _SHARES, histogram)
+        blue, green, red = channels = [np.asarray(channel, np.uint8) for channel in cv2.split(image)]
+        _count(blue, green, red, _SHARES, histogram)
         _normalise(histogram, margin, cells)
         for i, channel in enumerate(channels):
             _average(channel, colour[:, :, i])
@@ -72,7 +73,7 @@ def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
 
 
 @kernel("void(uint8[::1], float32[::1])")
-def _read(row, line):
+def _read(row: UInt8, line: Float32) -> None:
     """One row of a channel, each pixel at the edge twice."""
     width = len(row)
     for x in range(width):
@@ -81,7 +82,9 @@ def _read(row, line):
 
 
 @kernel("void(float32[:,::1], float32[:,::1], float32[:,::1], float32[::1], float32[::1], float32[::1])")
-def _gradients(above, here, below, across, down, magnitude):
+def _gradients(
+    above: Float32, here: Float32, below: Float32, across: Float32, down: Float32, magnitude: Float32
+) -> None:
     """The strongest channel's gradient at each pixel of a row."""
     blue, green, red = here[0], here[1], here[2]
     blue_above, green_above, red_above = above[0], above[1], above[2]
@@ -102,7 +105,7 @@ def _gradients(above, here, below, across, down, magnitude):
 
 
 @kernel("void(float32[::1], float32[::1], uint8[::1])")
-def _orientations(across, down, orientation):
+def _orientations(across: Float32, down: Float32, orientation: UInt8) -> None:
     """Which of 18 directions, 0 ... 17, each gradient points to."""
     for x in range(len(orientation)):
         dx, dy = across[x], down[x]
@@ -115,7 +118,7 @@ def _orientations(across, down, orientation):
 
 
 @kernel("void(uint8[:,::1], uint8[:,::1], uint8[:,::1], float32[::1], float32[:,::1])")
-def _count(blue, green, red, shares, histogram):
+def _count(blue: UInt8, green: UInt8, red: UInt8, shares: Float32, histogram: Float32) -> None:
     """Histograms of the cells, with one cell more on every side, which takes what falls outside."""
     columns = histogram.shape[1] // _SIGNED - 2
     height, width = (histogram.shape[0] - 2) * CELL, columns * CELL
@@ -155,7 +158,7 @@ def _count(blue, green, red, shares, histogram):
 
 
 @kernel("void(uint8[:,::1], uint8[:,:])")
-def _average(channel, means):
+def _average(channel: UInt8, means: UInt8) -> None:
     """The mean of each cell's pixels."""
     for row in range(means.shape[0]):
         for column in range(means.shape[1]):
@@ -167,7 +170,7 @@ def _average(channel, means):
 
 
 @kernel("void(float32[:,::1], int64, float32[:,:,::1])")
-def _normalise(histogram, margin, cells):
+def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
     """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in."""
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] // _SIGNED - 2
     energy = np.empty((rows, columns), np.float32)

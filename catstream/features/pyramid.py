@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from catstream.arrays import UInt8
 from catstream.box import Window
 from catstream.features.compiled import kernel
 from catstream.features.hog import CELL, MARGIN, WINDOW
@@ -123,7 +124,7 @@ def _half(image: np.ndarray) -> np.ndarray:
 
 
 @kernel("void(uint8[:,::1], int64, float64, float64, float64, float64, uint8[:,::1])")
-def _sample(image, channels, left, top, across, down, found):
+def _sample(image: UInt8, channels: int, left: float, top: float, across: float, down: float, found: UInt8) -> None:
     """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row."""
     rows, columns = found.shape
     height, width = image.shape[0], image.shape[1] // channels

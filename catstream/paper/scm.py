@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from catstream.arrays import Float32, Float64
 from catstream.box import Box
 from catstream.features.compiled import kernel
 from catstream.features.pyramid import Pyramid
@@ -184,7 +185,8 @@ class _Discriminative:
         half = len(self.positives)
         foreground = _squares(rows - codes[:, :half] @ self._templates[:half])
         background = _squares(rows - codes[:, half:] @ self._templates[half:])
-        return np.exp((background - foreground) / self._SIGMA)
+        ratios: np.ndarray = np.exp((background - foreground) / self._SIGMA)
+        return ratios
 
 
 class _Generative:
@@ -216,7 +218,8 @@ class _Generative:
         codes, covered = self._coded(cuts)
         codes[covered] = 0
         shared = np.minimum(codes, self.histogram).sum(axis=(1, 2))
-        return shared / max(self.histogram.sum(), 1e-6)
+        shares: np.ndarray = shared / max(self.histogram.sum(), 1e-6)
+        return shares
 
     def update(self, found: np.ndarray) -> None:
         """Learn the new look, unless it is covered; the first is never forgotten ("Update Scheme")."""
@@ -245,13 +248,15 @@ def _grey(image: np.ndarray) -> Pyramid:
 
 def _squares(rows: np.ndarray) -> np.ndarray:
     """Squared length of each row."""
-    return np.einsum("ij,ij->i", rows, rows)
+    squares: np.ndarray = np.einsum("ij,ij->i", rows, rows)
+    return squares
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:
     """Rows of length 1, float32; a black one stays black."""
     rows = rows.astype(np.float32)
-    return rows / np.maximum(np.sqrt(_squares(rows)), 1e-6)[:, None]
+    unit: np.ndarray = rows / np.maximum(np.sqrt(_squares(rows)), 1e-6)[:, None]
+    return unit
 
 
 def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
@@ -271,7 +276,7 @@ def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
 
 
 @kernel("void(float64[:,::1], float64[:,::1], float32[:,::1])")
-def _solve(gains, gram, codes):
+def _solve(gains: Float64, gram: Float64, codes: Float32) -> None:
     """Active sets (Lawson and Hanson): the atom that gains most comes in, those that turn negative go.
 
     `gains` are those at code 0, and are used up. The set's Gram matrix is kept as a Cholesky factor whose diagonal
