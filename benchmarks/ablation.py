@@ -1,4 +1,4 @@
-"""What each ingredient is worth: all of them but one, over all sequences and several starts of each.
+"""Ablation: accuracy without each ingredient of the tracker, over all sequences and several starts of each.
 
 Single runs are chaotic: what counts is the difference sequence by sequence, beside its standard error. How many runs
 changed at all says how much the sequences ask for an ingredient.
@@ -17,10 +17,10 @@ from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import PRESETS, Settings
 
 COLUMNS = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error", "runs changed")
-_NEVER = -100.0  # no score is below it
+_NEVER = -100.0  # lower than any score
 _LONGER_THAN_ANY_VIDEO = 1 << 30
 
-#: Ingredient -> the settings that are without it.
+#: Ingredient -> the settings that switch it off.
 WITHOUT: dict[str, dict[str, Any]] = {
     "loss tree": {"teaching.classifier": "least-squares"},
     "least squares, a one-class SVM instead": {"teaching.classifier": "one-class"},
@@ -67,13 +67,13 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     whole = runs["nothing left out"]
     note = f"{len(whole)} runs each; spread: standard deviation over {options.starts} starts, mean over the sequences"
     yield Table("Ablation", COLUMNS, beside(whole, runs), note)
-    if not options.quick and not options.only:  # last and alone, as SCM takes longer than all that is above
+    if not options.quick and not options.only:  # last, because SCM takes longer than all variants above
         paper = compared(options, found, {"the paper's tracker": Settings.of(PRESETS["one-class-paper"])})
         yield Table("The paper's tracker", COLUMNS, beside(whole, paper), note)
 
 
 def beside(whole: list[EvaluationRun], runs: dict[str, list[EvaluationRun]]) -> list[tuple[str | float, ...]]:
-    """A row for each variant: its means, what is lost against the whole, and in how many runs it shows."""
+    """Return a row for each variant: means, loss against the complete tracker, and number of different runs."""
     return [
         (name, *means(found), spread(found), *difference(whole, found), changed(whole, found))
         for name, found in runs.items()
@@ -83,7 +83,7 @@ def beside(whole: list[EvaluationRun], runs: dict[str, list[EvaluationRun]]) -> 
 if __name__ == "__main__":
     parser = accuracy_command(__doc__, starts=5)
     parser.add_argument(
-        "--only", nargs="+", metavar="WORD", help="leave out only ingredients whose name has one of these words"
+        "--only", nargs="+", metavar="WORD", help="only ingredients with one of these words in the name"
     )
     options = parser.parse_args()
     publish(figures(options), options)

@@ -1,4 +1,4 @@
-"""Accuracy of several settings, or trackers, over the same sequences and starts."""
+"""Compares the accuracy of several settings or trackers over the same sequences and starts."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from catstream.settings import Settings
 
 __all__ = ["accuracy_command", "changed", "compared", "difference", "means", "videos"]
 
-#: What `means` gives, as headings.
+#: Headings for the values of `means`.
 MEANS = ("AUC", "success", "precision")
 
 
 def accuracy_command(about: str | None, starts: int = 1, *, kept: bool = True) -> argparse.ArgumentParser:
-    """The options of a benchmark that follows many sequences."""
+    """Return a parser with the options of a benchmark over many sequences."""
     parser = command(about)
     parser.add_argument(
-        "--starts", type=int, default=starts, help="frames of each to start from (default: %(default)s)"
+        "--starts", type=int, default=starts, help="number of start frames of each sequence (default: %(default)s)"
     )
-    parser.add_argument("--frames", type=int, help="of each sequence, the first ones (default: all)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once (default: %(default)s)")
+    parser.add_argument("--frames", type=int, help="number of frames of each sequence (default: all)")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes (default: %(default)s)")
     if kept:
-        parser.add_argument("--output", type=Path, help="folder that keeps runs: finished ones are not run again")
+        parser.add_argument("--output", type=Path, help="folder for the runs; complete runs are not repeated")
     return parser
 
 
 def videos(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
-    """The sequences to follow, those whose name begins so, cut to the first `--frames`."""
+    """Return the sequences whose names begin with `prefix`, cut to the first `--frames`."""
     return [replace(found, boxes=found.boxes[: options.frames]) for found in sequences(options, prefix)]
 
 
 def compared(
     options: argparse.Namespace, sequences: list[Sequence], variants: dict[str, Settings]
 ) -> dict[str, list[EvaluationRun]]:
-    """Runs of catstream with each of several settings, by their name, in the same order in each."""
+    """Run catstream with each of several settings; return the runs by name, in the same order for each."""
     return {
         name: evaluate(
             sequences,
@@ -63,18 +63,18 @@ def compared(
 
 
 def means(runs: Iterable[EvaluationRun]) -> tuple[float, float, float]:
-    """AUC, success and precision, over the starts of each sequence and then over the sequences."""
+    """Return the means of AUC, success and precision over the starts of each sequence, then over the sequences."""
     rows = rows_of(runs)
     return tuple(fmean(getattr(row, measure.lower()) for row in rows) for measure in MEANS)
 
 
 def spread(runs: Iterable[EvaluationRun]) -> float:
-    """Standard deviation of the AUC over the starts of a sequence, the mean over the sequences."""
+    """Return the standard deviation of the AUC over the starts of a sequence, averaged over the sequences."""
     return fmean(row.auc_spread for row in rows_of(runs))
 
 
 def difference(runs: list[EvaluationRun], others: list[EvaluationRun]) -> tuple[float, float]:
-    """Mean difference of AUC over the sequences, and its standard error: above twice that it is hardly chance.
+    """Return the mean difference of AUC over the sequences, and its standard error.
 
     Starts of one sequence are alike: they count as one.
     """
@@ -84,6 +84,6 @@ def difference(runs: list[EvaluationRun], others: list[EvaluationRun]) -> tuple[
 
 
 def changed(runs: list[EvaluationRun], others: list[EvaluationRun]) -> int:
-    """How many runs have another box anywhere."""
+    """Return the number of runs with any different box."""
     pairs = zip(runs, others, strict=True)
     return sum(not np.array_equal(run.boxes, other.boxes, equal_nan=True) for run, other in pairs)

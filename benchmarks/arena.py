@@ -1,4 +1,4 @@
-"""A pipeline whose processes, links, disk and clock can be made to fail, each on a loopback address of its own.
+"""A pipeline with injectable faults of processes, links, disk and clock; each process has its own loopback address.
 
 The three processes run as on three hosts: 127.0.0.1, .2 and .3. Between them are links, TCP proxies that can be
 cut and slowed. Who dies is started again at once, as systemd or docker would do it; the arena itself is the owner,
@@ -34,20 +34,20 @@ from catstream.wire.newest import Subscriber
 
 __all__ = ["HOSTS", "LINKS", "Arena", "Link", "small_disk"]
 
-#: The address of each process; the owner of the tracks is on the detector's.
+#: Address of each process; the consumer of the tracks has that of the detector.
 HOSTS = {"compressor": "127.0.0.1", "trainer": "127.0.0.2", "detector": "127.0.0.3"}
 
-#: Channel -> (who listens, who connects).
+#: Channel -> (process that listens, process that connects).
 LINKS = {
     "features": ("compressor", "detector"),
     "samples": ("compressor", "trainer"),
     "models": ("trainer", "detector"),
 }
 
-_PATIENCE_SECONDS = 120.0  # without a track, after which the run counts as stuck
-_DISK = "128m"  # of the small disk: a few checkpoints, which are written anew beside the old one
-#: What a process finds as `sitecustomize`: its wall clock is off by the seconds in a file. Clocks that only run
-#: forward (time.monotonic, ZeroMQ's own) go on, as they do when an administrator or NTP sets the clock.
+_PATIENCE_SECONDS = 120.0  # the run counts as stuck after this time without a track
+_DISK = "128m"  # size of the small disk: a few checkpoints, as a new one is written before the old one is removed
+#: The module `sitecustomize` of each process: it shifts the wall clock by the seconds in a file. Monotonic clocks are
+#: unchanged, as they are if an administrator or NTP sets the clock.
 _CLOCK = """
 import os, time
 _true = time.time
@@ -78,16 +78,16 @@ class Link:
         self._thread.start()
 
     def cut(self) -> None:
-        """Break all connections, and let none through until `mend`."""
+        """Break all connections, and accept none until `mend`."""
         self._up = False
         self._loop.call_soon_threadsafe(self._break)
 
     def slow(self, seconds: float) -> None:
-        """Hold each piece of up to 64 KiB up for so long."""
+        """Delay each piece of up to 64 KiB by this time."""
         self._delay = seconds
 
     def mend(self) -> None:
-        """All through, without delay."""
+        """Forward everything without delay."""
         self._up, self._delay = True, 0.0
 
     def close(self) -> None:
@@ -117,7 +117,7 @@ class Link:
                 writers.add(forth)
                 self._writers |= writers
                 await asyncio.gather(self._pass(reader, forth), self._pass(other, writer))
-        except OSError:  # nobody listens there, or one side is gone
+        except OSError:  # nothing listens there, or one side has disconnected
             pass
         finally:
             for one in writers:
@@ -185,7 +185,7 @@ class Arena:
         self._stack.close()
 
     def turn(self, seconds: float = 0.01) -> None:
-        """Take the next track, and start again who died.
+        """Receive the next track, and restart processes that died.
 
         Raises
         ------
@@ -203,7 +203,9 @@ class Arena:
                 self._results.acknowledge(Position(message.seq))
                 self.end = message
         elif monotonic() - self._heard > _PATIENCE_SECONDS:
-            raise ServiceError(f"no track came for {_PATIENCE_SECONDS:.0f} s after {len(self.tracks)}: {self.words()}")
+            raise ServiceError(
+                f"no track arrived for {_PATIENCE_SECONDS:.0f} s after {len(self.tracks)}: {self.words()}"
+            )
         for name, process in self._processes.items():
             code = process.poll()
             if code == REFUSED:
@@ -213,37 +215,37 @@ class Arena:
                 self._start(name)
 
     def until(self, done: Callable[[], bool]) -> None:
-        """Turn until something is so, or all is over."""
+        """Call `turn` until a condition is true or the run has ended."""
         while self.end is None and not done():
             self.turn()
 
     def run(self, seconds: float) -> None:
-        """Turn for a while."""
+        """Call `turn` for some seconds."""
         over = monotonic() + seconds
         self.until(lambda: monotonic() >= over)
 
     def finish(self) -> None:
-        """Turn until the stream has ended, and all processes with it."""
+        """Call `turn` until the stream and all processes have ended."""
         self.until(lambda: False)
         over = monotonic() + _PATIENCE_SECONDS
         while any(process.poll() is None for process in self._processes.values()) and monotonic() < over:
             self.turn()
 
     def taught(self) -> bool:
-        """Whether a model came since this was last asked."""
+        """Return whether a model arrived since the last call."""
         return bool(self._models.receive_all())
 
     def signal(self, name: str, number: int) -> None:
-        """Send one to a process, where it runs."""
+        """Send a signal to a process if it runs."""
         with suppress(ProcessLookupError):
             self._processes[name].send_signal(number)
 
     def set_clock(self, seconds: float) -> None:
-        """Put the wall clock of all processes wrong by so much."""
+        """Shift the wall clock of all processes by some seconds."""
         self._clock.write_text(str(seconds))
 
     def words(self) -> str:
-        """The last line that each process logged."""
+        """Return the last log line of each process."""
         logs = {name: self._folder / f"{name}.log" for name in NAMES}
         lines = {name: log.read_text(errors="replace").strip().splitlines() for name, log in logs.items()}
         return "; ".join(f"{name}: {said[-1] if said else 'nothing'}" for name, said in lines.items())
@@ -273,7 +275,7 @@ class Arena:
 
 @contextmanager
 def small_disk(folder: Path) -> Iterator[Path]:
-    """A file system that is soon full, mounted on a folder; needs root.
+    """Mount a small file system on a folder; needs root.
 
     Raises
     ------
@@ -292,7 +294,7 @@ def small_disk(folder: Path) -> Iterator[Path]:
 
 
 def _free_port() -> int:
-    """The first of enough ports in a row that are free on all hosts."""
+    """Return the first of enough consecutive ports that are free on all hosts."""
     span = max(channel.port + len(channel.senders) for channel in CHANNELS.values())
     for first in range(21000 + os.getpid() % 500 * 20, 32000, span):
         with ExitStack() as stack, suppress(OSError):
@@ -300,4 +302,4 @@ def _free_port() -> int:
                 for port in range(first, first + span):
                     stack.enter_context(socket.socket()).bind((host, port))
             return first
-    raise ServiceError("there are no free ports on this machine")
+    raise ServiceError("there are not enough consecutive free ports on this machine")

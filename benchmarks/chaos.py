@@ -1,4 +1,4 @@
-"""Whether anything is lost when anything fails: a seeded random schedule of faults on a running pipeline.
+"""Injects a random schedule of faults into a running pipeline, and checks that no track and no row is lost.
 
 Processes are killed (kill -9) and frozen (SIGSTOP), links cut and slowed, the disk filled, the clock set wrong, one
 fault after the other. In lockstep, all that was sent must be in the trees exactly once, and the trees be those of a
@@ -35,10 +35,10 @@ from catstream.settings import Settings
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 
-CALM = (1, 6)  # frames from one recovery to the next fault
-LAST = 20  # frames at the end without faults: who has ended well is not started again
-SECONDS = (0.1, 1.0)  # that a freeze, a cut, a slow link or a full disk lasts
-DELAY = (0.005, 0.05)  # of each 64 KiB on a slow link
+CALM = (1, 6)  # frames between a recovery and the next fault
+LAST = 20  # frames without faults at the end, because a process that has ended normally is not restarted
+SECONDS = (0.1, 1.0)  # duration of a freeze, a cut, a slow link or a full disk
+DELAY = (0.005, 0.05)  # delay of each 64 KiB on a slow link
 HOUR = 3600.0
 FULL = "disk full"
 RUNS = {"lockstep": Settings(run={"lockstep": True}), "default": Settings()}
@@ -91,7 +91,7 @@ def jump(arena: Arena, random: np.random.Generator) -> None:
     arena.set_clock(random.uniform(-HOUR, HOUR))
 
 
-#: Kinds of fault; how often each comes beside the others.
+#: Kinds of faults, and their relative frequencies.
 FAULTS: dict[str, tuple[Fault, float]] = {
     "kill -9 detector": (kill("detector"), 3),
     "kill -9 compressor": (kill("compressor"), 3),
@@ -107,7 +107,7 @@ FAULTS: dict[str, tuple[Fault, float]] = {
 
 @dataclass(slots=True)
 class Ordeal:
-    """What a run through faults came to.
+    """The results of a run with faults.
 
     recovery  of each kind of fault: seconds from its end until all goes on
     tracks    of each frame
@@ -156,13 +156,13 @@ def long(sequence: Sequence, frames: int) -> tuple[str, np.ndarray]:
 
 
 def schedule(cycles: int, seed: int) -> list[str]:
-    """Names of as many faults, drawn anew for each seed."""
+    """Return the names of the faults, drawn from the seed."""
     share = np.array([often for _, often in FAULTS.values()])
     return [str(name) for name in np.random.default_rng(seed).choice(list(FAULTS), cycles, p=share / share.sum())]
 
 
 def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: int = 0) -> Ordeal:
-    """Follow a source to its end, through some faults; progress is told on stderr.
+    """Track a source to its end with some faults; progress is printed to stderr.
 
     The disk is a small one where it is to be filled, and these faults are left out where that cannot be mounted.
 
@@ -186,7 +186,7 @@ def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: i
         for number, name in enumerate(faults, start=1):
             further(arena, int(random.integers(*CALM)))
             if len(arena.tracks) > frames - LAST:
-                raise ServiceError(f"the video is over before fault {number} of {len(faults)}: take a longer one")
+                raise ServiceError(f"the video ends before fault {number} of {len(faults)}: use a longer one")
             arena.taught()
             FAULTS[name][0](arena, random)
             begin = monotonic()
@@ -202,18 +202,18 @@ def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: i
 
 
 def learned(state: Path, settings: Settings) -> Compressor:
-    """From the newest checkpoint in a folder; ValueError where there is none yet."""
+    """Load the newest checkpoint in a folder. Raises ValueError if there is none yet."""
     return Compressor.load(max(state.rglob("*.safetensors"), key=lambda file: file.stat().st_mtime_ns), settings)
 
 
 def further(arena: Arena, frames: int) -> None:
-    """Until so many frames more were followed."""
+    """Wait until a number of further frames were tracked."""
     goal = len(arena.tracks) + frames
     arena.until(lambda: len(arena.tracks) >= goal)
 
 
 def undisturbed(source: str, box: Box) -> tuple[list[Track], Compressor]:
-    """Tracks of a run in one process, and what it learned."""
+    """Return the tracks and the compressor of a run in one process."""
     tracker, tracks = Tracker(), []
     with open_source(source) as frames:
         for frame in frames:
@@ -226,23 +226,23 @@ def undisturbed(source: str, box: Box) -> tuple[list[Track], Compressor]:
 
 
 def identical(run: Ordeal, calm: tuple[list[Track], Compressor]) -> bool:
-    """Whether two runs gave the same tracks, and the same trees bit for bit."""
+    """Return whether two runs gave the same tracks, and the same trees bit for bit."""
     return run.tracks == calm[0] and fingerprint(run.learned) == fingerprint(calm[1])
 
 
 def boxes(tracks: list[Track]) -> np.ndarray:
-    """A row a frame, NaN where absent."""
+    """Return the boxes of tracks, one row for each frame, NaN if the object is absent."""
     return np.array([track.box or (np.nan,) * 4 for track in tracks])
 
 
 def fingerprint(compressor: Compressor) -> list[tuple[object, object]]:
-    """All that its trees hold, as bytes."""
+    """Return the content of the trees as bytes."""
     states = [tree.state() for tree in compressor.trees.values()]
     return [(facts, {name: (array.shape, array.tobytes()) for name, array in own.items()}) for own, facts in states]
 
 
 def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, float, float, float]]:
-    """A row for each kind of fault, and one for all."""
+    """Return a row for each kind of fault, and one for all."""
     everything = [seconds for times in recovery.values() for seconds in times]
     for name, times in [*sorted(recovery.items()), ("all", everything)]:
         yield name, len(times), *map(float, np.quantile(times, [0.5, 0.99, 1]))
@@ -250,9 +250,9 @@ def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, floa
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--cycles", type=int, default=200, help="faults (default: %(default)s)")
-    parser.add_argument("--run", choices=list(RUNS), help="only this one of the two")
-    parser.add_argument("--seed", type=int, default=0, help="of the schedule (default: %(default)s)")
+    parser.add_argument("--cycles", type=int, default=200, help="number of faults (default: %(default)s)")
+    parser.add_argument("--run", choices=list(RUNS), help="only this one of the two runs")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the schedule (default: %(default)s)")
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # the small disk is taken away then, too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the small disk is unmounted
     publish(figures(options), options)

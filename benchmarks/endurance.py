@@ -1,4 +1,4 @@
-"""Whether the pipeline slows down or grows: 20,000 frames and more through the real processes.
+"""Measures whether the pipeline slows down or its memory grows over 20,000 frames or more.
 
 TLD_01_david, forwards and backwards again and again, so that nothing jumps. Both medians are over one whole
 such turn, so that the same images are compared.
@@ -41,7 +41,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def looped(sequence: Sequence, order: np.ndarray) -> Path:
-    """A video of the sequence's frames in some order."""
+    """Write a video of the frames of a sequence in a given order."""
     images = list(sequence.frames())
     height, width = images[0].shape[:2]
     path = scratch() / "loop.mp4"
@@ -52,13 +52,13 @@ def looped(sequence: Sequence, order: np.ndarray) -> Path:
 
 
 def around(journey: Journey, frame: int, turn: int) -> float:
-    """Median milliseconds a frame over a turn, as far as there are frames before the given one."""
+    """Return the median milliseconds per frame over the frames before a given one, at most one turn."""
     begin = max(frame - turn // 2, 0)
     return float(np.median(journey.milliseconds[begin : begin + turn]))
 
 
 def memory(journey: Journey, early: int) -> Iterator[tuple[str, float, float, float]]:
-    """Resident megabytes of each process: early, last and most."""
+    """Return the resident megabytes of each process: early, last and maximum."""
     for name, looks in journey.looks.items():
         megabytes = [look.megabytes for look in looks]
         first = next(look.megabytes for look in looks if look.frame >= early)
@@ -67,7 +67,7 @@ def memory(journey: Journey, early: int) -> Iterator[tuple[str, float, float, fl
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--frames", type=int, default=20_000, help="at least as many (default: %(default)s)")
+    parser.add_argument("--frames", type=int, default=20_000, help="minimum number of frames (default: %(default)s)")
     parser.add_argument("--plot", type=Path, default=Path("out/endurance.png"), help="(default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)

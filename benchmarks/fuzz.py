@@ -1,4 +1,4 @@
-"""Hostile bytes: a million inputs for each decoder, led by coverage, each with a limit of time and of memory.
+"""Coverage-guided fuzzing: a million inputs for each decoder, with limits on the time and memory of each input.
 
 Each decoder has a process of its own under atheris (libFuzzer), which begins with good messages or files and changes
 them where that leads somewhere new. An input is taken, or refused by the error that is meant for it. Another error,
@@ -37,20 +37,20 @@ with atheris.instrument_imports(include=["catstream"]):
     from catstream.wire.codec import KINDS, decode, encode
     from catstream.wire.keys import Keys, create
 
-SECONDS = 5  # an input may take
-MEGABYTES = 64  # resident memory may grow by
-LONGEST = 4096  # bytes of an input, or as long as the longest seed
+SECONDS = 5  # time limit of an input
+MEGABYTES = 64  # limit of the growth of resident memory
+LONGEST = 4096  # maximum length of an input, unless a seed is longer
 SETTINGS = Settings(coreset={"size": 2})
 
 COLUMNS = ("decoder", "inputs", "taken", "refused", "inputs a second", "MB more", "crashes", "hangs")
 
 
 class Decoder:
-    """What takes bytes from outside.
+    """A decoder of untrusted bytes.
 
     take   decodes an input
-    error  what it refuses one with
-    seeds  good inputs
+    error  exception by which it rejects an input
+    seeds  valid inputs
     """
 
     def __init__(self, take: Callable[[bytes], Any], error: type[CatstreamError], *seeds: bytes) -> None:
@@ -58,7 +58,7 @@ class Decoder:
 
 
 def message(kind: type, full: bool, d: int = 5) -> Any:
-    """A good message of a kind, made from its schema.
+    """Return a valid message of a kind, made from its schema.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def message(kind: type, full: bool, d: int = 5) -> Any:
 
 
 def value(field: Field, full: bool, d: int) -> Any:
-    """A good value of a field."""
+    """Return a valid value of a field."""
     if field.values is not None:
         named = field.limit(Named) or Named({"sent": 0, "stored": 0})
         names = [name for name in named.columns if full or name in named.required]
@@ -96,7 +96,7 @@ def value(field: Field, full: bool, d: int) -> Any:
 
 
 def decoders(folder: Path) -> dict[str, Decoder]:
-    """All that take bytes from outside: each kind of message, and each kind of file.
+    """Return all decoders of untrusted bytes: each kind of message, and each kind of file.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
 
 
 def forged(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
-    """Read a file as if its checksum fits: who writes one on purpose sees to that."""
+    """Return a reader that ignores checksums, because an attacker writes correct ones."""
 
     def reading(path: Path) -> None:
         with patch.object(storage, "_checksum", lambda *_: Anything()):
@@ -166,14 +166,14 @@ def forged(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
 
 
 class Anything:
-    """Equal to all."""
+    """Compares equal to everything."""
 
     def __ne__(self, _: object) -> bool:
         return False
 
 
 def filed(path: Path, read: Callable[[Path], Any], error: type[CatstreamError], seed: bytes) -> Decoder:
-    """A decoder of what is in a file."""
+    """Return a decoder for the content of a file."""
     path.touch(mode=0o600)
 
     def take(data: bytes) -> None:
@@ -184,7 +184,7 @@ def filed(path: Path, read: Callable[[Path], Any], error: type[CatstreamError], 
 
 
 class Trial:
-    """One decoder, and the count of what became of its inputs; in a process of its own.
+    """Runs one decoder in a process of its own, and counts accepted and rejected inputs.
 
     totals : file that holds the count, written now and then
     """
@@ -211,7 +211,7 @@ class Trial:
 
 
 def trial(name: str, inputs: int, folder: Path) -> None:
-    """Be the process of one decoder; does not return."""
+    """Run the process of one decoder; does not return."""
     decoder = decoders(folder)[name]
     corpus = folder / "corpus"
     corpus.mkdir()
@@ -256,8 +256,10 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--inputs", type=int, default=1_000_000, help="for each decoder (default: %(default)s)")
-    parser.add_argument("--only", nargs="*", metavar="NAME", help="these decoders")
+    parser.add_argument(
+        "--inputs", type=int, default=1_000_000, help="number of inputs for each decoder (default: %(default)s)"
+    )
+    parser.add_argument("--only", nargs="*", metavar="NAME", help="only these decoders")
     parser.add_argument("--trial", metavar="NAME", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()

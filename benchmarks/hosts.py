@@ -1,4 +1,4 @@
-"""Hosts that are network namespaces, joined by a bridge in one of their own: no packet leaves this machine."""
+"""Simulated hosts: network namespaces on this machine, connected by a bridge in a namespace of its own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Hosts"]
 
 
 class Hosts:
-    """Some hosts on one network, 10.77.0.1 and so on, gone when this is closed; needs root and Debian's iproute2.
+    """Hosts on one network, 10.77.0.1 and so on, which are removed on close; needs root and Debian's iproute2.
 
     Raises
     ------
@@ -40,7 +40,7 @@ class Hosts:
         self._stack.close()
 
     def start(self, name: str, *command: object, **options: Any) -> subprocess.Popen[str]:
-        """Start a command on a host; it is killed with the hosts, if it runs for so long."""
+        """Start a command on a host; it is killed when the hosts are removed."""
         words = ["ip", "netns", "exec", self._named(name), *map(str, command)]
         process = subprocess.Popen(words, stdin=subprocess.DEVNULL, text=True, **options)
         self._stack.enter_context(process)
@@ -49,7 +49,7 @@ class Hosts:
 
     @contextmanager
     def cut_off(self, name: str) -> Iterator[None]:
-        """No packet comes from a host, or to it, meanwhile; nobody is told."""
+        """Drop all packets from and to a host inside a `with`, without closing connections."""
         port = ["-n", self._named("switch"), "link", "set", name]
         self._ip(*port, "down")
         try:
@@ -58,7 +58,7 @@ class Hosts:
             self._ip(*port, "up")
 
     def power_off(self, name: str, *processes: subprocess.Popen[str]) -> None:
-        """A host goes down with its processes and all that its kernel knew, and comes up again; nobody is told."""
+        """Restart a host: its processes and the state of its connections are lost, without notice to other hosts."""
         with self.cut_off(name):
             for process in processes:
                 process.kill()
@@ -86,7 +86,7 @@ class Hosts:
     def _ip(self, *words: str) -> None:
         program = shutil.which("ip", path=os.pathsep.join([os.environ["PATH"], "/usr/sbin"]))
         if program is None:
-            raise OSError("there is no command ip here: apt-get install iproute2")
+            raise OSError("the command ip is not installed: apt-get install iproute2")
         done = subprocess.run([program, *words], capture_output=True, text=True, check=False)
         if done.returncode:
             raise OSError(f"ip {' '.join(words)}: {done.stderr.strip()}")

@@ -1,4 +1,4 @@
-"""A run of the real pipeline, three processes and all, watched from outside."""
+"""Runs the real pipeline of three processes, and measures time and memory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Journey", "draw", "travel"]
 
 
 class Look(NamedTuple):
-    """A process at one moment: resident megabytes, and seconds of a processor that it has used."""
+    """Resident memory in megabytes and processor time in seconds of a process at one moment."""
 
     frame: int
     megabytes: float
@@ -29,7 +29,7 @@ class Look(NamedTuple):
 
 @dataclass(slots=True)
 class Journey:
-    """What was seen of one run.
+    """The measurements of one run.
 
     boxes    a row a frame, x, y, w, h in pixels; NaN where absent
     moments  seconds from the start to the track of each frame
@@ -42,12 +42,12 @@ class Journey:
 
     @property
     def rate(self) -> float:
-        """Frames a second from the first track to the last, decoding included."""
+        """Frames per second from the first track to the last, including decoding."""
         return (len(self.moments) - 1) / (self.moments[-1] - self.moments[0])
 
     @property
     def milliseconds(self) -> np.ndarray:
-        """Between each track and the one before it, float64 (frames - 1,)."""
+        """Seconds between consecutive tracks, float64 (frames - 1,)."""
         return np.diff(self.moments) * 1000
 
     def work(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +62,7 @@ class Journey:
 def travel(
     source: str, box: Sequence[float], settings: Settings, watch: int = 250, part: slice = ALL_FRAMES
 ) -> Journey:
-    """Run a pipeline to the end of its source, or a part of it; look at the processes each `watch` frames."""
+    """Run a pipeline over its source or a part of it; measure the processes every `watch` frames."""
     journey, begin = Journey(), perf_counter()
     with Pipeline(source, box, settings, part=part) as pipeline:
         for track in pipeline:
@@ -70,7 +70,7 @@ def travel(
             journey.boxes.append(track.box or (np.nan,) * 4)
             if track.frame % watch == 0:
                 for name, pid in pipeline.pids.items():
-                    with suppress(psutil.Error):  # it has just ended
+                    with suppress(psutil.Error):  # the process has just ended
                         process = psutil.Process(pid)
                         seconds = sum(process.cpu_times()[:2])
                         look = Look(track.frame, process.memory_info().rss / 1e6, seconds)
@@ -79,7 +79,7 @@ def travel(
 
 
 def draw(journeys: dict[str, Journey], file: Path, blocks: int = 80) -> None:
-    """Plot against frames: time a frame, the median of each block; what each process took for one; and memory."""
+    """Plot against frames: median time per frame in blocks, processor time of each process per frame, and memory."""
     import matplotlib
 
     matplotlib.use("agg")

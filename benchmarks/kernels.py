@@ -1,4 +1,4 @@
-"""Milliseconds that the parts of the algorithm take, one by one, on one core."""
+"""Times of the parts of the algorithm in milliseconds, on one core."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def milliseconds(call: Callable[[], object], runs: int) -> float:
-    """Median time of a call, after one to warm up."""
+    """Return the median time of a call, after one warm-up call."""
     call()
     times = []
     for _ in range(runs):
@@ -45,7 +45,7 @@ def milliseconds(call: Callable[[], object], runs: int) -> float:
 
 
 def detection(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Of one image of 640x480 pixels."""
+    """Time the detection in one image of 640x480 pixels."""
     image = next(sequence.frames())
     cells = Cells.of(image)
     weights = cells.row(0, 0)
@@ -56,7 +56,7 @@ def detection(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:
 
 
 def learning(sequence: Sequence, sizes: Iterable[int]) -> Iterator[tuple[str, Callable[[], object]]]:
-    """From what was learned of a whole video, at each coreset size."""
+    """Time the training on the coreset of a whole video, for each coreset size."""
     for n in sizes:
         sample = sample_of(sequence, n)
         rows = np.vstack([sample.trees["object"].rows, sample.trees["background"].rows])[: 2 * n]
@@ -67,7 +67,7 @@ def learning(sequence: Sequence, sizes: Iterable[int]) -> Iterator[tuple[str, Ca
 
 
 def sample_of(sequence: Sequence, n: int) -> Sample:
-    """What the trees hold once the tracker has followed the whole sequence."""
+    """Return the sample of the trees after tracking the whole sequence."""
     tracker = Tracker(Settings(coreset={"size": n}))
     for row, image in enumerate(sequence.frames()):
         if row == 0:
@@ -80,7 +80,7 @@ def sample_of(sequence: Sequence, n: int) -> Sample:
 
 
 def motion() -> Iterator[tuple[str, Callable[[], object]]]:
-    """Of a random walk."""
+    """Time the motion model on a random walk."""
     for m in (64, 500):
         centres = np.random.default_rng(0).normal(size=(m, 2)).cumsum(axis=0) + 200
         yield f"EM of the Kalman filter, {m} centres", lambda centres=centres: learn_motion(centres)
@@ -88,6 +88,6 @@ def motion() -> Iterator[tuple[str, Callable[[], object]]]:
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--runs", type=int, default=21, help="of each step (default: %(default)s)")
+    parser.add_argument("--runs", type=int, default=21, help="number of runs of each step (default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)

@@ -30,7 +30,7 @@ Record = Mapping[str, Any]
 
 
 class Shown(NamedTuple):
-    """A record on the page: its file in `benchmarks/results`, and the tables that are shown of it."""
+    """A record on the page: its file in `benchmarks/results`, and the tables made from it."""
 
     record: str
     tables: Callable[[Record], Iterable[Table]]
@@ -45,12 +45,12 @@ class Section(NamedTuple):
 
 
 def records() -> dict[str, Record]:
-    """All of them, by name."""
+    """Return all records by name."""
     return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(RECORDS.glob("*.json"))}
 
 
 def written(found: Mapping[str, Record]) -> str:
-    """The page."""
+    """Return the text of the page."""
     parts = ["# Results", _filled(_HEAD)]
     for section in SECTIONS:
         blocks = [_block(found[name], tables) for name, tables in section.parts]
@@ -60,12 +60,12 @@ def written(found: Mapping[str, Record]) -> str:
 
 
 def shown() -> set[str]:
-    """Names of the records that the page shows."""
+    """Return the names of the records on the page."""
     return {part.record for section in SECTIONS for part in section.parts}
 
 
 def readme(found: Mapping[str, Record], page: str) -> str:
-    """README with the figures between its marks."""
+    """Return the README with the figures between its marks."""
     return _MARKS.sub(lambda marks: f"{marks[1]}{_figures(found)}\n{marks[2]}", page)
 
 
@@ -77,7 +77,7 @@ def _block(record: Record, tables: Callable[[Record], Iterable[Table]]) -> str:
 
 
 def of(number: int = 0, *, columns: Sequence[str] = (), without: str = "") -> Callable[[Record], Iterator[Table]]:
-    """A table of a record: all its columns or these, and the rows that do not begin with a pattern."""
+    """Return a function that selects table `number` of a record, with these columns, without the rows of a pattern."""
 
     def chosen(record: Record) -> Iterator[Table]:
         table = record["tables"][number]
@@ -91,7 +91,7 @@ def of(number: int = 0, *, columns: Sequence[str] = (), without: str = "") -> Ca
 
 
 def strongest(count: int) -> Callable[[Record], Iterator[Table]]:
-    """The ingredients whose loss costs most, between nothing left out and the paper's tracker."""
+    """Select the ingredients that matter most, with the complete tracker and the paper's tracker."""
 
     def chosen(record: Record) -> Iterator[Table]:
         columns = ("variant", "AUC", "success", "AUC lost", "± standard error", "runs changed")
@@ -105,7 +105,7 @@ def strongest(count: int) -> Callable[[Record], Iterator[Table]]:
 
 
 def faults(record: Record) -> Iterator[Table]:
-    """Of the chaos: all kinds of faults together."""
+    """Summarise the chaos record over all kinds of faults."""
     recovered = {row[0]: row[3:] for row in record["tables"][0]["rows"] if row[1] == "all"}
     heads, rows = record["tables"][1]["columns"], record["tables"][1]["rows"]
     joined = [(*row, recovered[row[0]][0], recovered[row[0]][-1]) for row in rows]
@@ -113,7 +113,7 @@ def faults(record: Record) -> Iterator[Table]:
 
 
 def totals(record: Record) -> Iterator[Table]:
-    """Of the fuzzing: all decoders together."""
+    """Summarise the fuzzing record over all decoders."""
     (table,) = of()(record)
     inputs, taken, refused, _, memory, crashes, hangs = list(zip(*table.rows, strict=True))[1:]
     heads = ("decoders", "inputs", "taken", "refused", "most MB more", "crashes", "hangs")
@@ -123,14 +123,14 @@ def totals(record: Record) -> Iterator[Table]:
 
 
 def speeds(record: Record) -> Iterator[Table]:
-    """In a user's program, beside the other trackers, and against the size of the image."""
+    """Select the speed in a user's program, of the other trackers, and by size of the image."""
     for number, table in enumerate(record["tables"]):
         if table["title"] in _SPEEDS:
             yield from of(number, without=_SPEEDS[table["title"]])(record)
 
 
 def load(record: Record) -> Iterator[Table]:
-    """Of a load test: all its streams together."""
+    """Summarise a load test over all its streams."""
     streams, track, model = record["streams"], record["latency"]["track"], record["latency"]["model"]
     skipped = sum(stream["skipped"] for stream in streams) / sum(stream["frames"] for stream in streams)
     heads = (
@@ -150,7 +150,7 @@ def load(record: Record) -> Iterator[Table]:
 
 
 def limit(record: Record) -> Iterator[Table]:
-    """Of the search for the highest rate: the highest that held its limits, and the lowest that did not."""
+    """Select the highest rate that met the limits, and the lowest that did not."""
     held = [step for step in record["steps"] if not step["violations"]]
     broken = [step for step in record["steps"] if step["violations"]]
     bounds = [max(held, key=_due, default=None), min(broken, key=_due, default=None)]
@@ -167,7 +167,7 @@ def _due(step: Record) -> float:
 
 
 def groups(record: Record) -> Iterator[Table]:
-    """Accuracy: the mean over each group of sequences; and all of them, those that were tuned on beside the others."""
+    """Return the mean accuracy over each group of sequences: tuning set, others, and all."""
     trackers = list(record["mean"])
     rows = {(row["name"], row["tracker"]): row for row in record["sequences"]}
     names = list(dict.fromkeys(name for name, _ in rows))

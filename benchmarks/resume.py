@@ -1,4 +1,4 @@
-"""How a run goes on after everything was killed, as by a power cut, at random moments.
+"""Kills all processes of a run at random moments, as a power cut does, and checks that --resume continues the run.
 
 Again and again `catstream track` and all its processes get SIGKILL, once a random number of new rows has come, and
 `--resume` goes on. When all moments are through, the run goes on to its end.
@@ -26,7 +26,7 @@ from catstream.state import TREES
 from catstream.video.demo import write
 from catstream.video.results import read_tracks
 
-_REST = 200  # frames beyond the last kill: a fast pipeline goes on while a kill is on its way
+_REST = 200  # frames after the last kill: a fast pipeline continues until the kill takes effect
 TRACK = [sys.executable, "-P", "-c", "from catstream.cli import main; main()", "track"]
 
 
@@ -50,7 +50,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def watched(arguments: list[str], out: Path, rows: int | None) -> float:
-    """Run until more new rows have come, then kill it with its children; to the end where None.
+    """Run until a number of new rows are written, then kill the process and its children; if None, run to the end.
 
     Returns seconds to the first new row.
     """
@@ -73,14 +73,16 @@ def watched(arguments: list[str], out: Path, rows: int | None) -> float:
 
 
 def written(out: Path) -> int:
-    """Rows that there are."""
+    """Return the number of rows in the results."""
     return sum(max(table.read_text().count("\n") - 1, 0) for table in out.glob("*.csv"))
 
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--moments", type=int, default=20, help="how often all is killed (default: %(default)s)")
-    parser.add_argument("--rows", type=int, default=40, help="new rows before that, at most (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments (default: %(default)s)")
+    parser.add_argument("--moments", type=int, default=20, help="number of kills (default: %(default)s)")
+    parser.add_argument(
+        "--rows", type=int, default=40, help="maximum number of new rows before a kill (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random moments (default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)

@@ -1,4 +1,4 @@
-"""The videos that benchmarks run on: annotated sequences from a folder, or rendered ones."""
+"""The sequences of the benchmarks: annotated sequences from a folder, or rendered ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _QUICK_FRAMES = 8
 
 @cache
 def scratch() -> Path:
-    """A folder that is gone when the benchmark is."""
+    """Return a temporary folder that is removed when the benchmark ends."""
     folder = tempfile.TemporaryDirectory(prefix="catstream-benchmark-")
     atexit.register(folder.cleanup)
     return Path(folder.name)
@@ -27,14 +27,14 @@ def scratch() -> Path:
 
 @cache
 def rendered(frames: int, size: tuple[int, int] = demo.SIZE) -> Sequence:
-    """The demo's video, of any length and size, as a sequence."""
+    """Render the demo video, in any length and size, as a sequence."""
     folder = scratch() / f"demo-{size[0]}x{size[1]}-{frames}"
     demo.write(folder, frames, size)
     return find_sequences(folder)[0]
 
 
 def sequences(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
-    """Those in the folder of data whose name begins so; with --quick a few rendered frames instead.
+    """Return the sequences in the data folder whose names begin with `prefix`; with --quick, a few rendered frames.
 
     Raises
     ------
@@ -44,7 +44,9 @@ def sequences(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
     if options.quick:
         return [rendered(_QUICK_FRAMES, (320, 240))]
     if not options.data.is_dir():
-        raise VideoError(f"there are no sequences at {options.data}: give their folder with --data, or --quick")
+        raise VideoError(
+            f"there are no sequences at {options.data}: give a folder of sequences with --data, or use --quick"
+        )
     found = [sequence for sequence in find_sequences(options.data) if sequence.name.startswith(prefix)]
     if not found:
         raise VideoError(f"there is no sequence {prefix}* in {options.data}: give another --data")
@@ -52,12 +54,12 @@ def sequences(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
 
 
 def named(options: argparse.Namespace, name: str) -> Sequence:
-    """The one sequence of that name; where there is no folder of data, the demo's video stands in."""
+    """Return the sequence of this name, or the demo video if there is no data folder."""
     if options.quick or options.data.is_dir():
         return sequences(options, name)[0]
     return rendered(demo.FRAMES, (320, 240))
 
 
 def video(sequence: Sequence) -> str:
-    """What `catstream track` is given to follow it."""
+    """Return the source argument of `catstream track` for a sequence."""
     return str(sequence.path)

@@ -1,4 +1,5 @@
-"""Whether a compressor slows down or grows: a million messages of features into one, and some through the process.
+"""Measures whether the compressor slows down or its memory grows: a million features messages in one process,
+and some through the compressor process.
 
 The rows are real, cut by a detector that follows a video; each message draws a few of them anew, a little
 brighter or darker than they were. So few rows a message let a million of them pass in minutes; the law is in rows.
@@ -35,14 +36,14 @@ from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES
 from catstream.wire.endpoint import Endpoint, private_folder
 
-BLOCKS = 200  # the run is looked at so often
+BLOCKS = 200  # number of measurements
 GAIN = 0.02  # standard deviation of a drawn row's brightness
 
 COLUMNS = ("messages", "rows", "us a message", "nodes", "trees MB", "law MB", "resident MB", "handles", "disk MB")
 
 
 class Sight(NamedTuple):
-    """What was seen after some messages; megabytes are 10**6 bytes.
+    """The measurements after some messages; a megabyte is 10**6 bytes.
 
     messages, rows  taken so far, inserted into the four trees so far
     micros          microseconds of processor time a message since the sight before, reductions and samples included
@@ -65,7 +66,7 @@ class Sight(NamedTuple):
 
 
 class Stream:
-    """Messages without end, of rows that a detector cut from a video."""
+    """Makes an endless sequence of features messages from the rows of a video."""
 
     def __init__(self, sequence: Sequence, frames: int, settings: Settings) -> None:
         features = list(cut(sequence, frames, settings))
@@ -106,7 +107,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def cut(sequence: Sequence, frames: int, settings: Settings) -> Iterator[Features]:
-    """What the first frames of a sequence teach."""
+    """Return the features messages of the first frames of a sequence."""
     detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
     for number, image in zip(range(frames), sequence.frames(), strict=False):
         _, features = detector.step(image) if number else detector.init(image, Box(*sequence.boxes[0]))
@@ -116,7 +117,7 @@ def cut(sequence: Sequence, frames: int, settings: Settings) -> Iterator[Feature
 
 
 def alone(stream: Stream, messages: int, settings: Settings) -> list[Sight]:
-    """A compressor in this process; it is looked at, and saved, after each block."""
+    """Run a compressor in this process; measure and save it after each block."""
     compressor, me, file, sights = Compressor(settings), psutil.Process(), scratch() / "soak.safetensors", []
     block, busy = max(messages // BLOCKS, 1), 0.0
     for seq in range(1, messages + 1):
@@ -141,13 +142,13 @@ def alone(stream: Stream, messages: int, settings: Settings) -> list[Sight]:
 
 
 def law(tree: CoresetTree) -> float:
-    """Most bytes that a tree of so many rows may hold."""
+    """Return the maximum bytes of a tree of this number of rows."""
     nodes = math.log2(max(tree.rows_seen / tree.size, 1)) + 1
     return nodes * tree.width * (4 * tree.size + 8) + 4 * tree.size * tree.width
 
 
 def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int, float, float, int, float]]:
-    """The same through the compressor's process: a row for each fifth of the messages."""
+    """Measure the compressor process: a row for each fifth of the messages."""
     rows = []
     with private_folder() as folder:
         command = service_command("compressor")
@@ -162,8 +163,10 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
                 while not sender.send(message):
                     sender.poll(0.05)
                     if process.poll() is not None:
-                        raise ServiceError(f"the compressor ended with {process.returncode}: run it by hand to see why")
-                if seq == 1:  # it is imported by the time that it has answered
+                        raise ServiceError(
+                            f"the compressor ended with {process.returncode}: run it in a terminal to see why"
+                        )
+                if seq == 1:  # the imports are finished once the process has answered
                     wait(sender, 1)
                     begin = perf_counter()
                 if seq % part == 0:
@@ -178,7 +181,7 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
 
 
 def wait(sender: Sender, seq: int) -> None:
-    """Until a message is stored."""
+    """Wait until a message is stored."""
     while sender.stored < seq:
         sender.poll(0.05)
 
@@ -192,7 +195,7 @@ def doubling(sights: list[Sight]) -> Iterator[Sight]:
 
 
 def draw(sights: list[Sight], file: Path) -> None:
-    """Plot time a message, and memory beside its law, against messages; one above the other."""
+    """Plot time per message, and memory with its bound, against the number of messages."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -213,8 +216,15 @@ def draw(sights: list[Sight], file: Path) -> None:
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--messages", type=int, default=1_000_000, help="in one process (default: %(default)s)")
-    parser.add_argument("--through", type=int, default=50_000, help="through the process (default: %(default)s)")
+    parser.add_argument(
+        "--messages", type=int, default=1_000_000, help="number of messages in one process (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--through",
+        type=int,
+        default=50_000,
+        help="number of messages through the compressor process (default: %(default)s)",
+    )
     parser.add_argument("--plot", type=Path, default=Path("out/soak.png"), help="(default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)

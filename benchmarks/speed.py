@@ -1,4 +1,4 @@
-"""Speed beside OpenCV's trackers on the same frames in one run, and against the size of the image and of the coreset.
+"""Speed of catstream and OpenCV's trackers on the same frames, and by size of the image and of the coreset.
 
 CSRT and KCF come with the contrib modules of OpenCV 4: pip install "catstream[peers]".
 """
@@ -30,7 +30,7 @@ PEERS = ("csrt", "kcf", "mil")
 SIZES = ((320, 240), (640, 480), (960, 720), (1280, 720), (1920, 1080))
 CORESETS = (16, 32, 64, 128, 256, 512)
 
-#: A user's program. It prints frames per second without decoding, and a checksum of the boxes.
+#: Program of a user that prints frames per second without decoding, and a checksum of the boxes.
 PROGRAM = """
 import sys, time, zlib, cv2, catstream
 video, tracker, check, seconds = cv2.VideoCapture(sys.argv[1]), catstream.Tracker(), 0, 0.0
@@ -42,7 +42,7 @@ while (read := video.read())[0]:
     check = zlib.crc32(repr((ok, box)).encode(), check)
 print((tracker.track.seq - 1) / seconds, check)
 """
-#: Its environment: as it is, and with one thread from the start.
+#: Environments of the program: unchanged, and with one thread from the start.
 ENVIRONMENTS = {
     "none": {},
     "OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1": {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
@@ -54,7 +54,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield beside_peers(options)
     yield steps([named(options, "TLD_01_david")])
     sizes, modes, coresets, frames = SIZES, MODES, CORESETS, 300
-    if options.quick:  # one run of the pipeline has a figure for both tables
+    if options.quick:  # one run of the pipeline gives a figure for both tables
         sizes, modes, coresets, frames = ((640, 480),), ("local",), (Settings().coreset.size,), 8
     rows = [
         (f"{width}x{height}", *(rate(frames, (width, height), Settings(search={"mode": mode})) for mode in modes))
@@ -68,14 +68,14 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def own_program(options: argparse.Namespace) -> Table:
-    """The Tracker in a program of a user, which sets nothing, and the same with one thread from the start."""
+    """Measure the Tracker in a user's program with the default environment, and with one thread from the start."""
     frames, runs = (8, 1) if options.quick else (300, 5)
     sequence = rendered(frames, (352, 288))
     box = ",".join(map(str, sequence.boxes[0].tolist()))
     command = [sys.executable, "-P", "-c", PROGRAM, str(sequence.path / "demo.mp4"), box]
     plain = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     found: dict[str, list[tuple[float, str]]] = {name: [] for name in ENVIRONMENTS}
-    for _ in range(runs):  # turn about, so that other work on the machine slows both alike
+    for _ in range(runs):  # alternating, so that other load of the machine affects both alike
         for name, variables in ENVIRONMENTS.items():
             printed = subprocess.run(
                 command, env=plain | variables, capture_output=True, text=True, check=True
@@ -91,13 +91,13 @@ def own_program(options: argparse.Namespace) -> Table:
 
 
 def beside_peers(options: argparse.Namespace) -> Table:
-    """All trackers on all sequences, each alone on one core; the pipeline, and CSRT once more, on all cores."""
+    """Measure all trackers on all sequences on one core, and the pipeline and CSRT on all cores."""
     trackers, note = ["catstream"], "one core and no decoding, but for the three processes, which use all cores"
     for name in PEERS:
         try:
             Peer(name)
             trackers.append(name)
-        except SettingsError as error:  # says how to get it
+        except SettingsError as error:  # the message has the install command
             note += f"\n{error}"
     sequences = videos(options)
     journeys = [
@@ -131,19 +131,21 @@ def beside_peers(options: argparse.Namespace) -> Table:
 
 
 def together(runs: list[EvaluationRun]) -> float:
-    """Frames a second over all runs, the first frame of each apart."""
+    """Return the frames per second over all runs, without the first frame of each."""
     return sum(len(run.seconds) - 1 for run in runs) / sum(float(run.seconds[1:].sum()) for run in runs)
 
 
 @cache
 def rate(frames: int, size: tuple[int, int], settings: Settings) -> float:
-    """Frames a second of the pipeline on the rendered video."""
+    """Return the frames per second of the pipeline on the rendered video."""
     sequence = rendered(frames, size)
     return travel(video(sequence), sequence.boxes[0], settings).rate
 
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--frames", type=int, help="of each sequence beside the peers, the first ones (default: all)")
+    parser.add_argument(
+        "--frames", type=int, help="number of frames of each sequence for the comparison (default: all)"
+    )
     options = parser.parse_args()
     publish(figures(options), options)

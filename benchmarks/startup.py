@@ -1,4 +1,4 @@
-"""Seconds from the command `catstream track` to its first track, and to the first model that it learned.
+"""Seconds from the start of `catstream track` to its first track, and to the first trained model.
 
 Cold: the kernels have to be compiled first. Warm: they are in the cache, as from the second start on.
 """
@@ -21,7 +21,7 @@ from table import Table, command, publish
 from catstream.box import Box
 from catstream.errors import ServiceError
 
-CACHE = "NUMBA_CACHE_DIR"  # where compiled kernels are kept
+CACHE = "NUMBA_CACHE_DIR"  # folder of the compiled kernels
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
@@ -30,7 +30,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for kernels in ("warm",) if options.quick else ("cold", "warm"):
-            # Each cold start has a folder of its own for kernels, which the warm ones have the first of.
+            # Each cold start has an empty kernel folder of its own; the warm starts use the first of these folders.
             caches = [Path(folder, str(run) if kernels == "cold" else "0") for run in range(runs)]
             times = [start(video(sequence), box, {} if options.quick else {CACHE: str(cache)}) for cache in caches]
             first = [seconds for seconds, _ in times]
@@ -41,7 +41,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def start(source: str, box: Box, variables: dict[str, str]) -> tuple[float, float | None]:
-    """Seconds to the first track, and to the first of a learned model, None if the video ends before.
+    """Return the seconds to the first track, and to the first one with a trained model; None if the video ends before.
 
     The command is started with these environment variables on top of our own.
     """
@@ -59,12 +59,12 @@ def start(source: str, box: Box, variables: dict[str, str]) -> tuple[float, floa
             process.terminate()
             process.wait()
     if first is None:
-        raise ServiceError(f"catstream track {source} --box {box} gave no track: run it by hand to see why")
+        raise ServiceError(f"catstream track {source} --box {box} printed no track: run it in a terminal to see why")
     return first, learned
 
 
 def wait(process: subprocess.Popen[bytes], output: Path, version: int, begin: float) -> float | None:
-    """Seconds until a track with this version of the model, or a newer one, is in the results."""
+    """Return the seconds until a track with at least this model version is in the results."""
     running = True
     while running:
         running = process.poll() is None
@@ -75,13 +75,13 @@ def wait(process: subprocess.Popen[bytes], output: Path, version: int, begin: fl
 
 
 def versions(tracks: Path) -> list[int]:
-    """Model version of each whole row."""
+    """Return the model version of each complete row."""
     lines = tracks.read_text().split("\n")[1:-1] if tracks.exists() else []
     return [int(line.rsplit(",", 1)[1]) for line in lines]
 
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--runs", type=int, default=7, help="starts of each kind (default: %(default)s)")
+    parser.add_argument("--runs", type=int, default=7, help="number of starts of each kind (default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)

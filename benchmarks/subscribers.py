@@ -1,4 +1,4 @@
-"""What subscribers cost a pipeline: frames a second with many connected, some of them frozen, beside none connected.
+"""The cost of subscribers: frames per second with many subscribers, some of them frozen, and with none.
 
 All runs follow the same rendered video. The readers run where a core is idle: what is measured is the
 pipeline, not what readers do with a track.
@@ -26,12 +26,12 @@ from catstream.settings import Settings
 from catstream.wire.endpoint import private_folder
 
 SIZE = (320, 240)
-PAUSE_SECONDS = 2.0  # from one late joiner to the next
+PAUSE_SECONDS = 2.0  # between two late joiners
 
 
 @dataclass(slots=True)
 class Run:
-    """What was seen of one run.
+    """The measurements of one run.
 
     moments  seconds of each track
     memory   of each process: resident megabytes, some fifty times
@@ -50,7 +50,7 @@ class Run:
 
     @property
     def rate(self) -> float:
-        """Frames a second from the first track to the last."""
+        """Frames per second from the first track to the last."""
         return (len(self.moments) - 1) / (self.moments[-1] - self.moments[0])
 
 
@@ -59,7 +59,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     if options.quick:
         frames, readers, frozen, runs = 40, 2, 1, 1
     alone, beside = [], []
-    for _ in range(runs):  # in turn, so that a machine that gets slower does so for both
+    for _ in range(runs):  # alternating, so that other load of the machine affects both alike
         alone.append(travel(frames, 0, 0))
         beside.append(travel(frames, readers, frozen))
 
@@ -92,7 +92,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def travel(frames: int, readers: int, frozen: int) -> Run:
-    """Run a pipeline to the end of the video, with readers that attach as it starts."""
+    """Run a pipeline over the whole video, with subscribers that connect at its start."""
     sequence, run, ended = rendered(frames, SIZE), Run(), threading.Event()
     with private_folder() as folder, Subscribers(str(folder), readers, frozen=frozen) as group:
         late = threading.Thread(target=join, args=(str(folder), ended, run.joined))
@@ -116,14 +116,14 @@ def travel(frames: int, readers: int, frozen: int) -> Run:
 
 
 def look(run: Run, name: str, pid: int) -> None:
-    with suppress(psutil.NoSuchProcess):  # it has just ended
+    with suppress(psutil.NoSuchProcess):  # the process has just ended
         process = psutil.Process(pid)
         run.memory.setdefault(name, []).append(process.memory_info().rss / 1e6)
         run.work[name] = sum(process.cpu_times()[:2])
 
 
 def join(endpoint: str, ended: threading.Event, seconds: list[float]) -> None:
-    """Attach to the models again and again, and time how long the last one takes to come."""
+    """Subscribe to the models repeatedly, and measure the time until the last model arrives."""
     while not ended.is_set():
         begin = perf_counter()
         try:
@@ -131,16 +131,18 @@ def join(endpoint: str, ended: threading.Event, seconds: list[float]) -> None:
                 if next(models, None) is not None:
                     seconds.append(perf_counter() - begin)
         except SilenceError:
-            if not ended.is_set():  # else it came too late for the last word
+            if not ended.is_set():  # otherwise it connected after the end message
                 raise
         ended.wait(PAUSE_SECONDS)
 
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--frames", type=int, default=4_000, help="of each run (default: %(default)s)")
-    parser.add_argument("--readers", type=int, default=200, help="subscribers connected (default: %(default)s)")
-    parser.add_argument("--frozen", type=int, default=20, help="of them frozen (default: %(default)s)")
-    parser.add_argument("--runs", type=int, default=2, help="with and without each (default: %(default)s)")
+    parser.add_argument("--frames", type=int, default=4_000, help="frames of each run (default: %(default)s)")
+    parser.add_argument("--readers", type=int, default=200, help="number of subscribers (default: %(default)s)")
+    parser.add_argument("--frozen", type=int, default=20, help="number of those that are frozen (default: %(default)s)")
+    parser.add_argument(
+        "--runs", type=int, default=2, help="number of runs with and without subscribers (default: %(default)s)"
+    )
     options = parser.parse_args()
     publish(figures(options), options)

@@ -23,19 +23,19 @@ __all__ = ["Table", "command", "publish", "text"]
 
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")
-_PLACES = ("--json", "--data", "--output")  # options that say where something lies on this machine
+_PLACES = ("--json", "--data", "--output")  # options with paths of this machine
 
 Cell = str | int | float | None
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Figures that belong together.
+    """A table of figures.
 
-    title    what was measured
-    columns  headings, with their unit
-    rows     a cell a column; None where there is nothing to say
-    note     what has to be known to read them
+    title    measured quantity
+    columns  headings, with units
+    rows     one cell for each column; None for an empty cell
+    note     explanation of the figures
     """
 
     title: str
@@ -45,16 +45,16 @@ class Table:
 
 
 def command(about: str | None) -> argparse.ArgumentParser:
-    """The options that all benchmarks share."""
+    """Return a parser with the options of all benchmarks."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=_DATA, help="folder of annotated sequences (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures, and what made them, to a file")
-    parser.add_argument("--quick", action="store_true", help="a few rendered frames: shows that it runs, nothing else")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures and their provenance to a file")
+    parser.add_argument("--quick", action="store_true", help="a few rendered frames, to test that the benchmark runs")
     return parser
 
 
 def publish(tables: Iterable[Table], options: argparse.Namespace, settings: Settings | None = None) -> None:
-    """Print each table as it comes, and write all to the file of `--json`; linear algebra runs on one core meanwhile.
+    """Print each table when it is ready, and write all to the file of `--json`; linear algebra runs on one core.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def publish(tables: Iterable[Table], options: argparse.Namespace, settings: Sett
 
 
 def text(table: Table) -> str:
-    """Headings and rows, in columns: words to the left, figures to the right.
+    """Format headings and rows in columns: words left-aligned, figures right-aligned.
 
     >>> print(text(Table("", ("tracker", "frames/s"), [("catstream", 101.4), ("csrt", None)])))
     tracker    frames/s
@@ -104,7 +104,7 @@ def _cell(cell: Cell) -> str:
 
 
 def _words() -> Iterator[str]:
-    """The command of this process, as somebody would type it in the checkout, without the options of `_PLACES`."""
+    """Return the command of this process as typed in the checkout, without the options in `_PLACES`."""
     program = Path(sys.argv[0]).resolve()
     yield from ("python", program.relative_to(_ROOT).as_posix() if _ROOT in program.parents else program.name)
     words: Iterator[Any] = iter(sys.argv[1:])

@@ -1,4 +1,4 @@
-"""Frames a second from end to end, decoding included, by the real pipeline; and what each step costs.
+"""End-to-end frames per second of the real pipeline, including decoding, and the time of each stage.
 
 A file that is fast to decode and small (TLD_01_david, 320x240), and a rendered one of 640x480 pixels.
 """
@@ -39,7 +39,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def repeated(sequence: Sequence, mode: str, runs: int) -> tuple[float, float, float]:
-    """Median and least frames a second of some runs, and the success of the last."""
+    """Return median and minimum frames per second of some runs, and the success of the last one."""
     rates = []
     for _ in range(runs):
         journey = travel(video(sequence), sequence.boxes[0], Settings(search={"mode": mode}))
@@ -48,7 +48,7 @@ def repeated(sequence: Sequence, mode: str, runs: int) -> tuple[float, float, fl
 
 
 def steps(videos: list[Sequence]) -> Table:
-    """Milliseconds a frame of each step: the three stages in one process, one after the other."""
+    """Return the milliseconds per frame of each of the three stages, run in one process."""
     columns = ("video", "detection", "decode", "detect", "compress", "train", "all")
     rows = []
     for sequence in videos:
@@ -59,7 +59,7 @@ def steps(videos: list[Sequence]) -> Table:
 
 
 def costs(sequence: Sequence, settings: Settings) -> list[float]:
-    """Milliseconds spent in all on decoding, detecting, compressing and training."""
+    """Total milliseconds of decoding, detection, compression and training."""
     detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
     spent = [0.0] * 4
 
@@ -84,6 +84,6 @@ def costs(sequence: Sequence, settings: Settings) -> list[float]:
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--runs", type=int, default=3, help="runs of each video (default: %(default)s)")
+    parser.add_argument("--runs", type=int, default=3, help="number of runs of each video (default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)

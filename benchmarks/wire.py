@@ -1,4 +1,4 @@
-"""Features a second from one process to another, each message acknowledged: over Unix sockets and over tcp."""
+"""Acknowledged features messages per second between two processes, over Unix sockets and over TCP."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def features_of_a_frame() -> Features:
-    """The message of an ordinary frame."""
+    """Return the features message of a typical frame."""
     sequence, detector = rendered(2, (320, 240)), Detector(Settings())
     first, second = sequence.frames()
     detector.init(first, Box(*sequence.boxes[0]))
@@ -62,11 +62,11 @@ def loopback() -> Iterator[str]:
 
 
 def delivered(endpoint: str, features: Features, messages: int) -> float:
-    """Seconds until the last of some messages is acknowledged."""
+    """Return the seconds until the last of some messages is acknowledged."""
     receiver = SPAWN.Process(target=receive, args=(endpoint,), daemon=True)
     receiver.start()
     with Sender(FEATURES, Endpoint.parse(endpoint), WINDOW) as sender:
-        while sender.ask_position() is None:  # not there yet
+        while sender.ask_position() is None:  # no receiver yet
             receiver.join(0.01)
         begin = perf_counter()
         for seq in range(1, messages + 1):
@@ -81,7 +81,7 @@ def delivered(endpoint: str, features: Features, messages: int) -> float:
 
 
 def receive(endpoint: str) -> None:
-    """Take every message, and say so, until the end."""
+    """Receive and acknowledge every message until the end."""
     with Receiver(FEATURES, Endpoint.parse(endpoint), Position(), WINDOW) as features:
         message = None
         while not isinstance(message, End):
@@ -92,6 +92,8 @@ def receive(endpoint: str) -> None:
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--messages", type=int, default=5_000, help="over each (default: %(default)s)")
+    parser.add_argument(
+        "--messages", type=int, default=5_000, help="number of messages over each transport (default: %(default)s)"
+    )
     options = parser.parse_args()
     publish(figures(options), options)

@@ -1,11 +1,11 @@
-"""A running pipeline in the Rerun viewer: pictures, box, score, state and model, frame by frame.
+"""Shows a running pipeline in the Rerun viewer: pictures, box, score, state and model version of each frame.
 
     pip install "catstream[rerun]"
     catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=run
     python examples/rerun_subscriber.py run
     python examples/rerun_subscriber.py run --save walk.rrd
 
-The viewer is a window; where there is no screen, --save writes what it would show to a file.
+The viewer is a window. On a machine without a display, --save writes a file for the viewer.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import catstream
 
 
 async def show_tracks(endpoint: str) -> None:
-    """Draw each track."""
+    """Log each track."""
     count, state = 0, None
     with catstream.subscribe(endpoint, "tracks") as tracks:
         async for track in tracks:
@@ -42,7 +42,7 @@ async def show_tracks(endpoint: str) -> None:
 
 
 async def show_pictures(endpoint: str) -> None:
-    """Show the newest picture now and then, at the size of its frame."""
+    """Log the newest picture several times per second, scaled to the size of its frame."""
     with catstream.subscribe(endpoint, "previews") as previews:
         async for preview in previews:
             picture = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
@@ -51,10 +51,10 @@ async def show_pictures(endpoint: str) -> None:
 
 
 async def main() -> None:
-    """Attach until the pipeline ends."""
+    """Subscribe until the pipeline ends."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("endpoint", nargs="?", default="", help="where the pipeline runs; the only one if not given")
-    parser.add_argument("--save", metavar="FILE", help="write an .rrd file, and open no window")
+    parser.add_argument("endpoint", nargs="?", default="", help="endpoint of the pipeline; not needed if only one runs")
+    parser.add_argument("--save", metavar="FILE", help="write an .rrd file instead of opening a window")
     options = parser.parse_args()
     rr.init("catstream", spawn=not options.save)
     if options.save:

@@ -1,11 +1,11 @@
-"""A subscriber in plain Python, with pyzmq and msgpack and nothing of catstream.
+"""A subscriber that uses pyzmq and msgpack, without importing catstream.
 
     catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=run
     python examples/subscriber.py run
 
-Where the pipeline asks for keys, their folder is a second argument.
+If the pipeline requires keys, give their folder as the second argument.
 
-Prints every track and each new model, until the pipeline ends. `docs/protocol.md` says what travels.
+Prints every track and each new model, until the pipeline ends. `docs/protocol.md` describes the messages.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from pathlib import Path
 import msgpack
 import zmq
 
-PORTS = {"models": 2, "tracks": 3}  # counted from that of the endpoint
+PORTS = {"models": 2, "tracks": 3}  # offset from the port of the endpoint
 
 
 def address(endpoint: str, channel: str) -> str:
-    """Of a channel; the endpoint is a folder of sockets, or tcp://127.0.0.1:PORT."""
+    """Return the address of a channel; the endpoint is a folder of sockets, or tcp://127.0.0.1:PORT."""
     if endpoint.startswith("tcp://"):
         host, _, port = endpoint.rpartition(":")
         return f"{host}:{int(port) + PORTS[channel]}"
@@ -31,7 +31,7 @@ def address(endpoint: str, channel: str) -> str:
 
 
 def attach(endpoint: str, channel: str, keys: str, *, newest: bool) -> zmq.Socket:
-    """A socket that hears the channel from now on; with `newest` it holds no message but the last."""
+    """Return a socket that subscribes to a channel; with `newest` it keeps only the newest message."""
     socket = zmq.Context.instance().socket(zmq.SUB)
     if newest:
         socket.setsockopt(zmq.CONFLATE, 1)
@@ -40,12 +40,12 @@ def attach(endpoint: str, channel: str, keys: str, *, newest: bool) -> zmq.Socke
         own = tomllib.loads((Path(keys) / "client.key").read_text())
         socket.curve_serverkey = tomllib.loads((Path(keys) / "server.pub").read_text())["public"].encode()
         socket.curve_publickey, socket.curve_secretkey = own["public"].encode(), own["secret"].encode()
-    socket.connect(address(endpoint, channel))  # the pipeline may come later
+    socket.connect(address(endpoint, channel))  # the pipeline may start later
     return socket
 
 
 def receive(socket: zmq.Socket) -> tuple[str, dict]:
-    """The next message: its kind and its fields."""
+    """Receive the next message: its kind and its fields."""
     version, kind, fields = msgpack.unpackb(socket.recv())
     if version != 1:
         sys.exit("this catstream speaks another protocol")
@@ -53,7 +53,7 @@ def receive(socket: zmq.Socket) -> tuple[str, dict]:
 
 
 def norm(weights: dict) -> float:
-    """Length of a vector as it travels: dtype "<f4", shape, and the bytes of its numbers."""
+    """Return the Euclidean norm of an encoded vector: dtype "<f4", shape, and bytes."""
     numbers = array("f", weights["data"])
     if sys.byteorder == "big":
         numbers.byteswap()
@@ -70,12 +70,12 @@ def main(endpoint: str, keys: str = "") -> None:
         ready = dict(poller.poll())
         if models in ready:
             _, model = receive(models)
-            if model["version"] != version:  # the last one may come twice
+            if model["version"] != version:  # the last model may arrive twice
                 version = model["version"]
                 print(f"model {version} of frame {model['frame']}, norm {norm(model['weights']):.4f}", flush=True)
         if tracks in ready:
             kind, track = receive(tracks)
-            if seq:  # who comes late has missed nothing
+            if seq:  # tracks before the first received one are not counted
                 missed += max(0, track["seq"] - seq - 1)
             seq = track["seq"]
             if kind == "end":

@@ -1,4 +1,4 @@
-"""Trackers put together by hand from the library's stages, of several recipes, on the same sequences."""
+"""Trackers assembled from the stages of the library by several recipes, on the same sequences."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["Recipe", "follow_all"]
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What a tracker is made of.
+    """The parts of a tracker.
 
     settings  of the stages
     tree      class of the compressor's trees: `sample` says what is learned from
@@ -44,7 +44,7 @@ class Recipe:
 def follow_all(
     options: argparse.Namespace, sequences: list[Sequence], recipes: dict[str, Recipe]
 ) -> dict[str, list[EvaluationRun]]:
-    """Runs of each recipe over all sequences and starts, in the same order in each."""
+    """Run each recipe over all sequences and starts; return the runs in the same order for each."""
     starts, jobs = (1, 1) if options.quick else (options.starts, options.jobs)
     tasks = [(recipes, sequence, start) for sequence in sequences for start in start_frames(sequence, starts)]
     runs: dict[str, list[EvaluationRun]] = {name: [] for name in recipes}
@@ -56,9 +56,9 @@ def follow_all(
 
 
 def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: int) -> list[EvaluationRun]:
-    """Runs of each recipe on one sequence, from the same frame."""
+    """Run each recipe on one sequence, from the same frame."""
     runs = []
-    # SCM depends on none of what recipes differ in, and takes longer than all else: each frame once for all of them.
+    # SCM is slow and does not depend on the recipe, so each frame is computed once for all recipes.
     with patch("catstream.paper.scm.SparseCollaborativeModel", Shared()):
         for name, recipe in recipes.items():
             runs.append(follow(name, recipe, sequence, start))
@@ -67,7 +67,7 @@ def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: int) -> l
 
 
 class Shared:
-    """Stands for the class of SCM on one sequence: the first who asks for a frame has it searched."""
+    """Replaces the class SCM for one sequence: caches the result of each frame for all recipes."""
 
     model: SparseCollaborativeModel
 
@@ -81,7 +81,7 @@ class Shared:
         return self
 
     def step(self, image: np.ndarray) -> tuple[float, Box]:
-        """As the model's own."""
+        """Return the cached result of SCM for a frame."""
         if self.told == len(self.found):
             self.found.append(self.model.step(image))
         self.told += 1
@@ -89,7 +89,7 @@ class Shared:
 
 
 def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> EvaluationRun:
-    """The loop of `catstream.tracker.Tracker`, with other trees, and an end to learning."""
+    """Run the loop of `catstream.tracker.Tracker` with other trees, and stop learning after a share of the frames."""
     frames = len(sequence) - start
     settings = recipe.settings.for_length(frames)
     detector, compressor, trainer = Detector(settings), Compressor(settings, recipe.tree), Trainer(settings)

@@ -1,4 +1,4 @@
-"""The paper's bootstrap against ours: who follows better until there is a model to learn.
+"""The paper's bootstrap and ours: accuracy until the first model is trained.
 
 The paper begins with SCM, a sparse collaborative model in a particle filter, for the first n frames; we with affine
 copies of the first box and ridge regression, and learn from the first leaf on. Both follow the same n frames, from
@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from accuracy import MEANS, accuracy_command, compared, difference, means, videos
 from table import Table, publish
@@ -31,7 +31,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     base = Settings(coreset={"size": options.size})
     places = 1 if options.quick else options.starts
     pieces = [piece for found in videos(options) for piece in pieces_of(found, places, options.size)]
-    options.starts = 1  # of each piece
+    options.starts = 1  # for each piece
     runs = compared(options, pieces, {name: base.but(changes) for name, changes in BOOTSTRAPS.items()})
     rows = []
     for name, found in runs.items():
@@ -42,7 +42,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def pieces_of(sequence: Sequence, places: int, frames: int) -> list[Sequence]:
-    """`frames` frames from each of several places where the object is there, as sequences of their own."""
+    """Cut `frames` frames from several places where the object is present, as sequences of their own."""
     return [
         replace(
             sequence,

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
@@ -20,7 +20,7 @@ from table import Table, publish
 
 from catstream.settings import PRESETS, Settings
 
-#: Size in percent -> success: mean of ten videos, and Panda.
+#: Size in percent -> success in the paper: mean of ten videos, and Panda.
 PAPER = {1: (0.49, 0.59), 2.5: (0.51, 0.59), 5: (0.53, 0.61), 10: (0.56, 0.62), 25: (0.66, 0.67)}
 
 

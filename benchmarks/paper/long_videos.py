@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from journey import Journey, draw, travel
 from sequences import named, scratch
@@ -63,12 +63,12 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def base_of(options: argparse.Namespace) -> Settings:
-    """All settings but n."""
+    """Return all settings except n."""
     return Settings.of(PRESETS.get(options.preset, {}))
 
 
 def lengthened(sequence: Sequence, frames: int) -> tuple[Path, np.ndarray]:
-    """The video with clips of itself after it, and the object's box in each frame."""
+    """Lengthen a video with clips of itself; return it with the box of the object in each frame."""
     rng, images = np.random.default_rng(0), list(sequence.frames())
     height, width = images[0].shape[:2]
     clip = max(len(images) // 10, 1)
@@ -108,7 +108,7 @@ GROWTH = (
 
 
 def growth(journey: Journey) -> tuple[float, ...]:
-    """Early and late: median milliseconds a frame, those of a processor of all processes together, and their memory."""
+    """Return early and late medians of time per frame and processor time in milliseconds, and the memory in use."""
     tenth = max(len(journey.milliseconds) // 10, 1)
     early, late = np.median(journey.milliseconds[:tenth]), np.median(journey.milliseconds[-tenth:])
     work = [journey.work(name)[1] for name in journey.looks]
@@ -121,10 +121,12 @@ def growth(journey: Journey) -> tuple[float, ...]:
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--frames", type=int, default=100_000, help="of the longest (default: %(default)s)")
+    parser.add_argument(
+        "--frames", type=int, default=100_000, help="frames of the longest video (default: %(default)s)"
+    )
     parser.add_argument("--videos", nargs="+", default=["TLD_06_car", "TLD_10_panda"], help="(default: %(default)s)")
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 500], help="n (default: %(default)s)")
-    parser.add_argument("--preset", choices=PRESETS, help="settings but for n; the defaults where not given")
+    parser.add_argument("--preset", choices=PRESETS, help="preset for the settings except n (default: none)")
     parser.add_argument("--plot", type=Path, default=Path("out/long_videos.png"), help="(default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options, base_of(options))

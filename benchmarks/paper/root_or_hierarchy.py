@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from accuracy import MEANS, accuracy_command, means, spread, videos
 from assembled import Recipe, follow_all
@@ -22,12 +22,12 @@ from catstream.compression.tree import CoresetTree
 from catstream.messages import Summary
 from catstream.settings import PRESETS, Settings
 
-#: What is learned from -> success and precision.
+#: Training set -> success and precision in the paper.
 PAPER = {"root": (0.398, 0.434), "hierarchy": (0.524, 0.677)}
 
 
 class RootTree(CoresetTree):
-    """Shows its oldest and highest node alone: what came since is not learned before it is merged in."""
+    """A tree whose sample is its root only: newer rows are not used until they are merged into it."""
 
     def sample(self) -> Summary:
         root = self.nodes[0]
@@ -49,6 +49,6 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 if __name__ == "__main__":
     parser = accuracy_command(__doc__, starts=3, kept=False)
-    parser.add_argument("--ours", action="store_true", help="with our settings only")
+    parser.add_argument("--ours", action="store_true", help="only with our settings")
     options = parser.parse_args()
     publish(figures(options), options)

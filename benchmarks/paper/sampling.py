@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
@@ -28,7 +28,7 @@ from catstream.settings import PRESETS, Settings
 
 SHARES = (0.25, 0.375, 0.5, 0.625, 0.75)
 
-#: Success at n = 512, by share.
+#: Success in the paper at n = 512, by share.
 PAPER = {
     "coreset": (0.408, 0.449, 0.483, 0.534, 0.582),
     "evenly spaced": (0.332, 0.358, 0.396, 0.408, 0.424),
@@ -37,7 +37,7 @@ PAPER = {
 
 
 class Sampled(CoresetTree):
-    """Grows as a coreset tree does, so that it is asked as often; shows rows that it saw, in place of a coreset."""
+    """Has the interface and the schedule of a coreset tree, but its sample is a subset of the rows."""
 
     def __init__(self, size: int) -> None:
         super().__init__(size)
@@ -47,11 +47,11 @@ class Sampled(CoresetTree):
     def insert(self, rows: np.ndarray) -> None:
         super().insert(rows)
         for row in rows:
-            self.meet(row.copy())  # alone, not the rows it came with
+            self.meet(row.copy())  # a copy, so that the other rows of the message are not kept in memory
             self.met += 1
 
     def meet(self, row: np.ndarray) -> None:
-        """Keep the row or not."""
+        """Decide whether to keep a row."""
         raise NotImplementedError
 
     def sample(self) -> Summary:
@@ -61,7 +61,7 @@ class Sampled(CoresetTree):
 
 
 class Random(Sampled):
-    """2n of all rows so far, each as likely as any other (Vitter's reservoir)."""
+    """Keeps a uniform random sample of 2n rows (Vitter's reservoir sampling)."""
 
     def __init__(self, size: int) -> None:
         super().__init__(size)
@@ -75,7 +75,7 @@ class Random(Sampled):
 
 
 class Spaced(Sampled):
-    """Every k-th row, 2n to 4n of them: k doubles when there are more."""
+    """Keeps every k-th row, 2n to 4n rows: k doubles if there are more."""
 
     step = 1
 
@@ -107,7 +107,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def base_of(options: argparse.Namespace) -> Settings:
-    """All settings but n and the tree."""
+    """Return all settings except n and the tree."""
     return Settings() if options.ours else Settings.of(PRESETS["one-class-paper"])
 
 

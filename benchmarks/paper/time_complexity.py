@@ -15,7 +15,7 @@ from time import perf_counter
 
 import numpy as np
 
-sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from sequences import named
 from table import Table, command, publish
@@ -50,7 +50,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 def points_of(sequence: Sequence, count: int) -> np.ndarray:
-    """Rows of the object, float32 (count, d): as many copies of it from each frame as that takes."""
+    """Return rows of the object, float32 (count, d), with as many copies from each frame as needed."""
     present = int(np.isfinite(sequence.boxes).all(axis=1).sum())
     copies, rng = -(-count // present), np.random.default_rng(0)
     rows = [
@@ -62,7 +62,7 @@ def points_of(sequence: Sequence, count: int) -> np.ndarray:
 
 
 def grown(rows: np.ndarray, n: int) -> CoresetTree:
-    """A tree of all rows, inserted one by one, as they come."""
+    """Return a tree of all rows, inserted one by one."""
     tree = CoresetTree(n)
     for row in rows:
         tree.insert(row[None])
@@ -70,7 +70,7 @@ def grown(rows: np.ndarray, n: int) -> CoresetTree:
 
 
 def seconds(work: Callable[..., object], *arguments: object) -> float:
-    """Least time of three runs: the others were disturbed."""
+    """Return the minimum time of three runs, which other load of the machine affects least."""
     times = []
     for _ in range(3):
         begin = perf_counter()
@@ -80,7 +80,7 @@ def seconds(work: Callable[..., object], *arguments: object) -> float:
 
 
 def draw(training: list[tuple[float, ...]], building: list[tuple[float, ...]], file: Path) -> None:
-    """The two plots of the figure, side by side."""
+    """Draw the two plots of the figure side by side."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -107,7 +107,7 @@ def draw(training: list[tuple[float, ...]], building: list[tuple[float, ...]], f
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--points", type=int, default=8192, help="at most (default: %(default)s)")
+    parser.add_argument("--points", type=int, default=8192, help="maximum number of points (default: %(default)s)")
     parser.add_argument("--plot", type=Path, default=Path("out/time_complexity.png"), help="(default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)

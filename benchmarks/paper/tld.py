@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean
 
-sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from accuracy import accuracy_command, compared, videos
 from table import Table, publish
@@ -20,7 +20,7 @@ from table import Table, publish
 from catstream.evaluation.summary import rows_of
 from catstream.settings import PRESETS, Settings
 
-#: Tracker -> mean of ten videos, and Panda.
+#: Tracker -> success in the paper: mean of ten videos, and Panda.
 PAPER = {
     "cat25": (0.66, 0.58),
     "TLD": (0.57, 0.25),
