@@ -1,4 +1,4 @@
-"""The command line: a file a verb, or a family of them. Arguments and printing, no algorithm."""
+"""The command line: one module for each command. It has argument parsing and output, no algorithms."""
 
 from __future__ import annotations
 
@@ -16,47 +16,45 @@ from catstream.errors import CatstreamError
 
 __all__ = ["INTERRUPTED", "VERBS", "interruptible", "main", "verb"]
 
-#: Exit code of a command that Ctrl-C ended before it was done.
+#: Exit code of a command that was interrupted by Ctrl-C.
 INTERRUPTED = 130
 
-#: Verb -> what it does. Its module is imported only when it is called: some take long.
+#: Command -> summary. The module of a command is imported when it is called, because some imports take long.
 VERBS = {
-    "track": "Follow an object through a video.",
-    "demo": "See it work, on a video that is rendered for it.",
-    "evaluate": "Measure accuracy on annotated sequences, beside other trackers.",
-    "loadtest": "Put pipelines under load, and measure what they bear.",
-    "watch": "Show what a running pipeline says, as it says it.",
-    "view": "Look at a running pipeline in a browser, and steer it.",
+    "track": "Track an object in a video.",
+    "demo": "Track an object in a rendered demo video.",
+    "evaluate": "Measure accuracy on annotated sequences, also of other trackers.",
+    "loadtest": "Run pipelines under load, and measure latency and losses.",
+    "watch": "Print the messages of a running pipeline.",
+    "view": "Watch and steer a running pipeline in a browser.",
     "sink": "Write the tracks of a running pipeline to files.",
-    "record": "Keep what a running pipeline says, in one file.",
-    "replay": "Play a recording to subscribers, or learn from it once more.",
-    "status": "Ask a running pipeline how it is.",
-    "set-box": "Tell a running pipeline where the object is.",
-    "pause": "Have a running pipeline take no more frames.",
-    "resume": "Have a paused pipeline go on.",
-    "save": "Write what a running pipeline has learned to a file.",
-    "stop": "End a running pipeline as if its source had come to its end.",
-    "keys": "Make keys, and say who may connect to a pipeline.",
-    "settings": "List all settings, with their defaults and meaning.",
+    "record": "Record the messages of a running pipeline in one file.",
+    "replay": "Replay a recording to subscribers, or train on it again.",
+    "status": "Show the state of a running pipeline.",
+    "set-box": "Set the box of the object in a running pipeline.",
+    "pause": "Pause a running pipeline.",
+    "resume": "Resume a paused pipeline.",
+    "save": "Save what a pipeline has learned to a file.",
+    "stop": "Stop a running pipeline as if its source had ended.",
+    "keys": "Manage the keys of a pipeline and its clients.",
+    "settings": "List all settings with their defaults and descriptions.",
 }
 
-#: The module of verbs that share one.
-_TOGETHER = dict.fromkeys(("set-box", "pause", "resume", "save", "stop"), "steer")
+#: Module of the commands that share one.
+_MODULES = dict.fromkeys(("set-box", "pause", "resume", "save", "stop"), "steer")
 
 
 def verb(name: str) -> click.Command:
-    """The command of one of the `VERBS`."""
-    command: click.Command = getattr(
-        import_module(f"catstream.cli.{_TOGETHER.get(name, name)}"), name.replace("-", "_")
-    )
+    """Return the click command of one of the `VERBS`."""
+    command: click.Command = getattr(import_module(f"catstream.cli.{_MODULES.get(name, name)}"), name.replace("-", "_"))
     return command
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """End this process at once on Ctrl-C inside a `with`, which is for imports before anything has begun.
+    """End this process at once on Ctrl-C inside a `with`. It is for imports before any work.
 
-    Kernels that are compiled meanwhile swallow a KeyboardInterrupt, or make another error of it.
+    Kernels are compiled during these imports, and the compiler hides a KeyboardInterrupt or makes another error of it.
     """
 
     def leave(*_: object) -> None:
@@ -80,7 +78,7 @@ class _Verbs(click.Group):
     def invoke(self, context: click.Context) -> Any:
         try:
             return super().invoke(context)
-        except (KeyboardInterrupt, click.Abort):  # which click would take for an error
+        except (KeyboardInterrupt, click.Abort):  # click would report it as an error
             click.echo("stopped", err=True)
             context.exit(INTERRUPTED)
 
@@ -92,7 +90,7 @@ class _Verbs(click.Group):
 @click.command(cls=_Verbs, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="catstream", prog_name="catstream")
 def group() -> None:
-    """Learn to follow one object in a video stream, from a single box, on a CPU.
+    """Track one object in a video stream; it is learned online from a single box, on a CPU.
 
     \b
       catstream demo
@@ -101,7 +99,7 @@ def group() -> None:
 
 
 def main() -> None:
-    """Run the command line: one line for an error, and exit code 1; `INTERRUPTED` after Ctrl-C."""
+    """Run the command line. The exit code is 1 after an error, which is one line, and `INTERRUPTED` after Ctrl-C."""
     try:
         group(prog_name="catstream")
     except CatstreamError as error:

@@ -1,4 +1,4 @@
-"""How a verb attaches to a running pipeline: the options that select it, and the wait until it answers."""
+"""Options that select a running pipeline, and the wait until it answers."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def with_endpoint(command: _Command) -> _Command:
 
 
 def wait_for_pipeline(endpoint: str, keys: str, seconds: float) -> Endpoint:
-    """Wait until a process of the pipeline answers, and return its endpoint; a terminal shows that it waits.
+    """Wait until a process of the pipeline answers, and return its endpoint; a terminal shows a status line.
 
     Raises
     ------
     ServiceError
-        If `endpoint` is empty and not just one pipeline runs, or the pipeline does not let these keys in.
+        If `endpoint` is empty and not exactly one pipeline runs, or the pipeline rejects the keys.
     SilenceError
         If no process answers in time.
     """

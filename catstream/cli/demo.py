@@ -1,4 +1,4 @@
-"""`catstream demo`: see it work, without a video of one's own."""
+"""`catstream demo`: track an object in a rendered video."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ __all__ = ["demo"]
 @click.command()
 @click.option("--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder.")
 @click.option("--frames", type=click.IntRange(min=2), default=600, show_default=True, help="Length of the video.")
-@click.option("--render-only", is_flag=True, help="Write the video and its truth, follow nothing.")
+@click.option("--render-only", is_flag=True, help="Only write the video and its ground truth.")
 def demo(output: Path, frames: int, render_only: bool) -> None:
-    """Render a video with known truth, follow the object in it, and say how well that went.
+    """Render a video with ground truth, track the object in it, and print the accuracy.
 
-    A dahlia drifts over a lake: it turns, grows and shrinks, the light changes,
-    a look-alike crosses it, a pagoda covers it, it leaves and comes back.
+    A dahlia moves over a lake: it rotates and changes its size, the brightness
+    changes, a similar flower crosses it, a pagoda occludes it, and it leaves the
+    picture and returns.
 
     \b
     Writes
-      OUTPUT/demo.mp4, groundtruth_rect.txt   the video and its truth: a sequence for `catstream evaluate`
-      OUTPUT/tracks/                          what `catstream track` writes, with the annotated video
+      OUTPUT/demo.mp4, groundtruth_rect.txt   the video and its ground truth: a sequence for `catstream evaluate`
+      OUTPUT/tracks/                          the results of `catstream track`, with the annotated video
     """
     from catstream.evaluation.metrics import score
     from catstream.video.demo import write
@@ -47,7 +48,7 @@ def demo(output: Path, frames: int, render_only: bool) -> None:
     truth = np.array([box or (np.nan,) * 4 for box in boxes])
     found = np.loadtxt(tracks / "demo.txt", delimiter=",", ndmin=2)
     absent, nothing = np.isnan(truth).any(axis=1), np.isnan(found).any(axis=1)
-    console.print(f"success rate: {score(found, truth).success:.3f} (overlap with the truth above 0.5)")
+    console.print(f"success rate: {score(found, truth).success:.3f} (overlap with the ground truth above 0.5)")
     if absent.any():
-        console.print(f"known to be absent: {(absent & nothing).sum()} of {absent.sum()} frames")
+        console.print(f"absence reported: {(absent & nothing).sum()} of {absent.sum()} frames")
     console.print(f"annotated video: {tracks / 'demo.mp4'}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`catstream evaluate`: how well trackers follow, on annotated sequences."""
+"""`catstream evaluate`: measure the accuracy of trackers on annotated sequences."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ __all__ = ["evaluate"]
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
 @click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see below.")
-@click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Frames to start from.")
-@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Processes at once.")
+@click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Number of start frames.")
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of processes.")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder for results and report.html.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all numbers, and what made them.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all figures and their provenance.")
 @with_settings
 def evaluate(
     settings: Settings,
@@ -41,29 +41,29 @@ def evaluate(
 ) -> None:
     """Measure trackers on annotated sequences.
 
-    PATH is a sequence, or a folder of sequences. A sequence is a folder of
-    images, or with one video, and a text file with the object's box in each
-    frame: groundtruth_rect.txt (x,y,w,h; nan where it is absent). The layouts
-    of OTB, TLD, VOT and Princeton are read as they are.
+    PATH is a sequence or a folder of sequences. A sequence is a folder with
+    images or one video, and a text file with the box of the object in each
+    frame: groundtruth_rect.txt (x,y,w,h; nan if the object is absent). The
+    layouts of OTB, TLD, VOT and Princeton can be read.
 
     \b
     TRACKERS
       catstream        this one, in one process
-      mil              OpenCV's, always there
+      mil              OpenCV's, always available
       csrt, kcf, tld   OpenCV's, with pip install "catstream[peers]"
 
     \b
     MEASURES, over the frames with the object
-      AUC        area under the success plot: overlap with the truth, all thresholds
+      AUC        area under the success plot: overlap with the ground truth, all thresholds
       success    share of frames with an overlap above 0.5
       precision  share of frames whose centre is at most 20 pixels off
-      norm.      normalised precision: the same in parts of the object's size
-      F          F-score of VOT-LT, where the object leaves: does the tracker know?
+      norm.      normalised precision: the same, relative to the size of the object
+      F          F-score of VOT-LT, if the object is absent in some frames
 
-    A single run is chaotic on hard clips: --starts 5 follows the object from
-    five different frames and gives mean and spread. With --output, results
-    are kept in the layouts of the got10k and VOT toolkits, finished ones are
-    not run again, and report.html shows plots and the worst failures.
+    On difficult sequences a single run varies much: --starts 5 runs from five
+    different frames and prints mean and standard deviation. With --output,
+    results are stored in the layouts of the got10k and VOT toolkits, complete
+    runs are not repeated, and report.html shows plots and the worst failures.
 
     \b
     EXAMPLES
@@ -71,7 +71,7 @@ def evaluate(
       catstream evaluate sequences/ --tracker catstream,csrt --jobs 4 --output results
       catstream evaluate sequences/walk --starts 5 --set coreset.size=128
     """
-    # Here, so that --help and the other verbs need not wait for these.
+    # Imported here so that --help and the other commands start faster.
     with interruptible():
         from catstream.evaluation.datasets import find_sequences
         from catstream.evaluation.onepass import evaluate as run_all
@@ -88,7 +88,7 @@ def evaluate(
     errors: list[CatstreamError] = []
     console = Console(width=None if sys.stdout.isatty() else 120)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with _kept(output), Progress(*columns, console=console, transient=True) as progress:
+    with _reporting_interrupt(output), Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("frames", total=None)
 
         def begin(frames: int) -> None:
@@ -112,7 +112,7 @@ def evaluate(
     for error in errors:
         click.echo(f"catstream: {error}", err=True)
     if not runs:
-        raise CatstreamError("no sequence could be followed: see above")
+        raise CatstreamError("all runs have failed: see above")
     rows = rows_of(runs)
     numbers = to_json(rows, settings)
     console.print(_table(numbers))
@@ -124,22 +124,24 @@ def evaluate(
     if output is not None:
         console.print(f"report: {write_report(output / 'report.html', runs, settings)}", soft_wrap=True)
     if errors:
-        raise CatstreamError(f"{len(errors)} of {len(errors) + len(runs)} runs could not be made, and are in no number")
+        raise CatstreamError(
+            f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
+        )
 
 
 @contextmanager
-def _kept(output: Path | None) -> Iterator[None]:
-    """After Ctrl-C, say what there is."""
+def _reporting_interrupt(output: Path | None) -> Iterator[None]:
+    """After Ctrl-C, print how to continue."""
     try:
         yield
     except KeyboardInterrupt:
-        kept = "" if output is None else f": finished runs are kept in {str(output)!r}, the same command goes on"
+        kept = "" if output is None else f": complete runs are in {str(output)!r}; the same command continues"
         click.echo(f"stopped{kept}", err=True)
         sys.exit(INTERRUPTED)
 
 
 def _table(numbers: dict[str, Any]) -> Table:
-    """Rows of the sequences, then the means."""
+    """Return a table of the sequences and the means."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("sequence")
     table.add_column("tracker")

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and a terminal that is lost: they take effect between two frames."""
+"""Defers SIGINT, SIGTERM and SIGHUP to the end of a block, so that they take effect between two frames."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ __all__ = ["Interrupts"]
 
 
 class Interrupts:
-    """Raises KeyboardInterrupt for each of these signals, at the end of a `held` block if one came within it."""
+    """Raises KeyboardInterrupt for each of these signals; inside a `deferred` block, at the end of the block."""
 
     def __init__(self) -> None:
-        self._held = self._came = False
+        self._deferring = self._pending = False
 
     def install(self) -> None:
-        """Take over the signals; of those that a shell or nohup has this process ignore, only SIGTERM."""
+        """Install the handlers. A signal that is ignored, as under nohup, stays ignored, except SIGTERM."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, self._take)
+                signal.signal(number, self._handle)
 
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """A block that none of them interrupts."""
-        self._held = True
+    def deferred(self) -> Iterator[None]:
+        """A block that these signals do not interrupt."""
+        self._deferring = True
         try:
             yield
         finally:
-            self._held = False
-        if self._came:
-            self._came = False
+            self._deferring = False
+        if self._pending:
+            self._pending = False
             raise KeyboardInterrupt
 
-    def _take(self, *_: object) -> None:
-        if not self._held:
+    def _handle(self, *_: object) -> None:
+        if not self._deferring:
             raise KeyboardInterrupt
-        self._came = True
+        self._pending = True

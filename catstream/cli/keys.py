@@ -1,4 +1,4 @@
-"""`catstream keys`: who may connect to a pipeline, and as what."""
+"""`catstream keys`: manage the keys and roles of the clients of a pipeline."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _name = click.argument("name")
 
 @click.group()
 def keys() -> None:
-    """Make keys, and say who may connect to a pipeline.
+    """Manage the keys of a pipeline and its clients.
 
-    With keys all that travels is encrypted, and who connects must hold a key that
-    is allowed. A pipeline that other machines can reach does not start without.
+    With keys, all connections are encrypted, and only clients with an allowed
+    key can connect. A pipeline that other machines can reach requires keys.
 
     \b
     EXAMPLES
@@ -37,10 +37,10 @@ def keys() -> None:
 def new(folder: Path) -> None:
     """Make the keys of a pipeline.
 
-    DIR gets the key pair of the sockets that listen, that of the pipeline's own
-    processes, and the list of who may connect. Its files are for you alone, and
-    nothing is written over. Where the processes run on several machines, each
-    needs a copy of it.
+    DIR gets the key pair of the listening sockets, the key pair of the
+    pipeline's own processes, and the list of clients. Only you can read its
+    files, and no file is overwritten. If the processes run on several machines,
+    each machine needs a copy.
 
     \b
     EXAMPLE
@@ -53,20 +53,20 @@ def new(folder: Path) -> None:
 @keys.command(name="allow")
 @_folder
 @_name
-@click.option("--role", type=click.Choice(ROLES), default="watch", show_default=True, help="What the client may do.")
+@click.option("--role", type=click.Choice(ROLES), default="watch", show_default=True, help="Role of the client.")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder for the new keys of the client.")
-@click.option("--public", metavar="KEY", help="The public key of a client that has its own already.")
+@click.option("--public", metavar="KEY", help="Public key of a client that already has a key pair.")
 def allow_(folder: Path, name: str, role: Role, output: Path | None, public: str | None) -> None:
-    """Let a client connect, from now on.
+    """Allow a client to connect.
 
-    Bring the folder OUTPUT to the client, on a way that nobody else can read, and
-    remove it here. Running pipelines need no restart.
+    Transfer the folder OUTPUT to the client over a secure channel, and remove it
+    here. Running pipelines need no restart.
 
     \b
     ROLE
       watch     subscribe to tracks, models, samples and health
-      steer     watch, and send orders to a running pipeline
-      pipeline  all: another machine on which processes of this pipeline run
+      steer     watch, and send commands to a running pipeline
+      pipeline  everything: another machine that runs processes of this pipeline
 
     \b
     EXAMPLES
@@ -76,13 +76,13 @@ def allow_(folder: Path, name: str, role: Role, output: Path | None, public: str
     if (output is None) == (public is None):
         raise click.UsageError("give --output, a folder for the new keys of the client, or --public, the key it has")
     allow(folder, name, role, output, public)
-    click.echo(f"{name} may connect as {role}" + (f" with the keys in {output}: bring them to it" if output else ""))
+    click.echo(f"{name} may connect as {role}" + (f" with the keys in {output}: transfer them to it" if output else ""))
 
 
 @keys.command(name="list")
 @_folder
 def list_(folder: Path) -> None:
-    """Show who may connect.
+    """List the clients that may connect.
 
     \b
     EXAMPLE
@@ -98,14 +98,14 @@ def list_(folder: Path) -> None:
 @_folder
 @_name
 def revoke_(folder: Path, name: str) -> None:
-    """Let a client connect no more.
+    """Revoke the key of a client.
 
-    Running pipelines need no restart. A connection that is open stays until it
-    ends: restart the pipeline to end it now.
+    Running pipelines need no restart. Open connections stay open until they
+    end; restart the pipeline to close them now.
 
     \b
     EXAMPLE
       catstream keys revoke keys phone
     """
     revoke(folder, name)
-    click.echo(f"{name} can connect no more; a connection that is open lasts until it ends")
+    click.echo(f"{name} can no longer connect; open connections stay open until they end")

@@ -1,4 +1,4 @@
-"""What the verbs that serve the web page share: where it listens, and the token that opens it."""
+"""Options of the commands that serve the web page: address and token."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _LARGEST_PORT = 65535
 
 
 class Address(NamedTuple):
-    """Where a page listens."""
+    """Address that the web server listens on."""
 
     host: str
     port: int
 
 
 class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
-    """[HOST:]PORT, of this machine alone if there is no host.
+    """Parameter type [HOST:]PORT; the default host is 127.0.0.1.
 
     >>> [tuple(AddressType().convert(text, None, None)) for text in ("8080", "0.0.0.0:8000", "[::]:0")]
     [('127.0.0.1', 8080), ('0.0.0.0', 8000), ('::', 0)]
@@ -43,7 +43,7 @@ class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since c
 
 
 def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Adds the options --PREFIXtoken and --PREFIXtoken-file to a command, which takes one `token`: text or None."""
+    """Add the options --PREFIXtoken and --PREFIXtoken-file; the command gets one argument `token`, a text or None."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @click.option(
@@ -52,7 +52,7 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
             envvar="VIEW_TOKEN",
             show_envvar=True,
             metavar="TOKEN",
-            help="Token that opens the page; 16 characters or more.",
+            help="Token for access to the page; at least 16 characters.",
         )
         @click.option(
             f"--{prefix}token-file",
@@ -61,7 +61,7 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
             show_envvar=True,
             type=click.Path(path_type=Path),
             metavar="FILE",
-            help="File that holds this token.",
+            help="File with this token.",
         )
         @functools.wraps(command)
         def with_one(*args: Any, token: str | None, token_file: Path | None, **others: Any) -> None:

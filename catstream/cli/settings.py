@@ -1,4 +1,4 @@
-"""`catstream settings`: what can be set."""
+"""`catstream settings`: list the settings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["settings"]
 
 @click.command()
 def settings() -> None:
-    """List all settings, with their defaults and meaning.
+    """List all settings with their defaults and descriptions.
 
     Set them with --set GROUP.NAME=VALUE, in a TOML file with a table for each group (--settings FILE), or in the
     environment (CATSTREAM_GROUP_NAME).

@@ -21,35 +21,35 @@ from catstream.wire.newest import Subscriber
 
 __all__ = ["sink"]
 
-_RUN_SECONDS = 1.0  # that a detector which follows frames may take to say what it runs with
+_RUN_SECONDS = 1.0  # time-out for the message with the settings of the run
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
 @with_endpoint
 @with_wait
-@click.option("--source", metavar="SOURCE", help="What the pipeline follows, for an MP4.")
+@click.option("--source", metavar="SOURCE", help="The source that the pipeline tracks, for an MP4.")
 @with_part
 def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source: str | None, part: slice) -> None:
     """Write the tracks of a running pipeline to FILES, until it ends or Ctrl-C.
 
-    The end of a file's name says its format; none may be there yet. Each track
-    is written as it comes, and what is written stays, however this ends. The
-    pipeline does not wait: what was missed is counted. For files that miss
-    nothing there is `catstream track --write`. If another run begins at the same
-    place, the first one was killed, and this ends too.
+    The extension of a file selects its format; the file must not exist. Each
+    track is written when it arrives, and stays in the file however the command
+    ends. The pipeline does not wait; missed tracks are counted. For complete
+    files use `catstream track --write`. If another run starts at the same
+    endpoint, because the first one was killed, the command ends.
 
     \b
     FILES
-      .ndjson    an object a line, with the fields of a track; also .jsonl
+      .ndjson    one JSON object for each track, one per line; also .jsonl
       -          the same, on standard output
-      .json      one array of such objects, which ends when the sink ends
-      .csv       a row a frame: frame, seconds, state, box, score, model version
+      .json      one array of such objects, closed at the end
+      .csv       a row for each frame: frame, seconds, state, box, score, model version
       .txt       MOT text: frame,1,x,y,w,h,score,-1,-1,-1, counted from 1
-      .sqlite    the table tracks, in write-ahead mode: others may read meanwhile
-      .parquet   made at the end, of the rows in FILE.parquet.sqlite
-      .mp4       the frames with their tracks; of a file or folder (--source), with
-                 the --start, --end and --stride of the pipeline; made at the end
+      .sqlite    the table tracks, in write-ahead mode: it can be read meanwhile
+      .parquet   written at the end, from the rows in FILE.parquet.sqlite
+      .mp4       the frames of a file or folder (--source) with their tracks, with
+                 the --start, --end and --stride of the pipeline; written at the end
 
     \b
     EXAMPLES
@@ -62,20 +62,20 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
         check(path)
     interrupts = Interrupts()
     interrupts.install()
-    written, newest, reach, reason = 0, -1, 0, ""
+    written, newest, max_repeats, reason = 0, -1, 0, ""
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             place = wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
             sinks = [stack.enter_context(closing(open_sink(path, source, part))) for path in files]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in tracks:
-                reach = reach or _reach(place)
-                if newest - track.frame > reach:
-                    reason = ": it had no end, and another run began"
+                max_repeats = max_repeats or _max_repeats(place)
+                if newest - track.frame > max_repeats:
+                    reason = ": the run had no end, and another one started"
                     break
-                if track.frame <= newest:  # a restarted detector repeats some
+                if track.frame <= newest:  # a restarted detector repeats some frames
                     continue
-                with interrupts.held():  # a track is in all files, and counted, or in none
+                with interrupts.deferred():  # a track is written to all files or to none
                     for each in sinks:
                         each.write(track)
                     written, newest = written + 1, track.frame
@@ -85,8 +85,8 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
         click.echo(f"{written} tracks, {tracks.losses()}{reason}", err=True)
 
 
-def _reach(place: Endpoint) -> int:
-    """How many tracks a restarted detector repeats at most: those that may be on their way, as the run was told."""
+def _max_repeats(place: Endpoint) -> int:
+    """Return how many tracks a restarted detector repeats at most: the setting `run.unstored_frames` of the run."""
     with Subscriber(TRAINING, place, only=Run) as runs:
         run = runs.receive(_RUN_SECONDS)
     return int(run.settings["run.unstored_frames"]) if isinstance(run, Run) else Settings().run.unstored_frames

@@ -1,4 +1,4 @@
-"""`catstream status`: how a running pipeline is."""
+"""`catstream status`: show the state of a running pipeline."""
 
 from __future__ import annotations
 
@@ -23,44 +23,50 @@ _NAMES = CHANNELS["health"].senders
 @click.command()
 @with_endpoint
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0), help="Seconds to listen at most.")
+@click.option(
+    "--wait",
+    default=3.0,
+    show_default=True,
+    type=click.FloatRange(0),
+    help="Maximum seconds to wait for health reports.",
+)
 def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
-    """Ask a running pipeline how it is.
+    """Show the state of a running pipeline.
 
-    Exits with 0 where all three processes were heard, and with 1 otherwise: a
-    health check of a container, or of a timer.
+    The exit code is 0 if all three processes sent a health report, else 1, so
+    that it can be the health check of a container.
 
     \b
     Prints
       state      following, paused, or waiting for a box
-      frames     how many were followed, and how many a second now
-      learning   messages that the compressor has not taken yet, or not stored
-      model      the version that the detector uses
-      trees      the coreset trees of the compressor
-      source     whether a camera or a stream is there, and the frames skipped
-      rejected   messages that were not what their channel carries
-      trouble    what is wrong with a process, where something is
-      heard      each process, and how long ago it said so
+      frames     number of processed frames, and frames per second
+      learning   messages that the compressor has not received, or not stored
+      model      version of the model that the detector uses
+      trees      size of the coreset trees
+      source     whether a live source is available, and the number of skipped frames
+      rejected    messages that do not conform to the protocol
+      trouble    a problem of a process, if there is one
+      reports    each process, and the age of its last health report
 
     \b
     EXAMPLES
       catstream status
       catstream status --endpoint run --json
     """
-    place, reports = _listen(endpoint, keys, wait)
-    found = _summary(place, reports)
+    place, reports = _collect_reports(endpoint, keys, wait)
+    summary = _summary(place, reports)
     silent = [name for name in _NAMES if name not in reports]
     if as_json:
-        click.echo(json.dumps(found))
+        click.echo(json.dumps(summary))
     elif reports:
-        click.echo(_text(found))
+        click.echo(_format(summary))
     if silent:
-        click.echo(f"catstream: not heard at {place} within {wait:g} s: {', '.join(silent)}", err=True)
+        click.echo(f"catstream: no health report at {place} within {wait:g} s from: {', '.join(silent)}", err=True)
         sys.exit(1)
 
 
-def _listen(endpoint: str, keys: str, seconds: float) -> tuple[str, dict[str, list[Health]]]:
-    """What each process said, oldest first, until all were heard and the detector twice: that gives its rate."""
+def _collect_reports(endpoint: str, keys: str, seconds: float) -> tuple[str, dict[str, list[Health]]]:
+    """Collect reports, oldest first, until there are two of the detector, for its rate, and one of the others."""
     deadline = time.monotonic() + seconds
     reports: dict[str, list[Health]] = {}
     with subscribe(endpoint, "health", keys=keys) as health:
@@ -77,7 +83,7 @@ def _listen(endpoint: str, keys: str, seconds: float) -> tuple[str, dict[str, li
 
 
 def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
-    """What was heard, in figures; None for what was not."""
+    """Return the figures from the reports, None for those that are missing."""
     counters = {name: reports[name][-1].counters if name in reports else {} for name in _NAMES}
     detector, compressor = counters["detector"], counters["compressor"]
 
@@ -103,11 +109,11 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
         "skipped": whole(detector, "skipped"),
         "reopened": whole(detector, "reopened"),
         "lost_seconds": detector.get("lost_seconds"),
-        "trouble": {name: heard[-1].trouble for name, heard in reports.items() if heard[-1].trouble},
+        "trouble": {name: history[-1].trouble for name, history in reports.items() if history[-1].trouble},
         "rejected": {name: int(counters[name].get("rejected", 0)) for name in reports},
         "processes": {
-            name: {"seconds_ago": round(max(0.0, time.time() - heard[-1].time), 2), "counters": heard[-1].counters}
-            for name, heard in reports.items()
+            name: {"seconds_ago": round(max(0.0, time.time() - history[-1].time), 2), "counters": history[-1].counters}
+            for name, history in reports.items()
         },
     }
 
@@ -118,33 +124,35 @@ def _state(detector: dict[str, float]) -> str | None:
     return "waiting for a box" if detector.get("waiting") else "paused" if detector.get("paused") else "following"
 
 
-def _rate(heard: list[Health]) -> float | None:
-    """Frames a second between the first and the last of a detector's reports."""
-    if len(heard) < 2 or heard[-1].time <= heard[0].time:
+def _rate(history: list[Health]) -> float | None:
+    """Return the frames per second between the first and the last report of the detector."""
+    if len(history) < 2 or history[-1].time <= history[0].time:
         return None
-    frames = heard[-1].counters["sent"] - heard[0].counters["sent"]
-    return round(max(0.0, frames) / (heard[-1].time - heard[0].time), 1)  # a restarted detector goes back
+    frames = history[-1].counters["sent"] - history[0].counters["sent"]
+    return round(
+        max(0.0, frames) / (history[-1].time - history[0].time), 1
+    )  # the counter of a restarted detector decreases
 
 
-def _text(found: dict[str, Any]) -> str:
+def _format(summary: dict[str, Any]) -> str:
     def shown(name: str) -> str:
-        return "-" if found[name] is None else f"{found[name]}"
+        return "-" if summary[name] is None else f"{summary[name]}"
 
-    heard = (f"{name} {of['seconds_ago']:.1f} s ago" for name, of in found["processes"].items())
-    size = "-" if found["bytes"] is None else f"{found['bytes'] / 1e6:.1f}"
-    lost = f"lost for {found['lost_seconds']:.0f} s" if found["lost_seconds"] else "there"
+    history = (f"{name} {of['seconds_ago']:.1f} s ago" for name, of in summary["processes"].items())
+    size = "-" if summary["bytes"] is None else f"{summary['bytes'] / 1e6:.1f}"
+    lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "there"
     source = f"source     {lost}, {shown('skipped')} frames skipped, came back {shown('reopened')} times"
     return "\n".join(
         (
-            f"pipeline   {found['endpoint']}",
+            f"pipeline   {summary['endpoint']}",
             f"state      {shown('state')}",
             f"frames     {shown('frames')}, {shown('frames_per_second')} a second",
             f"learning   {shown('lag')} messages behind, {shown('not_stored')} not stored",
             f"model      {shown('model_version')}",
             f"trees      {shown('leaves')} leaves, {shown('nodes')} nodes, level {shown('level')}, {size} MB",
-            *([source] if found["skipped"] is not None else []),  # a file skips none
-            f"rejected   {sum(found['rejected'].values())} messages",
-            f"heard      {', '.join(heard)}",
-            *(f"trouble    {name}: {trouble}" for name, trouble in found["trouble"].items()),
+            *([source] if summary["skipped"] is not None else []),  # None for a file
+            f"rejected    {sum(summary['rejected'].values())} messages",
+            f"reports    {', '.join(history)}",
+            *(f"trouble    {name}: {trouble}" for name, trouble in summary["trouble"].items()),
         )
     )

@@ -22,10 +22,10 @@ __all__ = ["pause", "resume", "save", "set_box", "stop"]
 
 
 @dataclass(frozen=True, slots=True)
-class _Meant:
-    """The pipeline that a command is for, as the options say it.
+class _Target:
+    """The pipeline that a command is for, as given by the options.
 
-    yes  whether a person who named none agrees to the only one
+    yes  do not ask for confirmation if neither --endpoint nor --source is given
     """
 
     endpoint: str
@@ -35,48 +35,50 @@ class _Meant:
     yes: bool
 
     @property
-    def named(self) -> bool:
+    def is_named(self) -> bool:
         return bool(self.endpoint or self.source)
 
     def control(self) -> Control:
-        """Connect to it and say which one it is; a person at a terminal who named none is asked first."""
+        """Connect to the pipeline and print its name. At a terminal, ask for confirmation if it was not named."""
         pipeline = control(self.endpoint, timeout=self.timeout, keys=self.keys, source=self.source)
         line = f"pipeline: {pipeline.source or 'a pipeline'} at {pipeline.endpoint}"
         if self.endpoint and not pipeline.source:
-            return pipeline  # nothing is known of it but what was said
-        if self.named or self.yes or not sys.stdin.isatty():
+            return pipeline  # nothing more is known than the endpoint
+        if self.is_named or self.yes or not sys.stdin.isatty():
             click.echo(line, err=True)
-        elif not click.confirm(f"{line}. Is it the one that you mean?", default=True, err=True):
+        elif not click.confirm(f"{line}. Is this the right one?", default=True, err=True):
             pipeline.close()
-            raise ServiceError("nothing was done: name the pipeline with --endpoint or --source")
+            raise ServiceError("no command was sent: name the pipeline with --endpoint or --source")
         return pipeline
 
 
 def _with_pipeline(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that say which pipeline is meant; the command gets them as one argument `meant`."""
+    """Add the options that select a pipeline; the command gets them as one argument `target`."""
 
     @with_endpoint
-    @click.option("--source", default="", metavar="SOURCE", help="The source that it follows, instead of --endpoint.")
+    @click.option(
+        "--source", default="", metavar="SOURCE", help="The source that the pipeline tracks, instead of --endpoint."
+    )
     @click.option(
         "--timeout", default=5.0, show_default=True, type=click.FloatRange(0), help="Seconds to wait for an answer."
     )
-    @click.option("--yes", is_flag=True, help="Do not ask whether the only pipeline that runs is the one meant.")
+    @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
     @wraps(command)
     def wrapped(endpoint: str, source: str, keys: str, timeout: float, yes: bool, **options: Any) -> None:
         if endpoint and source:
-            raise click.UsageError("--endpoint and --source both say which pipeline is meant: give one of them")
-        command(meant=_Meant(endpoint, source, keys, timeout, yes), **options)
+            raise click.UsageError("--endpoint and --source both select the pipeline: give one of them")
+        command(target=_Target(endpoint, source, keys, timeout, yes), **options)
 
     return wrapped
 
 
-def _steers(command: Callable[..., str]) -> Callable[..., None]:
-    """Add the same; the command gets a Control, and what it returns is printed."""
+def _with_control(command: Callable[..., str]) -> Callable[..., None]:
+    """Add the same options; the command gets a `Control`, and its return value is printed."""
 
     @_with_pipeline
     @wraps(command)
-    def wrapped(meant: _Meant, **options: Any) -> None:
-        with meant.control() as pipeline:
+    def wrapped(target: _Target, **options: Any) -> None:
+        with target.control() as pipeline:
             click.echo(command(pipeline, **options))
 
     return wrapped
@@ -84,14 +86,14 @@ def _steers(command: Callable[..., str]) -> Callable[..., None]:
 
 @click.command("set-box", context_settings={"ignore_unknown_options": True})  # -3,40,60,60 is a box
 @click.argument("box", metavar="X,Y,W,H")
-@click.option("--keep", is_flag=True, help="It is the same object: what was learned of it is kept.")
-@_steers
+@click.option("--keep", is_flag=True, help="Same object: keep what was learned.")
+@_with_control
 def set_box(pipeline: Control, box: str, keep: bool) -> str:
-    """Tell a running pipeline where the object is.
+    """Set the box of the object in a running pipeline.
 
-    X,Y,W,H is its box in the newest frame, in pixels; while the pipeline is
-    paused or waits for a box, in the frame that is held. What was learned of
-    another object before is forgotten.
+    X,Y,W,H is the box in pixels in the newest frame, or in the next frame if
+    the pipeline is paused or waits for a box. By default it is a new object,
+    and everything learned of the previous one is dropped.
 
     \b
     EXAMPLES
@@ -102,12 +104,12 @@ def set_box(pipeline: Control, box: str, keep: bool) -> str:
 
 
 @click.command()
-@_steers
+@_with_control
 def pause(pipeline: Control) -> str:
-    """Have a running pipeline take no more frames.
+    """Pause a running pipeline.
 
-    A file waits; the frames of a camera or a stream pass by and are counted as
-    skipped. `catstream resume` goes on.
+    A file waits; the frames of a camera or a stream are counted as skipped.
+    `catstream resume` continues.
 
     \b
     EXAMPLES
@@ -118,9 +120,9 @@ def pause(pipeline: Control) -> str:
 
 
 @click.command()
-@_steers
+@_with_control
 def resume(pipeline: Control) -> str:
-    """Have a paused pipeline go on.
+    """Resume a paused pipeline.
 
     \b
     EXAMPLES
@@ -132,19 +134,19 @@ def resume(pipeline: Control) -> str:
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
-    "--state", type=click.Path(path_type=Path), metavar="FOLDER", help="Of a run with --state; it may be over."
+    "--state", type=click.Path(path_type=Path), metavar="FOLDER", help="State folder of a run, which may have ended."
 )
 @_with_pipeline
-def save(meant: _Meant, file: Path, state: Path | None) -> None:
-    """Write what a pipeline has learned to FILE.
+def save(target: _Target, file: Path, state: Path | None) -> None:
+    """Save what a pipeline has learned to FILE.
 
-    It holds the newest model, and a summary of all that it was learned from.
-    `catstream track SOURCE --model FILE` finds the object again by it, and goes
-    on learning from there. A pipeline that runs goes on meanwhile.
+    The file has the newest model and the coreset that it was trained on.
+    `catstream track SOURCE --model FILE` finds the object with it and continues
+    to learn. A running pipeline is not interrupted.
 
-    With --state it is what the newest checkpoint in that folder holds, and no
-    pipeline has to run. A run without such a folder writes the same file at its
-    end with `catstream track --save-model FILE`.
+    With --state, the newest checkpoint in that folder is saved, and no pipeline
+    has to run. `catstream track --save-model FILE` writes the same file at the
+    end of a run.
 
     \b
     EXAMPLES
@@ -153,25 +155,25 @@ def save(meant: _Meant, file: Path, state: Path | None) -> None:
       catstream track other.mp4 --model walker.safetensors
     """
     if state is None:
-        with meant.control() as pipeline:
+        with target.control() as pipeline:
             version = pipeline.save(file).version
-    elif meant.named:
+    elif target.is_named:
         raise click.UsageError(
             "--state names the folder of a run, --endpoint and --source a running pipeline: give one"
         )
     else:
-        found = learned(state, Job.load(state).settings)
-        found.save(file)
-        version = found.model.version
+        content = learned(state, Job.load(state).settings)
+        content.save(file)
+        version = content.model.version
     click.echo(f"model {version} is in {file}")
 
 
 @click.command()
-@_steers
+@_with_control
 def stop(pipeline: Control) -> str:
-    """End a running pipeline as if its source had come to its end.
+    """Stop a running pipeline as if its source had ended.
 
-    All that it learned is stored first, and its results are whole.
+    Everything learned is stored first, and the results are complete.
 
     \b
     EXAMPLES

@@ -203,7 +203,7 @@ def track(
                 # Not before there is something to write: a run that cannot start leaves older results alone.
                 keep = keep or stack.enter_context(files.opened(resume=resume is not None))
                 before, moment = moment, time.perf_counter()
-                with interrupts.held():  # a frame is in all results, and counted, or in none
+                with interrupts.deferred():  # a frame is in all results, and counted, or in none
                     keep(found, moment - before)
                     run.show(progress, found)
     except KeyboardInterrupt:

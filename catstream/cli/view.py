@@ -1,4 +1,4 @@
-"""`catstream view`: the web page of a running pipeline."""
+"""`catstream view`: serve a web page for a running pipeline."""
 
 from __future__ import annotations
 
@@ -14,29 +14,34 @@ __all__ = ["view"]
 
 @click.command()
 @with_endpoint
-@click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen.")
-@click.option("--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="0 for any that is free.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Host name or address to listen on.")
+@click.option(
+    "--port",
+    default=PORT,
+    show_default=True,
+    type=click.IntRange(0, 65535),
+    help="Port to listen on; 0 for any free port.",
+)
 @with_token()
 def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> None:
-    """Look at a running pipeline in a browser, and steer it.
+    """Watch and steer a running pipeline in a browser.
 
-    The page shows the picture with the box, the score, frames a second, the
-    coreset trees as they grow, and the frames that taught most. A box drawn
-    on the picture is followed from there on. If no pipeline runs, the page
-    waits for one, and it goes on with the next one. Ctrl-C ends it; the
-    pipeline goes on.
+    The page shows the picture with the box, the score, frames per second, the
+    coreset trees, and the most surprising frames. If you draw a box on the
+    picture, the pipeline tracks that object. If no pipeline runs, the page
+    waits for the next one. Ctrl-C ends the server; the pipeline continues.
 
-    On another host than 127.0.0.1 a token is needed; the addresses that are
-    printed end with it. What travels is not encrypted: through an ssh tunnel,
-    or behind a proxy with TLS, it is.
+    If the host is not a loopback address, a token is required; the printed
+    addresses end with it. The connection is not encrypted: use an ssh tunnel,
+    or a proxy with TLS.
 
     \b
     Serves
       /              the page
-      /live.mjpeg    the newest picture with its track drawn in, again and again
-      /metrics       for Prometheus: catstream_frames_total ...
+      /live.mjpeg    the newest pictures with their tracks drawn in, as MJPEG
+      /metrics       metrics for Prometheus: catstream_frames_total ...
       /healthz       200 while this server runs
-      /readyz        200 while all processes of the pipeline are heard
+      /readyz        200 while all processes send health reports
 
     \b
     EXAMPLES

@@ -1,4 +1,4 @@
-"""`catstream watch`: what a running pipeline says, as it says it."""
+"""`catstream watch`: print the messages of a running pipeline."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from catstream.subscription import Subscription, subscribe
 
 __all__ = ["watch"]
 
-_RATE_SECONDS = 2.0  # that the rate is the mean of
-_ROWS = 16  # of the newest messages that a terminal shows
-_REFRESHES = 8  # a second
-_LEFT = {"state", "process", "counters", "levels"}  # columns of words
+_RATE_SECONDS = 2.0  # interval of the mean rate
+_ROWS = 16  # number of messages that a terminal shows
+_REFRESHES = 8  # per second
+_LEFT = {"state", "process", "counters", "levels"}  # left-aligned columns
 
 
 def _track(message: Track) -> dict[str, str]:
@@ -95,7 +95,7 @@ def _health(message: Health) -> dict[str, str]:
     return {"process": message.process, "counters": "  ".join(counters)}
 
 
-#: Of each channel: what a person wants to see of a message, by the name of its column.
+#: Channel -> function that returns the cells of a message by the names of their columns.
 _CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
     "tracks": _track,
     "models": _model,
@@ -111,21 +111,22 @@ _CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
 @with_endpoint
 @with_wait
 @click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
-@click.option("--count", type=click.IntRange(min=1), help="End after so many messages.")
+@click.option("--count", type=click.IntRange(min=1), help="End after this number of messages.")
 def watch(channel: str, endpoint: str, keys: str, wait: float, as_json: bool, count: int | None) -> None:
-    """Show what a running pipeline says, until it ends or Ctrl-C.
+    """Print the messages of a running pipeline, until it ends or Ctrl-C.
 
-    The pipeline does not wait: what this reader was too slow for is counted as
-    missed. With --json an array is told by its dtype, its shape and its norm.
+    The pipeline does not wait; messages that are dropped because this command
+    is too slow are counted as missed. With --json, an array is printed as its
+    dtype, shape and norm.
 
     \b
     CHANNEL
-      tracks    where the object is, frame by frame
-      models    what was learned: the last model, then the newest
-      health    what each process counts, once a second
-      samples   what the trainer learns from, and the levels of the object's tree
-      features  the rows that each frame teaches
-      previews  small pictures of the newest frame, about ten a second
+      tracks    state and box of the object in each frame
+      models    the last model, then each new one
+      health    the counters of each process, every second
+      samples   the samples for the trainer, and the levels of the object's tree
+      features  the training rows of each frame
+      previews  small pictures of the newest frame, about ten per second
 
     \b
     EXAMPLES
@@ -158,7 +159,7 @@ def _print_json(message: Any) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """A message for JSON; an array, or a picture, by what it is."""
+    """Return a message as a JSON value; an array or a picture is replaced by a description."""
     if isinstance(value, np.ndarray):
         norm = float(np.linalg.norm(np.nan_to_num(value)))
         return {"dtype": value.dtype.name, "shape": value.shape, "norm": round(norm, 6)}

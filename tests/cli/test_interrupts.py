@@ -29,7 +29,7 @@ def test_a_frame_that_was_begun_is_in_all_results_before_the_run_ends(interrupts
 
     def follow():
         for frame in range(10):
-            with interrupts.held():
+            with interrupts.deferred():
                 results.append(frame)
                 if frame == 3:
                     signal.raise_signal(number)
@@ -41,7 +41,7 @@ def test_a_frame_that_was_begun_is_in_all_results_before_the_run_ends(interrupts
 
 
 def test_between_frames_it_ends_at_once(interrupts):
-    with interrupts.held():
+    with interrupts.deferred():
         pass
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)

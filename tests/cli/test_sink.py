@@ -88,7 +88,7 @@ def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the
     assert sink.returncode == 0, errors
     frames = [json.loads(line)["frame"] for line in file.read_text().splitlines()]
     assert frames == list(range(310))
-    assert "310 tracks, 0 missed: it had no end, and another run began" in errors
+    assert "310 tracks, 0 missed: the run had no end, and another one started" in errors
 
 
 def test_where_no_pipeline_is_heard_no_file_is_left(said, tmp_path):

@@ -158,7 +158,7 @@ def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, 
 LIVE = "http://127.0.0.1:1/one"
 REFUSED = {
     "in lockstep": (["--lockstep"], "leave lockstep away"),
-    "from a later frame": (["--start", "9"], "leave start, end and stride away"),
+    "from a later frame": (["--start", "9"], "leave out start, end and stride"),
     "not there": ([], "connection refused"),
 }
 

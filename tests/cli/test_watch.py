@@ -112,14 +112,14 @@ def test_where_no_pipeline_runs_one_line_says_so(said, tmp_path, arguments):
 def test_where_a_place_is_silent_one_line_says_so(said, tmp_path):
     code, output, errors = said("watch", "tracks", "--endpoint", tmp_path, "--wait", 0.2)
     assert (code, output) == (1, "")
-    assert errors == f"catstream: no health came from {tmp_path} within 0.2 s: is a pipeline running there?\n"
+    assert errors == f"catstream: no health arrived from {tmp_path} within 0.2 s: is a pipeline running there?\n"
 
 
 def test_status_tells_of_all_processes(resting, said):
     code, output, errors = said("status", "--endpoint", resting.endpoint, "--wait", SECONDS)
     assert (code, errors) == (0, "")
     assert [line.split()[0] for line in output.splitlines()] == [
-        "pipeline", "state", "frames", "learning", "model", "trees", "rejected", "heard",
+        "pipeline", "state", "frames", "learning", "model", "trees", "rejected", "reports",
     ]  # fmt: skip
     assert all(name in output for name in NAMES)
 
@@ -146,4 +146,4 @@ def test_status_names_a_process_that_is_silent_and_fails(resting, said):
         os.kill(resting.pids["trainer"], signal.SIGCONT)
     assert code == 1
     assert "trainer" not in output
-    assert errors == f"catstream: not heard at {resting.endpoint} within 3 s: trainer\n"
+    assert errors == f"catstream: no health report at {resting.endpoint} within 3 s from: trainer\n"

@@ -75,11 +75,11 @@ def test_at_a_terminal_the_only_pipeline_is_commanded_if_a_person_says_so(pipeli
     at_a_terminal(monkeypatch)
     refused = said("stop", input="n\n")
     assert (refused.exit_code, heard) == (1, [])
-    assert f"/films/walk.mp4 at {place}. Is it the one that you mean?" in refused.stderr
-    assert "nothing was done" in str(refused.exception)
+    assert f"/films/walk.mp4 at {place}. Is this the right one?" in refused.stderr
+    assert "no command was sent" in str(refused.exception)
     assert said("stop", input="\n").exit_code == 0
     for named in (["--yes"], ["--endpoint", place], ["--source", "walk.mp4"]):
-        assert "Is it the one" not in said("stop", *named, input="n\n").stderr
+        assert "Is this the right one" not in said("stop", *named, input="n\n").stderr
     assert heard == ["stop"] * 4
 
 

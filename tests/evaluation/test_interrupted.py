@@ -28,7 +28,7 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_leaves_none(walk, tmp_pa
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate()
     assert "Traceback" not in errors
-    assert errors.splitlines()[-1].startswith("stopped: finished runs are kept in ")
+    assert errors.splitlines()[-1].startswith("stopped: complete runs are in ")
     assert process.returncode == INTERRUPTED
     assert not psutil.wait_procs(children, timeout=10)[1]
 
