@@ -44,7 +44,7 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
       model      version of the model that the detector uses
       trees      size of the coreset trees
       source     whether a live source is available, and the number of skipped frames
-      rejected    messages that do not conform to the protocol
+      rejected   messages that do not conform to the protocol
       trouble    a problem of a process, if there is one
       reports    each process, and the age of its last health report
 
@@ -151,7 +151,7 @@ def _format(summary: dict[str, Any]) -> str:
             f"model      {shown('model_version')}",
             f"trees      {shown('leaves')} leaves, {shown('nodes')} nodes, level {shown('level')}, {size} MB",
             *([source] if summary["skipped"] is not None else []),  # None for a file
-            f"rejected    {sum(summary['rejected'].values())} messages",
+            f"rejected   {sum(summary['rejected'].values())} messages",
             f"reports    {', '.join(history)}",
             *(f"trouble    {name}: {trouble}" for name, trouble in summary["trouble"].items()),
         )
