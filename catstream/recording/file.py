@@ -18,8 +18,18 @@ from typing import Any, BinaryIO, Self, TypeVar
 
 from catstream.errors import ProtocolError, RecordingError
 from catstream.messages import End, Features, Health, Model, Run, Track
-from catstream.recording.container import MAGIC, Entry, Index, Topic, end_of_data, entries, entry_at, opening, pack
-from catstream.recording.container import summary as summary_of
+from catstream.recording.container import (
+    MAGIC,
+    Entry,
+    Index,
+    Topic,
+    end_of_data,
+    entries,
+    entry_at,
+    opening,
+    pack,
+    summary,
+)
 from catstream.settings import Settings
 from catstream.storage import lock
 from catstream.wire.codec import decode, decode_json, encode, encode_json
@@ -114,7 +124,7 @@ class RecordingWriter:
             return
         size = self._size
         try:
-            for block in summary_of(_TOPICS, self._index, size):
+            for block in summary(_TOPICS, self._index, size):
                 self._append(block)
         except RecordingError:  # the index can be made from the messages
             self._size = size
