@@ -44,7 +44,7 @@ def test_an_absent_object_is_no_detection_and_both_can_be_drawn_and_filtered():
     assert drawn[1].any()
 
 
-def test_without_supervision_one_line_says_what_to_install(monkeypatch):
+def test_a_missing_supervision_is_an_error_with_the_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "supervision", None)
     with pytest.raises(ImportError, match=r'pip install "catstream\[supervision\]"'):
         catstream.to_supervision(Track(3, 2, 0.1, "absent", None, 0.1, 7))

@@ -102,7 +102,7 @@ def holds_tracks(shown):
 
 
 @pytest.mark.parametrize("beside", [False], ids=["without keys"], indirect=True)
-def test_the_rerun_subscriber_writes_what_the_viewer_would_show(beside, shown):
+def test_the_rerun_subscriber_writes_a_file_for_the_viewer(beside, shown):
     if why := missing("rerun_subscriber.py"):
         pytest.skip(why)
     code, printed = beside.printed["rerun_subscriber.py"]

@@ -31,12 +31,12 @@ for name in VERBS:
 """
 
 
-def test_following_and_the_help_of_every_verb_need_no_extra():
+def test_tracking_and_the_help_of_every_command_need_no_extra():
     subprocess.run([sys.executable, "-P", "-c", BASE], check=True)
 
 
 @pytest.mark.parametrize(("package", "extra"), [("catstream.web", "view"), ("catstream.loadtest", "loadtest")])
-def test_a_package_whose_extra_is_missing_says_the_command(monkeypatch, package, extra):
+def test_a_missing_extra_is_an_error_with_the_install_command(monkeypatch, package, extra):
     monkeypatch.setitem(sys.modules, EXTRAS[extra][1][0], None)
     for name in [name for name in sys.modules if name == package or name.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, name)
@@ -45,11 +45,11 @@ def test_a_package_whose_extra_is_missing_says_the_command(monkeypatch, package,
 
 
 @pytest.mark.parametrize("extra", EXTRAS)
-def test_an_extra_that_is_installed_says_nothing(extra):
+def test_an_installed_extra_is_no_error(extra):
     require_extra(extra)
 
 
-def test_the_command_is_of_this_environment(monkeypatch):
+def test_the_install_command_is_that_of_this_environment(monkeypatch):
     monkeypatch.setenv("PATH", "/nowhere")
     assert install_command("view") == f'{sys.executable} -m pip install "catstream[view]"'
 

@@ -14,7 +14,7 @@ def bgr(rng):
     return rng.integers(0, 256, (6, 8, 3), np.uint8)
 
 
-def test_an_ordinary_frame_is_passed_on_and_not_copied(bgr):
+def test_a_bgr_frame_is_not_copied(bgr):
     assert as_bgr(bgr) is bgr
 
 
@@ -66,7 +66,7 @@ def test_grey_is_expanded(bgr, form):
         (np.full((4, 5, 3), 1j), "got complex128"),
     ],
 )
-def test_what_is_no_image_is_an_error_of_one_line_that_says_what_to_do(image, told):
+def test_an_array_that_is_no_image_is_one_line_of_error_with_a_remedy(image, told):
     with pytest.raises(FrameError, match=told) as error:
         as_bgr(image)
     assert "\n" not in str(error.value)

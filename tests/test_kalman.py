@@ -28,7 +28,7 @@ def test_the_first_models_need_no_filterpy_and_its_import_begins_half_a_block_of
     assert tracker.detector.model.version
 
 
-def test_a_filter_asked_for_during_the_import_waits_for_it_without_a_word():
+def test_a_filter_requested_during_the_import_waits_for_it_without_output():
     code = """
 import numpy as np
 from catstream.kalman import constant_velocity, prepare

@@ -49,7 +49,7 @@ def learned(compressor, rng):
     )
 
 
-def test_what_is_saved_comes_back_bit_for_bit_with_frames_that_count_anew(learned, tmp_path):
+def test_a_saved_model_is_loaded_bit_for_bit_and_frames_start_at_zero(learned, tmp_path):
     learned.save(tmp_path / "one")
     read = Learned.load(tmp_path / "one")
     anew = (dataclasses.replace(part, frame=0) for part in (learned.model, learned.sample))
@@ -57,7 +57,7 @@ def test_what_is_saved_comes_back_bit_for_bit_with_frames_that_count_anew(learne
 
 
 @pytest.mark.parametrize("share", [0, 0.3, 0.99])
-def test_a_torn_file_is_refused(learned, tmp_path, share):
+def test_an_incomplete_file_is_an_error(learned, tmp_path, share):
     learned.save(tmp_path / "one")
     whole = (tmp_path / "one").read_bytes()
     (tmp_path / "one").write_bytes(whole[: int(share * len(whole))])
@@ -65,13 +65,13 @@ def test_a_torn_file_is_refused(learned, tmp_path, share):
         Learned.load(tmp_path / "one")
 
 
-def test_another_file_of_ours_is_refused(compressor, tmp_path):
+def test_a_file_of_another_kind_is_an_error(compressor, tmp_path):
     compressor.save(tmp_path / "one")
     with pytest.raises(ProtocolError, match="not a saved model"):
         Learned.load(tmp_path / "one")
 
 
-def test_where_it_cannot_be_written_it_says_so_and_leaves_nothing(learned, tmp_path):
+def test_an_unwritable_file_is_an_error_and_leaves_nothing(learned, tmp_path):
     with pytest.raises(ServiceError, match="cannot write"):
         learned.save(tmp_path / "none" / "one")
     assert not list(tmp_path.iterdir())

@@ -49,7 +49,7 @@ def test_every_benchmark_has_a_record_and_every_record_its_place_on_the_page():
 
 
 @EVERY_RECORD
-def test_a_record_says_what_made_it(record):
+def test_a_record_has_its_provenance(record):
     assert {"version", "commit", "date", "command", "settings", "machine"} <= record.keys()
     assert re.fullmatch(r"[0-9a-f]{10}", record["commit"]), "measured beside changes that were not committed"
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"])
@@ -58,11 +58,11 @@ def test_a_record_says_what_made_it(record):
 
 
 @EVERY_RECORD
-def test_a_record_names_no_folder_of_the_machine(record):
+def test_a_record_has_no_folder_of_the_machine(record):
     assert not re.findall(r'"[^"]*(?:^|[ "=])/\w[^"]*"', json.dumps(record)), "a path of the machine"
 
 
-def test_the_sequences_that_the_defaults_were_chosen_on_are_told_apart():
+def test_the_tuning_set_is_reported_separately():
     names = {row["name"] for row in FOUND["accuracy"]["sequences"]}
     assert (len(TUNED), len(CHECK), len(TUNED & CHECK)) == (20, 15, 3)
     assert names >= TUNED | CHECK

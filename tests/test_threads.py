@@ -38,7 +38,7 @@ def test_all_libraries_are_on_one_thread_inside_and_as_before_outside():
 
 
 @pytest.mark.usefixtures("libraries")
-def test_an_exception_sets_back_what_was():
+def test_an_exception_restores_the_number_of_threads():
     before = counts()
     with pytest.raises(ZeroDivisionError), one_thread():
         _ = 1 / 0
@@ -46,7 +46,7 @@ def test_an_exception_sets_back_what_was():
 
 
 @pytest.mark.usefixtures("libraries")
-def test_of_two_threads_the_last_to_leave_sets_it_back():
+def test_the_last_of_two_threads_restores_the_number():
     before, both, first_left = counts(), Barrier(2), Barrier(2)
 
     def first():
@@ -67,7 +67,7 @@ def test_of_two_threads_the_last_to_leave_sets_it_back():
 
 
 @pytest.mark.usefixtures("libraries")
-def test_what_the_user_sets_meanwhile_is_not_set_back():
+def test_a_number_set_by_the_user_meanwhile_is_kept():
     holder = one_thread()
     holder.__enter__()
     with threadpool_limits(1):
@@ -80,7 +80,7 @@ def test_what_the_user_sets_meanwhile_is_not_set_back():
     assert [library.get_num_threads() for library in libraries] == meant
 
 
-def test_opencv_is_held_only_if_asked_for():
+def test_opencv_is_limited_only_if_requested():
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:

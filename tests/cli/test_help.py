@@ -25,7 +25,7 @@ def help_of(said):
     return ask
 
 
-def test_the_command_names_its_verbs_and_shows_how_to_start(said_by_process):
+def test_the_help_lists_the_commands_and_shows_a_first_example(said_by_process):
     code, output, errors = said_by_process("--help")
     assert (code, errors) == (0, "")
     text = " ".join(output.split())
@@ -34,24 +34,24 @@ def test_the_command_names_its_verbs_and_shows_how_to_start(said_by_process):
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_says_what_it_does(help_of, verb):
+def test_every_command_has_a_help_text(help_of, verb):
     assert help_of(verb).startswith(f"Usage: catstream {verb}")
 
 
-def test_track_says_what_it_writes_and_how_it_is_stopped(help_of):
+def test_the_help_of_track_lists_its_files_and_how_to_stop_it(help_of):
     text = help_of("track")
     for word in ("NAME.txt", "NAME_confidence.value", "NAME_time.txt", "NAME.csv", "NAME.mp4", "Ctrl-C", "EXAMPLES"):
         assert word in text
 
 
-def test_a_verb_that_does_not_exist_is_refused(said_by_process):
+def test_an_unknown_command_is_an_error(said_by_process):
     code, _, errors = said_by_process("trakc")
     assert code == 2
     assert "No such command 'trakc'" in errors
 
 
 @pytest.mark.parametrize("name", [*NAMES, "supervisor"])
-def test_every_process_says_what_it_does(name):
+def test_every_process_has_a_help_text(name):
     command = [sys.executable, "-P", "-m", "catstream.services", name, "--help"]
     run = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (run.returncode, run.stderr) == (0, "")
@@ -66,7 +66,7 @@ LONG = {
 
 
 @pytest.mark.parametrize(("verb", "options", "begun"), [(verb, *how) for verb, how in LONG.items()], ids=LONG)
-def test_ctrl_c_ends_any_verb_with_130_and_no_traceback(catstream, until, tmp_path, verb, options, begun):
+def test_ctrl_c_ends_any_command_with_130_and_no_traceback(catstream, until, tmp_path, verb, options, begun):
     process = catstream(verb, *options, cwd=tmp_path)
     until(lambda: begun(Path(f"/proc/{process.pid}/task").glob("*/comm"), tmp_path) or process.poll() is not None)
     process.send_signal(signal.SIGINT)

@@ -24,7 +24,7 @@ def interrupts():
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_frame_that_was_begun_is_in_all_results_before_the_run_ends(interrupts, number):
+def test_a_signal_takes_effect_after_the_current_frame(interrupts, number):
     results, video = [], []
 
     def follow():
@@ -40,14 +40,14 @@ def test_a_frame_that_was_begun_is_in_all_results_before_the_run_ends(interrupts
     assert results == video == [0, 1, 2, 3]
 
 
-def test_between_frames_it_ends_at_once(interrupts):
+def test_between_frames_a_signal_takes_effect_at_once(interrupts):
     with interrupts.deferred():
         pass
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
 
 
-def test_what_a_shell_has_this_process_ignore_is_ignored(interrupts):
+def test_ignored_signals_stay_ignored(interrupts):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     interrupts.install()
     signal.raise_signal(signal.SIGHUP)

@@ -8,7 +8,7 @@ import re
 import pytest
 
 
-def test_a_run_counts_every_frame_and_says_which_limit_was_broken(said, tmp_path):
+def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     arguments = ["--rate", 20, "--duration", 3, "--size", "320x240", "--subscribers", 3, "--slow-subscribers", 2]
     limits = ["--limit", "max=0", "--limit", "missed=1"]
     code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
@@ -52,7 +52,7 @@ def test_a_run_counts_every_frame_and_says_which_limit_was_broken(said, tmp_path
         (["--set", "run.lockstep=true"], "leave out lockstep"),
     ],
 )
-def test_what_makes_no_sense_is_refused_before_anything_starts(said, tmp_path, arguments, message):
+def test_contradictory_options_are_errors_before_the_start(said, tmp_path, arguments, message):
     code, _, errors = said("loadtest", *arguments, cwd=tmp_path)
     assert code in (1, 2)
     assert message in " ".join(errors.split())

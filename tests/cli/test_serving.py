@@ -10,7 +10,7 @@ from catstream.cli.serving import AddressType, with_token
 
 
 @pytest.mark.parametrize("text", ["", "x", "host:", "8000:host", "70000", "-1"])
-def test_what_is_no_address_to_listen_at_is_refused(text):
+def test_a_malformed_address_is_an_error(text):
     with pytest.raises(click.BadParameter, match="for example 8000"):
         AddressType().convert(text, None, None)
 

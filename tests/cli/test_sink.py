@@ -20,7 +20,7 @@ from catstream.wire.newest import Publisher
 FILES = ["tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet"]
 
 
-def test_tracks_go_to_files_and_stay_there(video, catstream, tmp_path):
+def test_tracks_are_written_to_files_and_stay_there(video, catstream, tmp_path):
     source, box = video
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     with Pipeline(source, [float(side) for side in box.split(",")], Settings(run={"unstored_frames": 1})) as pipeline:
@@ -63,7 +63,7 @@ def written(folder, errors):
     return frames
 
 
-def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the_end(
+def test_repeated_frames_of_a_restarted_detector_are_skipped_and_another_run_ends_the_sink(
     catstream, folder, tmp_path, until
 ):
     endpoint, file = Endpoint.parse(str(folder)), tmp_path / "tracks.ndjson"
@@ -91,7 +91,7 @@ def test_what_a_restarted_detector_repeats_is_passed_over_and_another_run_is_the
     assert "310 tracks, 0 missed: the run had no end, and another one started" in errors
 
 
-def test_where_no_pipeline_is_heard_no_file_is_left(said, tmp_path):
+def test_without_a_pipeline_no_file_is_left(said, tmp_path):
     code, _, errors = said("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path, "--wait", 1)
     assert code == 1
     assert "is a pipeline running there?" in errors

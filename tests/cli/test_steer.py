@@ -43,7 +43,7 @@ def rows(folder):
     return list(csv.DictReader((folder / "demo.csv").read_text().splitlines()))
 
 
-def test_a_run_without_a_box_is_shown_the_object_and_goes_on_when_it_may(video, catstream, steer, state, tmp_path):
+def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, steer, state, tmp_path):
     source, box = video
     run = catstream("track", source, "--output", tmp_path / "out", "--set", f"run.endpoint={tmp_path / 'run'}")
     assert steer("pause") == (0, "paused before the first frame")
@@ -64,7 +64,7 @@ def test_a_run_without_a_box_is_shown_the_object_and_goes_on_when_it_may(video, 
     assert len(rows(tmp_path / "out")) == 60
 
 
-def test_what_a_run_has_saved_finds_the_object_in_another(video, catstream, said, steer, camera, until, tmp_path):
+def test_a_saved_model_finds_the_object_in_another_run(video, catstream, said, steer, camera, until, tmp_path):
     source, box = video
     with open_source(source) as film:
         image = next(film).image
@@ -86,7 +86,7 @@ def test_what_a_run_has_saved_finds_the_object_in_another(video, catstream, said
     assert int(found[0]["model_version"]) >= 1
 
 
-def test_box_and_model_together_are_refused(video, said, tmp_path):
+def test_box_and_model_together_are_an_error(video, said, tmp_path):
     source, box = video
     code, _, errors = said("track", source, "--box", box, "--model", tmp_path / "one")
     assert code == 2

@@ -37,7 +37,7 @@ def resting(video):
         yield running
 
 
-def test_tracks_come_as_lines_of_json_until_the_pipeline_ends_and_features_as_lines(video, catstream):
+def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(video, catstream):
     with pipeline(video) as running:
         place = ["--endpoint", running.endpoint]
         features = catstream("watch", "features", "--count", 3, *place)
@@ -58,7 +58,7 @@ def test_tracks_come_as_lines_of_json_until_the_pipeline_ends_and_features_as_li
     assert (tracks.returncode, features.returncode) == (0, 0)
 
 
-def test_a_late_one_gets_the_last_model_with_its_arrays_in_short(resting, said):
+def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):
     code, output, errors = said("watch", "models", "--count", 1, "--json", "--endpoint", resting.endpoint)
     model = json.loads(output)
     assert model["version"] >= 1
@@ -68,7 +68,7 @@ def test_a_late_one_gets_the_last_model_with_its_arrays_in_short(resting, said):
 
 
 @pytest.mark.parametrize(("channel", "word"), [("samples", "  levels "), ("health", "  counters ")])
-def test_what_is_no_terminal_gets_a_line_a_message(resting, said, channel, word):
+def test_without_a_terminal_each_message_is_one_line(resting, said, channel, word):
     code, output, _ = said("watch", channel, "--count", 1, "--endpoint", resting.endpoint)
     assert code == 0
     (line,) = output.splitlines()
@@ -76,7 +76,7 @@ def test_what_is_no_terminal_gets_a_line_a_message(resting, said, channel, word)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_terminal_shows_a_table_until_it_is_stopped_which_is_no_error(resting, catstream, number):
+def test_a_terminal_shows_a_table_until_ctrl_c_which_is_no_error(resting, catstream, number):
     screen, terminal = pty.openpty()
     process = catstream("watch", "health", "--endpoint", resting.endpoint, stdout=terminal, env=TERMINAL)
     os.close(terminal)
@@ -109,13 +109,13 @@ def test_where_no_pipeline_runs_one_line_says_so(said, tmp_path, arguments):
     assert errors.count("\n") == 1
 
 
-def test_where_a_place_is_silent_one_line_says_so(said, tmp_path):
+def test_a_silent_endpoint_is_one_line_of_error(said, tmp_path):
     code, output, errors = said("watch", "tracks", "--endpoint", tmp_path, "--wait", 0.2)
     assert (code, output) == (1, "")
     assert errors == f"catstream: no health arrived from {tmp_path} within 0.2 s: is a pipeline running there?\n"
 
 
-def test_status_tells_of_all_processes(resting, said):
+def test_status_shows_all_processes(resting, said):
     code, output, errors = said("status", "--endpoint", resting.endpoint, "--wait", SECONDS)
     assert (code, errors) == (0, "")
     assert [line.split()[0] for line in output.splitlines()] == [
@@ -124,7 +124,7 @@ def test_status_tells_of_all_processes(resting, said):
     assert all(name in output for name in NAMES)
 
 
-def test_status_tells_programs_in_json(resting, said, until):
+def test_status_has_a_json_form(resting, said, until):
     def at_rest():
         code, output, _ = said("status", "--endpoint", resting.endpoint, "--json", "--wait", SECONDS)
         assert code == 0
@@ -138,7 +138,7 @@ def test_status_tells_programs_in_json(resting, said, until):
     assert found["processes"].keys() == set(NAMES)
 
 
-def test_status_names_a_process_that_is_silent_and_fails(resting, said):
+def test_status_fails_and_names_a_silent_process(resting, said):
     os.kill(resting.pids["trainer"], signal.SIGSTOP)
     try:
         code, output, errors = said("status", "--endpoint", resting.endpoint, "--wait", 3)

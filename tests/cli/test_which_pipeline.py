@@ -61,7 +61,7 @@ def at_a_terminal(monkeypatch):
 
 
 @pytest.mark.parametrize("words", [["stop"], ["pause"], ["resume"], ["set-box", "1,2,3,4"]])
-def test_a_script_is_told_which_pipeline_was_meant(pipeline, words):
+def test_a_script_gets_the_name_of_the_selected_pipeline(pipeline, words):
     place, heard = pipeline("/films/walk.mp4")
     result = said(*words)
     assert result.exit_code == 0
@@ -70,7 +70,7 @@ def test_a_script_is_told_which_pipeline_was_meant(pipeline, words):
     assert heard == [words[0]]
 
 
-def test_at_a_terminal_the_only_pipeline_is_commanded_if_a_person_says_so(pipeline, monkeypatch):
+def test_at_a_terminal_a_command_to_an_unnamed_pipeline_needs_confirmation(pipeline, monkeypatch):
     place, heard = pipeline("/films/walk.mp4")
     at_a_terminal(monkeypatch)
     refused = said("stop", input="n\n")
@@ -83,7 +83,7 @@ def test_at_a_terminal_the_only_pipeline_is_commanded_if_a_person_says_so(pipeli
     assert heard == ["stop"] * 4
 
 
-def test_a_pipeline_is_named_by_its_source(pipeline, tmp_path, monkeypatch):
+def test_a_pipeline_can_be_selected_by_its_source(pipeline, tmp_path, monkeypatch):
     _, walk = pipeline(str(tmp_path / "walk.mp4"))
     _, street = pipeline("rtsp://10.0.0.7/street")
     assert "walk.mp4 at /" in str(said("stop").exception), "the error of several pipelines says what each follows"

@@ -189,7 +189,7 @@ def test_the_same_tree_makes_the_same_file(stream, tmp_path):
 
 
 @pytest.mark.parametrize("share", [0, 0.01, 0.3, 0.99])
-def test_a_torn_file_is_refused(stream, share, tmp_path):
+def test_an_incomplete_file_is_an_error(stream, share, tmp_path):
     path = tmp_path / "tree"
     grown(stream).save(path)
     whole = path.read_bytes()

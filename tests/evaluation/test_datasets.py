@@ -56,13 +56,13 @@ def test_otb_with_two_objects_is_two_sequences(tmp_path):
     np.testing.assert_allclose(find_sequences(place)[1].boxes, TRUTH + 1)
 
 
-def test_an_object_of_otb_without_truth_is_no_sequence(tmp_path):
+def test_an_otb_object_without_ground_truth_is_no_sequence(tmp_path):
     place = folder(tmp_path / "walk", "groundtruth_rect.2.txt", "img", lines(TRUTH))
     (place / "groundtruth_rect.1.txt").touch()
     check(place)
 
 
-def test_the_truth_of_one_sequence_of_otb_begins_at_its_300th_image(tmp_path):
+def test_the_ground_truth_of_otb_david_begins_at_its_300th_image(tmp_path):
     boxes = np.tile(TRUTH[:1], (471, 1))
     (tmp_path / "David").mkdir()
     (tmp_path / "David" / "groundtruth_rect.txt").write_text(lines(boxes))
@@ -82,7 +82,7 @@ def test_vot_with_a_folder_of_colours_and_rectangles(tmp_path):
     check(folder(tmp_path / "walk", "groundtruth.txt", "color", lines(TRUTH)))
 
 
-def test_a_turned_polygon_counts_by_its_bounding_box(tmp_path):
+def test_a_rotated_polygon_is_read_as_its_bounding_box(tmp_path):
     place = folder(tmp_path / "walk", "groundtruth.txt", ".", "10,5,15,10,10,15,5,10\n", frames=1)
     np.testing.assert_allclose(find_sequences(place)[0].boxes, [[5, 5, 10, 10]])
 
@@ -134,20 +134,20 @@ def test_a_folder_of_sequences_in_natural_order(tmp_path):
         ("1,2,3,4\n\n1,2,3,4\n", "line 2 is blank: .* nan,nan,nan,nan"),
     ],
 )
-def test_a_truth_that_cannot_be_read_says_where(tmp_path, text, message):
+def test_a_malformed_ground_truth_is_an_error_with_the_line(tmp_path, text, message):
     place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", text)
     with pytest.raises(VideoError, match=message):
         find_sequences(place)
 
 
-def test_a_truth_that_is_no_text_says_so(tmp_path):
+def test_a_ground_truth_that_is_no_text_is_an_error(tmp_path):
     place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", "")
     (place / "groundtruth_rect.txt").write_bytes("1,2,3,4\n".encode("utf-16"))
     with pytest.raises(VideoError, match=r"cannot be read .* expected a text file"):
         find_sequences(place)
 
 
-def test_nothing_there_says_what_was_expected(tmp_path):
+def test_a_folder_without_sequences_is_an_error_with_the_layouts(tmp_path):
     for place in (tmp_path, tmp_path / "missing"):
         with pytest.raises(VideoError, match="groundtruth_rect"):
             find_sequences(place)

@@ -17,7 +17,7 @@ from catstream.evaluation.workers import run_tasks
 EVALUATE = [sys.executable, "-c", "from catstream.cli import main; main()", "evaluate"]
 
 
-def test_ctrl_c_while_the_workers_start_is_one_line_and_leaves_none(walk, tmp_path):
+def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, tmp_path):
     """The terminal sends it to all of them, of which the workers are at their imports."""
     command = [*EVALUATE, str(walk), "--starts", "4", "--jobs", "2", "--output", str(tmp_path / "out")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, process_group=0)

@@ -99,7 +99,7 @@ def test_frames_without_the_object_do_not_count(rng):
     assert (result.auc, result.success, result.precision) == (kept.auc, kept.success, kept.precision)
 
 
-def test_frames_where_nothing_is_found_count_as_missed():
+def test_frames_without_a_reported_box_count_as_missed():
     found, truth = boxes()
     half = found.copy()
     half[::2] = np.nan
@@ -108,7 +108,7 @@ def test_frames_where_nothing_is_found_count_as_missed():
     assert score(half, truth).success <= score(found, truth).success
 
 
-def test_boxes_where_nothing_is_cost_precision_unless_the_confidence_is_low():
+def test_boxes_in_frames_without_the_object_reduce_precision_unless_their_confidence_is_low():
     truth = boxes()[1]
     found = truth.copy()
     truth[10:20] = np.nan
@@ -118,7 +118,7 @@ def test_boxes_where_nothing_is_cost_precision_unless_the_confidence_is_low():
     assert long_term(found, truth, unsure).f_score == 1
 
 
-def test_a_tracker_that_finds_nothing_scores_nothing():
+def test_a_tracker_without_boxes_scores_zero():
     truth = boxes()[1]
     truth[3] = np.nan
     nothing = np.full_like(truth, np.nan)
@@ -139,7 +139,7 @@ SIDES = st.tuples(*[st.floats(-50, 50)] * 2, *[st.floats(0.1, 50)] * 2)
 
 
 @given(SIDES, SIDES)
-def test_overlap_is_that_of_two_boxes_whichever_comes_first(one, two):
+def test_overlap_is_symmetric_and_equals_that_of_box(one, two):
     first, second = np.array([one]), np.array([two])
     value = overlaps(first, second)[0]
     assert value == pytest.approx(Box(*one).overlap(Box(*two)), abs=1e-9)
@@ -148,11 +148,11 @@ def test_overlap_is_that_of_two_boxes_whichever_comes_first(one, two):
 
 
 @pytest.mark.parametrize("truth", [np.zeros((3, 4)), np.zeros((4, 3))])
-def test_unequal_shapes_are_refused(truth):
+def test_unequal_shapes_are_an_error(truth):
     with pytest.raises(ValueError, match="same shape"):
         score(np.zeros((4, 4)), truth)
 
 
-def test_a_truth_without_boxes_is_refused():
+def test_a_ground_truth_without_boxes_is_an_error():
     with pytest.raises(ValueError, match="nothing to measure"):
         score(np.zeros((4, 4)), np.full((4, 4), np.nan))

@@ -50,7 +50,7 @@ def counted(monkeypatch, found):
 # --- running -----------------------------------------------------------------------------------------
 
 
-def test_each_tracker_starts_on_the_given_box_and_answers_every_frame(sequence):
+def test_each_tracker_starts_with_the_given_box_and_has_a_row_for_every_frame(sequence):
     for tracker in ("catstream", "mil"):
         run = follow(tracker, SETTINGS, sequence)
         assert run.boxes.shape == (12, 4)
@@ -68,7 +68,7 @@ def test_a_later_start_is_a_run_of_its_own(sequence):
     np.testing.assert_allclose(run.boxes[0], sequence.boxes[8], atol=1e-3)
 
 
-def test_starts_are_spread_over_the_frames_with_the_object(sequence):
+def test_start_frames_are_evenly_spaced_over_the_frames_with_the_object(sequence):
     assert start_frames(sequence, 1) == [0]
     assert start_frames(sequence, 2) == [0, 8]  # the object is absent in 5, 6 and 7
     assert start_frames(sequence, 4) == [0, 3, 8, 9]
@@ -88,7 +88,7 @@ def test_processes_give_the_same_runs_as_one(sequence, tmp_path):
 # --- keeping -----------------------------------------------------------------------------------------
 
 
-def test_a_run_that_was_kept_is_the_same_run(tmp_path, run):
+def test_a_saved_run_is_loaded_unchanged(tmp_path, run):
     save(tmp_path, run)
     again = load(tmp_path, "catstream", run.sequence, 0)
     assert again is not None
@@ -97,7 +97,7 @@ def test_a_run_that_was_kept_is_the_same_run(tmp_path, run):
     assert again.score() == run.score()
 
 
-def test_results_lie_where_the_toolkits_look(tmp_path, run):
+def test_results_have_the_layouts_of_the_toolkits(tmp_path, run):
     """got10k's ExperimentOTB loads TRACKER/NAME.txt with np.loadtxt; the VOT toolkit parses lines of NAME_001.txt."""
     save(tmp_path, run)
     home = tmp_path / "catstream"
@@ -110,7 +110,7 @@ def test_results_lie_where_the_toolkits_look(tmp_path, run):
     assert len(list(vot.parent.iterdir())) == 1
 
 
-def test_finished_runs_are_not_made_again(tmp_path, sequence, counted):
+def test_complete_runs_are_not_repeated(tmp_path, sequence, counted):
     first = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=2, output=tmp_path)
     assert len(counted) == len(first) == 4
     again = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=4, output=tmp_path)
@@ -118,7 +118,7 @@ def test_finished_runs_are_not_made_again(tmp_path, sequence, counted):
     assert counted[4:] == [("catstream", "walk", 3), ("catstream", "walk", 9), ("mil", "walk", 3), ("mil", "walk", 9)]
 
 
-def test_a_run_that_was_cut_off_is_made_again(tmp_path, sequence, run, counted):
+def test_an_incomplete_run_is_repeated(tmp_path, sequence, run, counted):
     save(tmp_path, run)
     folder = tmp_path / "catstream" / "longterm" / "walk"
     folder.rename(folder.with_name("walk.part"))
@@ -127,14 +127,14 @@ def test_a_run_that_was_cut_off_is_made_again(tmp_path, sequence, run, counted):
     assert not folder.with_name("walk.part").exists()
 
 
-def test_runs_of_another_truth_are_made_again(tmp_path, sequence, run, counted):
+def test_runs_with_another_ground_truth_are_repeated(tmp_path, sequence, run, counted):
     save(tmp_path, run)
     shorter = Sequence(sequence.name, sequence.path, sequence.boxes[:-1])
     evaluate([shorter], ["catstream"], SETTINGS, output=tmp_path)
     assert len(counted) == 1
 
 
-def test_a_run_from_another_box_is_made_again(tmp_path, sequence, counted):
+def test_a_run_from_another_box_is_repeated(tmp_path, sequence, counted):
     evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
     corrected = Sequence(sequence.name, sequence.path, sequence.boxes + 3)
     evaluate([corrected], ["catstream"], SETTINGS, output=tmp_path)
@@ -157,7 +157,7 @@ def test_runs_made_with_other_settings_are_not_mixed_in(tmp_path, sequence, coun
 
 
 @pytest.mark.usefixtures("counted")
-def test_begin_and_done_tell_how_far_it_is(sequence):
+def test_begin_and_done_report_the_progress(sequence):
     said: list[int] = []
     evaluate(
         [sequence],
@@ -173,7 +173,7 @@ def test_begin_and_done_tell_how_far_it_is(sequence):
 # --- refusing ----------------------------------------------------------------------------------------
 
 
-def test_unknown_trackers_and_equal_names_are_refused_before_anything_runs(sequence, counted):
+def test_unknown_trackers_and_equal_names_are_errors_before_the_first_run(sequence, counted):
     with pytest.raises(SettingsError, match="no tracker 'kfc'"):
         evaluate([sequence], ["catstream", "kfc"], SETTINGS)
     with pytest.raises(VideoError, match="two sequences are named 'walk'"):
@@ -181,14 +181,14 @@ def test_unknown_trackers_and_equal_names_are_refused_before_anything_runs(seque
     assert not counted
 
 
-def test_no_tracker_at_all_is_refused_and_one_named_twice_runs_once(sequence, counted):
+def test_no_tracker_is_an_error_and_a_tracker_named_twice_runs_once(sequence, counted):
     with pytest.raises(SettingsError, match="no tracker is given"):
         evaluate([sequence], [], SETTINGS)
     assert len(evaluate([sequence], ["mil", "mil"], SETTINGS)) == len(counted) == 1
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_sequence_that_cannot_be_followed_is_named_and_the_others_are_followed(tmp_path, sequence, jobs):
+def test_a_failing_sequence_is_named_and_the_others_run(tmp_path, sequence, jobs):
     longer = Sequence("longer", sequence.path, np.vstack([sequence.boxes, sequence.boxes[:1]]))
     errors: list[CatstreamError] = []
     found = evaluate([longer, sequence], ["mil"], SETTINGS, jobs=jobs, output=tmp_path, failed=errors.append)
@@ -199,7 +199,7 @@ def test_a_sequence_that_cannot_be_followed_is_named_and_the_others_are_followed
     assert "1 frames too few" in str(error)
 
 
-def test_an_error_that_nobody_takes_is_raised(sequence):
+def test_an_error_without_a_handler_is_raised(sequence):
     longer = Sequence("longer", sequence.path, np.vstack([sequence.boxes, sequence.boxes[:1]]))
     with pytest.raises(CatstreamError, match=r"mil on longer: .* too few"):
         evaluate([longer], ["mil"], SETTINGS)
@@ -240,7 +240,7 @@ def test_a_box_across_the_edge_of_the_frame_is_clipped_for_opencv(sequence):
     assert found
 
 
-def test_what_opencv_does_not_start_on_is_one_line(monkeypatch, sequence):
+def test_a_box_that_opencv_rejects_is_one_line_of_error(monkeypatch, sequence):
     class Broken:
         def init(self, *_):
             raise cv2.error("assertion failed")
@@ -251,7 +251,7 @@ def test_what_opencv_does_not_start_on_is_one_line(monkeypatch, sequence):
         peer.init(next(iter(sequence.frames())), (1, 2, 30, 40))
 
 
-def test_a_tracker_that_this_opencv_has_not_says_how_to_get_it(monkeypatch):
+def test_a_tracker_missing_in_opencv_is_an_error_with_the_install_command(monkeypatch):
     monkeypatch.setitem(PEERS, "csrt", "TrackerThatIsNot")
     with pytest.raises(SettingsError, match=r"catstream\[peers\]"):
         Peer("csrt")
@@ -289,7 +289,7 @@ def test_the_mean_f_score_is_over_the_sequences_that_have_one(sequence, run):
     assert mean_of(rows[1:])["catstream"]["f_score"] is None
 
 
-def test_the_json_holds_every_row_and_the_means(run):
+def test_the_json_has_every_row_and_the_means(run):
     numbers = json.loads(json.dumps(to_json(rows_of([run]), Settings()), allow_nan=False))
     (row,) = numbers["sequences"]
     assert {"name", "frames", "auc", "success", "precision", "f_score", "fps", "tracker"} <= row.keys()

@@ -14,7 +14,7 @@ from catstream.evaluation.provenance import machine, provenance
 from catstream.settings import Settings
 
 
-def test_figures_say_the_settings_that_are_not_the_default_and_the_command():
+def test_figures_have_the_changed_settings_and_the_command():
     made = provenance(Settings(coreset={"size": 32}), ["catstream", "evaluate", "walk", "--starts", "5"])
     assert made["settings"] == ["coreset.size=32"]
     assert made["command"] == "catstream evaluate walk --starts 5"
@@ -22,17 +22,17 @@ def test_figures_say_the_settings_that_are_not_the_default_and_the_command():
 
 
 @pytest.mark.parametrize("word", ["/home/me/walk", "--data=/home/me/walk"])
-def test_a_command_names_no_folder_of_the_machine(word):
+def test_a_command_has_no_folder_of_the_machine(word):
     assert provenance(Settings(), ["catstream", word])["command"] == f"catstream {word.replace('/home/me/', '')}"
 
 
-def test_a_machine_is_told_by_what_it_computes_with_and_not_by_its_name():
+def test_a_machine_is_described_by_processor_and_libraries_without_its_host_name():
     told = machine()
     assert {"processor", "cores", "memory_gb", "python", "opencv", "blas", "numpy"} <= told.keys()
     assert platform.node() not in json.dumps(told)
 
 
-def test_the_commit_is_that_of_the_checkout_and_says_if_the_code_was_changed(tmp_path, monkeypatch):
+def test_the_commit_is_that_of_the_checkout_and_dirty_if_the_code_was_changed(tmp_path, monkeypatch):
     def git(*words):
         subprocess.run(["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", *words], check=True)
 

@@ -31,7 +31,7 @@ def lost(sequence, found) -> EvaluationRun:
     return run_of(sequence, boxes)
 
 
-def test_a_film_shows_the_frames_around_the_loss(lost):
+def test_a_failure_strip_shows_the_frames_around_the_loss(lost):
     strip = failure_strip(lost)
     assert strip.first == 3
     assert strip.length == 9
@@ -47,7 +47,7 @@ def test_only_failures_are_shown_and_the_worst_first(sequence, found, lost):
     assert worst_runs([half, lost], 1) == [lost]
 
 
-def test_the_report_needs_nothing_else(tmp_path, sequence, found, lost):
+def test_the_report_is_self_contained(tmp_path, sequence, found, lost):
     path = write_report(
         tmp_path / "report.html", [run_of(sequence, found, "mil"), lost], Settings(coreset={"size": 32})
     )
@@ -59,7 +59,7 @@ def test_the_report_needs_nothing_else(tmp_path, sequence, found, lost):
     assert page.count("<tr") == 1 + 2 + 2
 
 
-def test_of_each_tracker_the_worst_failures_are_shown_and_more_of_the_first(tmp_path, sequence, lost):
+def test_the_worst_failures_of_each_tracker_are_shown_and_more_of_the_first(tmp_path, sequence, lost):
     def named(tracker: str) -> list[EvaluationRun]:
         sequences = [replace(sequence, name=f"{tracker}{number}") for number in range(4)]
         return [replace(lost, tracker=tracker, sequence=other) for other in sequences]
@@ -69,7 +69,7 @@ def test_of_each_tracker_the_worst_failures_are_shown_and_more_of_the_first(tmp_
     assert len(re.findall(r"<b>mil\d</b>, mil: wrong for", page)) == 2
 
 
-def test_a_report_that_cannot_be_written_says_so(tmp_path, lost):
+def test_a_report_that_cannot_be_written_is_an_error(tmp_path, lost):
     with pytest.raises(VideoError, match="cannot write the report"):
         write_report(tmp_path / "missing" / "report.html", [lost], Settings())
 
@@ -91,7 +91,7 @@ def test_the_command_shows_the_spread_over_several_starts(walk):
     assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", result.output)
 
 
-def test_what_could_not_be_followed_is_said_after_the_table_of_the_rest(tmp_path, walk):
+def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk):
     torn = tmp_path / "torn"
     shutil.copytree(walk, torn)
     (torn / "img" / "0012.png").unlink()
@@ -104,7 +104,7 @@ def test_what_could_not_be_followed_is_said_after_the_table_of_the_rest(tmp_path
     assert [row["name"] for row in json.loads(file.read_text())["sequences"]] == ["walk"]
 
 
-def test_a_place_for_the_numbers_that_is_none_is_refused_before_the_work(tmp_path, walk):
+def test_an_unwritable_json_path_is_an_error_before_the_work(tmp_path, walk):
     for place, message in ((tmp_path, "it is a folder"), (tmp_path / "a" / "b", "does not exist")):
         result = CliRunner().invoke(evaluate, [str(walk), "--tracker", "mil", "--json", str(place)])
         assert isinstance(result.exception, CatstreamError)

@@ -18,7 +18,7 @@ def parsed(svg):
     return [[tuple(map(float, point.split(","))) for point in line] for line in lines], texts
 
 
-def test_a_plot_is_one_svg_with_a_line_a_curve():
+def test_a_plot_is_one_svg_with_one_line_for_each_curve():
     places = np.linspace(0, 1, 21)
     curves = {"a & b": (places, np.linspace(1, 0, 21)), "<c>": (places, np.linspace(0.5, 0, 21))}
     (first, second), texts = parsed(plot("Success", SHARES, SHARES, curves))
@@ -28,14 +28,14 @@ def test_a_plot_is_one_svg_with_a_line_a_curve():
     assert {"Success", "a & b", "<c>", "0.2", "1.0"} <= set(texts)
 
 
-def test_a_value_that_is_not_known_leaves_a_gap():
+def test_nan_leaves_a_gap():
     ys = np.array([1.0, 2.0, np.nan, np.nan, 4.0, 3.0])
     lines, _ = parsed(plot("Lag", Axis.upto(5), Axis.upto(4), {"": (np.arange(6.0), ys)}))
     assert [len(line) for line in lines] == [2, 2]
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-4, 0.031, 0.7, 1.0, 4.9, 10.0, 12.0, 99.0, 5e6])
-def test_an_axis_holds_its_value_and_has_two_to_six_ticks_up_to_its_end(value):
+def test_an_axis_includes_its_value_and_has_two_to_six_ticks_up_to_its_end(value):
     axis = Axis.upto(value)
     assert value <= axis.high * (1 + 1e-6)
     assert axis.ticks[0][0] == 0

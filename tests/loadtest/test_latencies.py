@@ -19,15 +19,15 @@ def test_percentiles_are_those_of_the_sorted_latencies_to_three_digits(rng):
         assert latencies[name] == pytest.approx(exact, rel=2e-3), name
 
 
-def test_what_takes_longer_than_an_hour_is_not_left_out():
+def test_a_latency_above_an_hour_is_counted_as_an_hour():
     assert Latencies([0.01, 1e6])["max"] == pytest.approx(3600, rel=1e-2)
 
 
-def test_no_latency_has_no_percentile():
+def test_percentiles_without_latencies_are_nan():
     assert set(Latencies([]).figures().values()) == {None}
 
 
-def test_the_file_is_a_distribution_that_hdr_tools_read(tmp_path):
+def test_the_file_has_the_format_of_hdr_histogram(tmp_path):
     Latencies([0.001] * 90 + [0.050] * 10).write(tmp_path / "track.hgrm")
     lines = (tmp_path / "track.hgrm").read_text().splitlines()
     assert lines[0].split() == ["Value", "Percentile", "TotalCount", "1/(1-Percentile)"]
@@ -36,6 +36,6 @@ def test_the_file_is_a_distribution_that_hdr_tools_read(tmp_path):
     assert rows[-1][:3] == pytest.approx([50.0, 1.0, 100], rel=1e-3)
 
 
-def test_a_place_that_cannot_be_written_to_is_refused(tmp_path):
+def test_an_unwritable_path_is_an_error(tmp_path):
     with pytest.raises(VideoError, match="give another folder"):
         Latencies([0.1]).write(tmp_path / "missing" / "track.hgrm")

@@ -15,13 +15,13 @@ from catstream.loadtest.search import find_highest_rate
 from catstream.settings import Settings
 
 
-def test_a_limit_holds_for_the_worst_stream(result):
+def test_a_limit_applies_to_the_worst_stream(result):
     run = result([0.01] * 100, [0.01] * 90 + [0.2] * 10)
     assert violations([Limit("p99", 0.1)], run) == ["p99 is 0.2, limit at most 0.1 (seconds from a frame to its track)"]
     assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2)], run) == []
 
 
-def test_success_is_to_be_at_least_what_is_asked(result):
+def test_the_limit_on_success_is_a_minimum(result):
     run = result([0.01], success=0.8)
     assert violations([Limit("success", 0.8)], run) == []
     assert "limit at least 0.9" in violations([Limit("success", 0.9)], run)[0]
@@ -33,24 +33,24 @@ def test_skipped_and_missed_are_shares(result):
     assert len(violations([Limit("skipped", 0.09), Limit("missed", 0.009)], run)) == 2
 
 
-def test_a_process_that_never_recovered_breaks_every_limit(result):
+def test_a_process_that_did_not_recover_violates_every_limit_on_recovery(result):
     run = result([0.01], recoveries=[Recovery(Kill(100.0, 0, "trainer"), None, None)])
     assert not Limit("recovery", 1000).is_met(run)
 
 
-def test_a_stream_that_failed_breaks_a_run_without_limits(result):
+def test_a_failed_stream_is_a_violation_without_any_limit(result):
     assert violations([], result([0.01], errors=["stream 0: it died"])) == ["stream 0: it died"]
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_every_limit_can_be_read_and_told(name, result):
+def test_every_limit_can_be_parsed_and_described(name, result):
     limit = Limit.parse(f"{name}=0.5")
     assert Limit.parse(str(limit)) == limit
     assert limit.describe(result([0.25])).startswith(f"{name} is ")
 
 
 @pytest.mark.parametrize("text", ["p98=0.1", "p99", "p99=", "p99=fast", "p99=-1", "p99=nan", "p99=inf", "=1", ""])
-def test_what_is_no_limit_is_refused(text):
+def test_a_malformed_limit_is_an_error(text):
     with pytest.raises(SettingsError, match=r"NAME=VALUE with one of p50, .*for example p99=0\.1"):
         Limit.parse(text)
 
@@ -64,7 +64,7 @@ def test_what_is_no_limit_is_refused(text):
         ({"settings": Settings(run={"endpoint": "run"})}, "leave out endpoint"),
     ],
 )
-def test_a_plan_that_makes_no_sense_is_refused(facts, said):
+def test_a_contradictory_plan_is_an_error(facts, said):
     with pytest.raises(SettingsError, match=said):
         Plan(**facts)
 

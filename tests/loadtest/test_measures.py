@@ -13,7 +13,7 @@ from catstream.loadtest.observer import Observations
 TRUTH = np.tile((10.0, 10.0, 20.0, 20.0), (10, 1))
 
 
-def test_a_frame_waits_for_its_own_track(schedule, track):
+def test_the_latency_of_a_tracked_frame_ends_with_its_own_track(schedule, track):
     observations = Observations(tracks=[track(number, 0.02) for number in range(10)])
     measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={"sent": 10, "stored": 9})
     assert measures.track.seconds == pytest.approx(np.full(10, 0.02))
@@ -21,14 +21,14 @@ def test_a_frame_waits_for_its_own_track(schedule, track):
     assert (measures.success, measures.sent, measures.stored) == (1.0, 10, 9)
 
 
-def test_a_skipped_frame_waits_for_the_track_of_a_newer_one(schedule, track):
+def test_the_latency_of_a_skipped_frame_ends_with_the_track_of_a_newer_one(schedule, track):
     observations = Observations(tracks=[track(0, 0.02), track(5, 0.02), track(9, 0.02)])
     measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={})
     assert measures.track.seconds[1:6] == pytest.approx([0.42, 0.32, 0.22, 0.12, 0.02])
     assert (measures.skipped, measures.skipped_share, measures.rate(10.0)) == (7, 0.7, pytest.approx(3.0))
 
 
-def test_a_frame_that_no_track_covers_waits_until_the_end(schedule, track):
+def test_the_latency_of_a_frame_without_a_track_ends_with_the_run(schedule, track):
     measures = measure(Observations(tracks=[track(7, 0.02)]), schedule, 10, TRUTH, end=105.0, totals={})
     assert measures.without_track == 2
     assert measures.track["max"] == pytest.approx(4.2)
@@ -41,21 +41,21 @@ def test_stills_before_the_start_and_after_the_end_count_only_for_what_they_cove
     assert (measures.without_track, measures.track["max"]) == (0, pytest.approx(0.71))
 
 
-def test_a_frame_is_seen_by_the_first_model_of_it_or_of_a_newer_one(schedule, track):
+def test_the_model_latency_ends_with_the_first_model_trained_on_the_frame_or_a_newer_one(schedule, track):
     observations = Observations(tracks=[track(number, 0.02) for number in range(10)])
     observations.models = [(100.45, 2), (100.95, 7), (101.5, 9)]
     measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={})
     assert measures.model.seconds == pytest.approx([0.45, 0.35, 0.25, 0.65, 0.55, 0.45, 0.35, 0.25, 0.7, 0.6])
 
 
-def test_a_number_that_a_restarted_detector_gives_again_stands_for_its_new_frame(schedule, track):
+def test_a_frame_number_reused_after_a_restart_means_the_new_frame(schedule, track):
     observations = Observations(tracks=[track(0, 0.0, frame=50), track(1, 0.0, frame=51), track(6, 0.0, frame=51)])
     observations.models = [(100.2, 51), (100.8, 51)]
     measures = measure(observations, schedule, 10, TRUTH, end=101.0, totals={})
     assert measures.model.seconds[[1, 2, 6]] == pytest.approx([0.1, 0.6, 0.2])
 
 
-def test_a_skipped_frame_is_judged_by_the_box_before_it(schedule, track):
+def test_a_skipped_frame_is_scored_with_the_last_known_box(schedule, track):
     truth = TRUTH.copy()
     truth[3:, 0] += 100  # the object jumps while nobody looks
     measures = measure(Observations(tracks=[track(0, 0.02), track(9, 0.02, box=None)]), schedule, 10, truth, 102.0, {})
@@ -63,7 +63,7 @@ def test_a_skipped_frame_is_judged_by_the_box_before_it(schedule, track):
 
 
 @given(st.lists(st.tuples(st.integers(-5, 30), st.floats(0, 50)), max_size=40), st.integers(1, 20))
-def test_waits_are_those_of_brute_force(answers, frames):
+def test_latencies_equal_those_of_brute_force(answers, frames):
     due = np.arange(frames) / 10
     numbers, moments = np.array([number for number, _ in answers], int), np.array([at for _, at in answers])
     found, without_track = latencies_to_answer(due, numbers, moments, end=60.0)
@@ -73,5 +73,5 @@ def test_waits_are_those_of_brute_force(answers, frames):
     assert without_track == sum(wait == 60.0 for wait in expected)
 
 
-def test_before_the_first_box_nothing_is_held():
+def test_before_the_first_box_there_is_no_known_box():
     assert np.isnan(carried_forward(np.ones((3, 4)), np.zeros(3, bool))).all()

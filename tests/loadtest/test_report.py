@@ -31,7 +31,7 @@ def at(rate: float, result: Result) -> Result:
     return result
 
 
-def test_a_search_shows_the_highest_rate_that_held_and_why_others_did_not(result, tmp_path):
+def test_a_search_shows_the_highest_rate_and_the_violations_of_the_others(result, tmp_path):
     load_test = is_search(at(25.0, result([0.01] * 50)), at(50.0, result([0.3] * 50)), at(37.5, result([0.02] * 50)))
     assert (load_test.highest_rate, load_test.result.plan.rate, load_test.violations) == (37.5, 37.5, [])
     page = write_report(tmp_path / "report.html", load_test).read_text()
@@ -41,7 +41,7 @@ def test_a_search_shows_the_highest_rate_that_held_and_why_others_did_not(result
     assert [step["rate"] for step in to_json(load_test)["steps"]] == [25.0, 50.0, 37.5]
 
 
-def test_a_search_without_success_says_so(result, tmp_path):
+def test_a_search_without_a_result_is_reported(result, tmp_path):
     load_test = is_search(result([0.3] * 50))
     assert load_test.violations == ["no rate meets p99=0.1: the lowest tried was 25"]
     assert "No rate meets the limits" in write_report(tmp_path / "report.html", load_test).read_text()

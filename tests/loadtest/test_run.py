@@ -52,7 +52,7 @@ def children():
     return [child for child in psutil.Process().children(recursive=True) if child.pid != tracker]
 
 
-def test_chaos_kills_whom_it_says(sleepers):
+def test_chaos_records_the_processes_that_it_kills(sleepers):
     chaos = Chaos(seed=7)
     for _ in range(3):
         chaos._due = 0.0
@@ -62,7 +62,7 @@ def test_chaos_kills_whom_it_says(sleepers):
     assert sum(len(stream.pids) for stream in sleepers) == 3
 
 
-def test_chaos_spares_whom_a_supervisor_would_give_up(sleepers):
+def test_chaos_does_not_kill_one_process_so_often_that_the_supervisor_gives_up(sleepers):
     (stream, _), chaos = sleepers, Chaos(seed=1)
     for _ in range(40):
         before, chaos._due = len(chaos.kills), 0.0
@@ -74,7 +74,7 @@ def test_chaos_spares_whom_a_supervisor_would_give_up(sleepers):
     assert {name: names.count(name) for name in names} == {"detector": 4, "compressor": 4, "trainer": 4}
 
 
-def test_ctrl_c_reaches_not_even_the_first_child():
+def test_no_child_receives_ctrl_c():
     script = """if True:
         import time
         from catstream.loadtest.children import SPAWN, start
@@ -88,7 +88,7 @@ def test_ctrl_c_reaches_not_even_the_first_child():
     assert blocked & 1 << (signal.SIGINT - 1)
 
 
-def test_usage_tells_who_is_busy(sleepers):
+def test_usage_shows_which_process_is_busy(sleepers):
     usage, busy = Usage(), psutil.Process().pid
     usage.read(0.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
     deadline = time.process_time() + 0.3
@@ -101,7 +101,7 @@ def test_usage_tells_who_is_busy(sleepers):
     assert 0 < usage.readings["idle"][0].memory < usage.readings["busy"][0].memory
 
 
-def test_an_interrupted_run_tells_what_it_measured_and_leaves_nobody_behind():
+def test_an_interrupted_run_returns_its_measurements_and_leaves_no_process():
     def tell(news):
         if news.share > 0.05 and "tracks" in news.figures:
             raise KeyboardInterrupt
@@ -119,7 +119,7 @@ def test_an_interrupted_run_tells_what_it_measured_and_leaves_nobody_behind():
 
 
 @pytest.mark.slow
-def test_all_processes_come_back_from_chaos():
+def test_all_killed_processes_recover():
     load_test = run_load_test(Plan(streams=2, rate=8.0, duration=40.0, size=(320, 240), chaos=True), [], find=False)
     assert not load_test.violations
     assert len(load_test.result.recoveries) >= 5
@@ -134,7 +134,7 @@ def test_all_processes_come_back_from_chaos():
 
 
 @pytest.mark.slow
-def test_a_search_ends_with_a_rate_that_held_below_one_that_did_not():
+def test_a_search_ends_with_a_rate_that_meets_the_limits_below_one_that_does_not():
     plan = Plan(rate=30.0, duration=3.0, size=(320, 240))
     load_test = run_load_test(plan, [Limit("p99", 1.0), Limit("skipped", 0.05)], find=True)
     held = {step.rate for step in load_test.steps if not step.violations}

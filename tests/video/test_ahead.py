@@ -30,21 +30,21 @@ class Numbers(Source):
         pass
 
 
-def test_all_frames_come_in_order_read_by_another_thread():
+def test_frames_are_yielded_in_order_from_another_thread():
     source = Numbers(5)
     assert [frame.number for frame in read_ahead(source)] == [0, 1, 2, 3, 4]
     assert len(source.readers) == 1
     assert threading.current_thread().name not in source.readers
 
 
-def test_what_breaks_is_told_after_the_frames_before_it():
+def test_an_error_of_the_source_is_raised_after_the_frames_before_it():
     frames = read_ahead(Numbers(2, VideoError("it breaks at frame 2")))
     assert [next(frames).number, next(frames).number] == [0, 1]
     with pytest.raises(VideoError, match="frame 2"):
         next(frames)
 
 
-def test_it_is_never_more_than_one_frame_ahead_and_its_thread_ends_with_it():
+def test_at_most_one_frame_is_read_ahead_and_the_thread_ends_with_the_generator():
     source = Numbers(50)
     with closing(read_ahead(source)) as frames:
         for frame in frames:

@@ -22,7 +22,7 @@ def track(state: State = "present", box: Box | None = BOX, frame: int = 7) -> Tr
 
 @pytest.mark.parametrize("state", ["bootstrapping", "present", "absent"])
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (1921, 1081)])
-def test_drawing_keeps_the_size_and_leaves_the_frame_alone(state, size):
+def test_drawing_does_not_change_the_frame(state, size):
     image = np.full((size[1], size[0], 3), 128, np.uint8)
     drawn = draw(image, track(state, None if state == "absent" else BOX))
     assert drawn.shape[1:] == image.shape[1:]
@@ -32,7 +32,7 @@ def test_drawing_keeps_the_size_and_leaves_the_frame_alone(state, size):
 
 
 @pytest.mark.parametrize("size", [(70, 50), (352, 288)])
-def test_pixels_keep_their_place_and_the_text_covers_none_of_them(size):
+def test_the_text_is_below_the_image(size):
     image = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
     assert (draw(image, track(box=None))[: size[1]] == image).all()
 
@@ -61,7 +61,7 @@ def test_the_video_has_each_frame_written_at_any_size(tmp_path, size):
     assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
 
 
-def test_frames_are_shown_at_the_times_that_they_have_in_the_source(tmp_path):
+def test_frames_keep_the_time_stamps_of_the_source(tmp_path):
     times = [2.0, 2.04, 2.5, 2.52, 9.0]
     with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)) as video:
         for frame, time in enumerate(times):
@@ -90,7 +90,7 @@ def with_sound(tmp_path):
 
 
 @pytest.mark.parametrize("first", [0, 25])
-def test_the_sound_of_the_source_is_kept_where_it_was(tmp_path, with_sound, first):
+def test_the_sound_of_the_source_keeps_its_time(tmp_path, with_sound, first):
     source = open_source(with_sound, part=slice(first, None))
     with source, AnnotatedVideo(tmp_path / "out.mp4", source.rate, source.size, sound=source.sound) as video:
         for frame in source:
@@ -101,7 +101,7 @@ def test_the_sound_of_the_source_is_kept_where_it_was(tmp_path, with_sound, firs
     assert heard[-1][0] == pytest.approx(4 - first / 25, abs=0.15)
 
 
-def test_a_video_without_frames_leaves_nothing(tmp_path):
+def test_a_video_without_frames_leaves_no_file(tmp_path):
     with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -120,7 +120,7 @@ def test_an_interrupted_run_keeps_its_video(tmp_path):
 
 
 @pytest.mark.parametrize("frames", [0, 200], ids=["at its end", "while it is written"])
-def test_a_disk_that_is_full_is_said_in_one_line_and_nothing_is_left_of_the_video(tmp_path, rng, full, frames):
+def test_a_full_disk_is_one_line_of_error_and_no_video_is_left(tmp_path, rng, full, frames):
     image = rng.integers(0, 256, (240, 320, 3), np.uint8)  # noise, which no codec makes small
 
     def run():
@@ -136,7 +136,7 @@ def test_a_disk_that_is_full_is_said_in_one_line_and_nothing_is_left_of_the_vide
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_that_cannot_be_written_is_refused_at_once(tmp_path):
+def test_a_path_that_cannot_be_written_is_an_error_at_once(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(VideoError, match="cannot write the video"):
         AnnotatedVideo(tmp_path / "file" / "out.mp4", 25, (64, 64))

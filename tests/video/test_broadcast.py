@@ -26,7 +26,7 @@ def shown(image: np.ndarray) -> int:
     return round(image.mean() / 80)
 
 
-def test_a_frame_says_when_it_was_due_and_shows_what_was_scheduled(broadcast):
+def test_the_time_stamp_of_a_frame_is_its_due_time_and_its_image_the_scheduled_one(broadcast):
     schedules = broadcast.play(Schedule(time.monotonic() + 1, 20.0, frames=30))
     for url, schedule in zip(broadcast.urls, schedules, strict=True):
         with open_source(url) as source:
@@ -39,12 +39,12 @@ def test_a_frame_says_when_it_was_due_and_shows_what_was_scheduled(broadcast):
         assert time.monotonic() >= frame.pts
 
 
-def test_the_streams_are_not_in_step(broadcast):
+def test_the_streams_are_shifted_by_a_part_of_a_frame(broadcast):
     one, other = broadcast.play(Schedule(100.0, 20.0, frames=30))
     assert (one.start, other.start) == (100.0, 100.025)
 
 
-def test_the_picture_stands_still_before_the_start_and_after_the_end(broadcast):
+def test_a_still_image_is_sent_before_the_start_and_after_the_end(broadcast):
     (schedule, _) = broadcast.play(Schedule(time.monotonic() + 0.5, 40.0, frames=3))
     seen = {}
     with open_source(broadcast.urls[0]) as source:
@@ -56,7 +56,7 @@ def test_the_picture_stands_still_before_the_start_and_after_the_end(broadcast):
     assert {picture for number, picture in seen.items() if number > 2} == {2}
 
 
-def test_no_frame_is_left_out_for_a_reader_that_was_slow(broadcast):
+def test_a_slow_receiver_gets_every_frame(broadcast):
     (schedule, _) = broadcast.play(Schedule(time.monotonic(), 100.0, frames=1000))
     with urllib.request.urlopen(broadcast.urls[0]) as answer:
         first = time.monotonic()
@@ -68,6 +68,6 @@ def test_no_frame_is_left_out_for_a_reader_that_was_slow(broadcast):
     assert data.count(b"\xff\xd8\xff") >= 40
 
 
-def test_a_stream_that_is_not_there_is_not_found(broadcast):
+def test_an_unknown_stream_is_an_http_404(broadcast):
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(broadcast.urls[0][:-1] + "7")

@@ -20,7 +20,7 @@ def test_the_demo_is_followed_and_shown(tmp_path):
         assert sum(1 for _ in source) == 25
 
 
-def test_rendering_alone_starts_nothing(tmp_path):
+def test_render_only_starts_no_pipeline(tmp_path):
     result = CliRunner().invoke(demo, ["--output", str(tmp_path), "--frames", "2", "--render-only"])
     assert result.exit_code == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == ["demo.mp4", "groundtruth_rect.txt"]

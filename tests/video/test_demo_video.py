@@ -43,7 +43,7 @@ def test_the_seed_changes_the_noise_and_not_the_truth(film):
     assert box == film[0][1]
 
 
-def test_the_dahlia_is_covered_once_and_leaves_once(film):
+def test_the_dahlia_is_occluded_once_and_leaves_once(film):
     absent = np.array([box is None for _, box in film])
     edges = np.flatnonzero(np.diff(absent.astype(int)))
     assert len(edges) == 4
@@ -52,7 +52,7 @@ def test_the_dahlia_is_covered_once_and_leaves_once(film):
     assert not absent[-1]
 
 
-def test_the_truth_is_where_the_dahlia_is(film):
+def test_the_ground_truth_box_contains_the_dahlia(film):
     inside = [
         (image, box) for image, box in film[::10] if box and 0 <= box.x < 160 - box.w and 0 <= box.y < 120 - box.h
     ]
@@ -61,7 +61,7 @@ def test_the_truth_is_where_the_dahlia_is(film):
     assert np.mean(shares) > 0.95  # now and then a corner of the pagoda or the look-alike is before it
 
 
-def test_it_moves_a_little_a_frame_and_changes_size_and_light(film):
+def test_the_dahlia_moves_slowly_and_changes_size_and_brightness(film):
     boxes = [box for _, box in film if box]
     pairs = [(one, two) for (_, one), (_, two) in pairwise(film) if one and two]
     steps = [np.hypot(*(np.array(one.centre) - two.centre)) for one, two in pairs]
@@ -71,13 +71,13 @@ def test_it_moves_a_little_a_frame_and_changes_size_and_light(film):
     assert max(light) > 1.4 * min(light)
 
 
-def test_a_longer_video_turns_back_without_a_jump(film, longer):
+def test_a_longer_video_runs_backwards_without_a_jump(film, longer):
     """Frame 600 is frame 598 again, but for the noise."""
     for step, (_, box) in enumerate(longer[FRAMES:]):
         assert box == film[FRAMES - 2 - step][1]
 
 
-def test_the_video_lies_beside_its_truth(tmp_path):
+def test_the_video_is_written_with_its_ground_truth(tmp_path):
     steps: list[int] = []
     path, truth = write(tmp_path / "demo", 4, (160, 120), done=steps.append)
     assert steps == [1, 2, 3, 4]

@@ -30,12 +30,12 @@ def number_of(image: np.ndarray) -> int:
     return low + 64 * high
 
 
-def test_a_stream_says_what_it_is(camera):
+def test_a_stream_has_a_name_a_rate_and_a_size(camera):
     with open_source(camera(numbered).url) as source:
         assert (source.name, source.frames, source.size, source.live) == ("one", None, (128, 96), True)
 
 
-def test_every_frame_is_taken_or_counted_as_skipped_and_the_last_taken_is_the_newest(camera, until):
+def test_every_frame_is_returned_or_counted_as_skipped_and_the_last_returned_is_the_newest(camera, until):
     cam, taken = camera(numbered), []
     with open_source(cam.url) as source:
         for frame in source:
@@ -52,7 +52,7 @@ def test_every_frame_is_taken_or_counted_as_skipped_and_the_last_taken_is_the_ne
     assert len(taken) < cam.sent / 2
 
 
-def test_frames_count_up_and_their_times_pass_as_the_clock_does(camera):
+def test_frame_numbers_increase_by_one_and_times_follow_the_clock(camera):
     with open_source(camera(numbered).url, start=7) as source:
         began = time.monotonic()
         frames = [next(source) for _ in range(10)]
@@ -64,12 +64,12 @@ def test_frames_count_up_and_their_times_pass_as_the_clock_does(camera):
     assert 0 < times[-1] <= passed + 1
 
 
-def test_times_count_from_the_moment_that_is_given(camera):
+def test_times_are_relative_to_the_given_moment(camera):
     with open_source(camera(numbered).url, since=time.monotonic() - 1000) as source:
         assert 1000 <= next(source).time < 1030
 
 
-def test_a_camera_that_leaves_and_returns_is_opened_again(camera, until):
+def test_a_camera_that_disconnects_is_reopened(camera, until):
     cam = camera(numbered)
     with open_source(cam.url) as source:
         next(source)
@@ -83,7 +83,7 @@ def test_a_camera_that_leaves_and_returns_is_opened_again(camera, until):
     assert [frame.number for frame in frames] == [1, 2, 3]
 
 
-def test_a_camera_that_is_silent_is_opened_again(camera, monkeypatch, caplog, until):
+def test_a_camera_that_sends_no_frames_is_reopened(camera, monkeypatch, caplog, until):
     monkeypatch.setattr(live, "_SILENT_SECONDS", 0.5)
     cam = camera(numbered)
     with open_source(cam.url) as source:
@@ -97,7 +97,7 @@ def test_a_camera_that_is_silent_is_opened_again(camera, monkeypatch, caplog, un
     assert "one is back after" in caplog.text
 
 
-def test_why_it_is_lost_is_logged_once(camera, monkeypatch, caplog, until):
+def test_the_reason_of_a_loss_is_logged_once(camera, monkeypatch, caplog, until):
     monkeypatch.setattr(live, "_LONGEST_PAUSE", 0.01)
     cam, tried = camera(numbered), []
 
@@ -113,7 +113,7 @@ def test_why_it_is_lost_is_logged_once(camera, monkeypatch, caplog, until):
     assert caplog.text.count("it is unplugged") == 1
 
 
-def test_a_camera_that_returns_with_other_pixels_is_scaled_to_the_first(camera):
+def test_a_camera_that_returns_with_another_size_is_scaled_to_the_first_size(camera):
     cam = camera(numbered)
     with open_source(cam.url) as source:
         next(source)
@@ -124,7 +124,7 @@ def test_a_camera_that_returns_with_other_pixels_is_scaled_to_the_first(camera):
         assert frame.image.shape == (96, 128, 3)
 
 
-def test_what_was_never_there_is_refused_and_its_password_not_shown(camera, caplog):
+def test_an_unreachable_stream_is_an_error_without_its_password(camera, caplog):
     cam = camera(numbered)
     cam.leave()
     with pytest.raises(VideoError, match=r"cannot open 'http://127.*connection refused.*check") as error:
@@ -133,12 +133,12 @@ def test_what_was_never_there_is_refused_and_its_password_not_shown(camera, capl
     assert not caplog.records, "what never was there is not lost, and not opened again"
 
 
-def test_a_camera_that_this_machine_has_not_is_refused():
+def test_a_camera_that_does_not_exist_is_an_error():
     with pytest.raises(VideoError, match=r"no such file.*\./987$"):
         open_source("987")
 
 
-def test_who_has_something_to_do_meanwhile_waits_for_the_first_frame_too(camera):
+def test_with_an_idle_function_the_first_frame_is_waited_for_too(camera):
     cam, turns = camera(numbered), []
     cam.leave()
 
@@ -160,7 +160,7 @@ def test_a_closed_source_has_no_frames_and_leaves_no_thread(camera):
     assert not [thread for thread in threading.enumerate() if thread.name == "reader of one"]
 
 
-def test_a_recording_behind_a_url_is_refused(tmp_path):
+def test_a_url_of_a_video_file_is_an_error(tmp_path):
     path = tmp_path / "walk.mp4"
     with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
         stream = container.add_stream("mpeg4", rate=25)

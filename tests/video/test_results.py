@@ -38,7 +38,7 @@ def test_each_frame_has_a_row_and_absence_is_nan(tmp_path):
     assert lines[4] == "3,0.120000,absent,,,,,0.125000,1"
 
 
-def test_what_is_written_can_be_read_before_the_end(tmp_path):
+def test_written_rows_can_be_read_before_the_end(tmp_path):
     results = ResultsWriter(tmp_path, "walk")
     results.write(track(0), 0.01)
     for file in ("walk.txt", "walk_confidence.value", "walk_time.txt"):
@@ -77,13 +77,13 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
     assert len((tmp_path / file).read_text().splitlines()) == 1 + (file == "walk.csv")
 
 
-def test_a_disk_that_is_full_from_the_start_is_refused_at_once(tmp_path):
+def test_a_disk_that_is_full_from_the_start_is_an_error_at_once(tmp_path):
     (tmp_path / "walk.csv").symlink_to("/dev/full")
     with pytest.raises(VideoError, match="No space left on device"):
         ResultsWriter(tmp_path, "walk")
 
 
-def test_a_place_that_cannot_be_written_is_refused_at_once(tmp_path):
+def test_a_path_that_cannot_be_written_is_an_error_at_once(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(VideoError, match="cannot write results"):
         ResultsWriter(tmp_path / "file" / "out", "walk")

@@ -119,7 +119,7 @@ def broken(path, start: int = 0) -> tuple[list[int], str]:
 
 
 @KINDS
-def test_every_frame_of_a_video_comes_once_and_in_order(video, name):
+def test_every_frame_of_a_video_is_returned_once_and_in_order(video, name):
     source = open_source(video(name))
     assert (source.name, source.size, source.rate, source.live) == ("a", (160, 120), 25.0, False)
     assert source.frames == 100
@@ -150,7 +150,7 @@ PARTS = pytest.mark.parametrize("part", [slice(7, 31, 3), slice(90, None), slice
 
 @PARTS
 @pytest.mark.parametrize("name", ["a.mp4", "a.mpg"])
-def test_a_part_of_a_video_has_its_frames_at_their_times(video, name, part):
+def test_frames_of_a_part_keep_their_time_stamps(video, name, part):
     wanted = range(100)[part]
     with open_source(video(name), part=part) as source:
         assert source.frames in (len(wanted), None)
@@ -161,7 +161,7 @@ def test_a_part_of_a_video_has_its_frames_at_their_times(video, name, part):
     assert [frame.time for frame in frames] == pytest.approx([number / 25 for number in wanted], abs=0.002)
 
 
-def test_what_is_broken_after_a_part_does_not_matter(video):
+def test_damage_after_a_part_is_no_error(video):
     path = video("a.mpg")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     good, _ = broken(path)
@@ -170,7 +170,7 @@ def test_what_is_broken_after_a_part_does_not_matter(video):
 
 @KINDS
 @pytest.mark.parametrize("share", [0.31, 0.6, 0.83])
-def test_a_truncated_video_gives_its_good_frames_and_then_says_where_it_breaks(video, name, share):
+def test_a_truncated_video_returns_its_good_frames_and_then_an_error_with_the_frame_number(video, name, share):
     path = video(name, options={"movflags": "faststart"} if name.endswith("mp4") else None)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(len(whole) * share)])
@@ -181,7 +181,7 @@ def test_a_truncated_video_gives_its_good_frames_and_then_says_where_it_breaks(v
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.mpg"])
-def test_damage_in_the_middle_ends_a_video_there(video, name):
+def test_damage_in_the_middle_is_an_error_after_the_frames_before_it(video, name):
     path = video(name)
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
@@ -193,7 +193,7 @@ def test_damage_in_the_middle_ends_a_video_there(video, name):
     assert "is damaged at frame" in message
 
 
-def test_a_video_without_its_index_says_that_it_cannot_be_read(video):
+def test_a_video_without_its_index_is_an_error(video):
     path = video("a.mp4")
     path.write_bytes(path.read_bytes()[:-3000])
     with pytest.raises(VideoError, match="not a video that can be read"):
@@ -201,7 +201,7 @@ def test_a_video_without_its_index_says_that_it_cannot_be_read(video):
 
 
 @pytest.mark.parametrize("rotation", [90, 180, 270])
-def test_videos_of_phones_stand_upright(video, rotation):
+def test_rotated_videos_of_phones_are_upright(video, rotation):
     with open_source(video("a.mp4", frames=1, rotation=rotation)) as source:
         frame = next(source)
     assert number_of(np.rot90(frame.image, -rotation // 90)) == 0
@@ -217,7 +217,7 @@ def test_text_is_not_a_video(tmp_path, name, text):
         open_source(tmp_path / name)
 
 
-def test_a_start_after_the_end_is_refused(video):
+def test_a_start_after_the_end_is_an_error(video):
     with pytest.raises(VideoError, match="has 5 frames, numbered from 0, and none from frame 5 on"):
         open_source(video("a.avi", frames=5), start=5)
 
@@ -262,7 +262,7 @@ def test_a_sequence_folder_opens_by_its_images(images, inner):
     assert numbers(source) == [0, 1]
 
 
-def test_a_sequence_folder_opens_by_its_one_video(video, tmp_path):
+def test_a_sequence_folder_opens_by_its_only_video(video, tmp_path):
     folder = tmp_path / "walk"
     folder.mkdir()
     video("a.avi", frames=3).rename(folder / "a.avi")
@@ -292,7 +292,7 @@ def test_a_part_of_a_folder_has_its_images_from_any_start(images, part):
 
 @KINDS
 @pytest.mark.parametrize("share", [0.3, 0.7])
-def test_a_damaged_place_is_skipped_if_that_is_asked_for_and_no_frame_gets_another_time(video, name, share):
+def test_damage_is_skipped_if_requested_and_frames_keep_their_time_stamps(video, name, share):
     path = damaged(video(name), share)
     with open_source(path, skip_damaged=True) as source:
         found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
@@ -310,13 +310,13 @@ def test_a_damaged_place_is_skipped_if_that_is_asked_for_and_no_frame_gets_anoth
 
 
 @pytest.mark.parametrize("part", [slice(-1, None), slice(None, -1), slice(0, 9, 0), slice(9, 0, -1)], ids=str)
-def test_a_part_that_counts_backwards_is_refused(images, part):
+def test_a_part_with_a_negative_step_is_an_error(images, part):
     with pytest.raises(VideoError, match="frames count from 0"):
         open_source(images("walk", ["0.png"]), part=part)
 
 
 @pytest.mark.parametrize("part", [slice(5, 5), slice(9, None)], ids=str)
-def test_a_part_without_a_frame_is_refused_and_the_error_says_how_many_there_are(images, part):
+def test_a_part_without_frames_is_an_error_with_the_number_of_frames(images, part):
     with pytest.raises(VideoError, match=f"has 9 frames, numbered from 0, and none from frame {part.start} on"):
         open_source(images("walk", [f"{number}.png" for number in range(9)]), part=part)
 
@@ -335,12 +335,12 @@ def test_a_file_address_names_a_file_of_this_machine(images):
         open_source("file://elsewhere/walk.mp4")
 
 
-def test_standard_input_is_refused_with_what_to_do_instead():
+def test_standard_input_is_an_error_that_names_the_alternatives():
     with pytest.raises(VideoError, match="write the video to a file"):
         open_source("-")
 
 
-def test_an_image_that_cannot_be_read_is_said_by_nobody_else(tmp_path, capfd):
+def test_opencv_prints_no_warning_for_an_unreadable_image(tmp_path, capfd):
     cv2.imwrite(str(tmp_path / "0.tiff"), np.zeros((20, 30, 3), np.float32))
     with pytest.raises(VideoError, match=r"cannot read the image .*0\.tiff"):
         open_source(tmp_path)
@@ -383,13 +383,13 @@ def test_an_image_that_cannot_be_read_is_named(images):
         ("empty/*.png", "no images at"),
     ],
 )
-def test_nothing_there_is_said(tmp_path, place, message):
+def test_a_missing_source_is_an_error(tmp_path, place, message):
     (tmp_path / "empty").mkdir()
     with pytest.raises(VideoError, match=message):
         open_source(tmp_path / place)
 
 
-def test_two_videos_in_a_folder_are_not_guessed_between(video, tmp_path):
+def test_a_folder_with_two_videos_is_an_error(video, tmp_path):
     video("a.avi", frames=1)
     video("b.avi", frames=1)
     with pytest.raises(VideoError, match="2 videos"):

@@ -43,7 +43,7 @@ def sent_until_it_is_closed(client, data):
 
 
 @pytest.mark.parametrize("begun", BEGUN.values(), ids=BEGUN)
-def test_a_request_that_is_not_whole_in_time_ends_its_connection(serve, connect, monkeypatch, begun):
+def test_a_request_that_is_incomplete_after_the_timeout_closes_its_connection(serve, connect, monkeypatch, begun):
     monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.05)
     client = connect(serve())
     client.sendall(begun)
@@ -52,14 +52,14 @@ def test_a_request_that_is_not_whole_in_time_ends_its_connection(serve, connect,
             pass
 
 
-def test_a_request_that_comes_byte_by_byte_gets_no_more_time_for_it(serve, connect, monkeypatch):
+def test_a_request_sent_byte_by_byte_has_the_same_timeout(serve, connect, monkeypatch):
     monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.05)
     client = connect(serve())
     client.sendall(HALF)
     sent_until_it_is_closed(client, b"x")
 
 
-def test_a_client_that_does_not_read_its_answers_is_let_go(serve, connect, monkeypatch):
+def test_a_client_that_does_not_read_its_response_is_disconnected(serve, connect, monkeypatch):
     monkeypatch.setattr(connections, "_ANSWER_SECONDS", 0.05)
     monkeypatch.setattr(Dashboard, "picture", lambda *_: Preview(1, 64, 48, None, bytes(1 << 23)))
     client = connect(serve())
@@ -67,7 +67,7 @@ def test_a_client_that_does_not_read_its_answers_is_let_go(serve, connect, monke
 
 
 @pytest.mark.parametrize("begun", [b"", HALF], ids=["nothing", "half a head"])
-def test_no_number_of_idle_connections_keeps_others_out(serve, connect, begun):
+def test_idle_connections_cannot_block_new_clients(serve, connect, begun):
     page = serve(token=TOKEN)
     for _ in range(connections.MAX_CONNECTIONS + 50):
         connect(page).sendall(begun)
@@ -75,7 +75,7 @@ def test_no_number_of_idle_connections_keeps_others_out(serve, connect, begun):
     assert page.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
 
 
-def test_a_page_that_is_open_stays_so_while_others_open_connections(serve, connect, monkeypatch):
+def test_an_open_page_stays_connected_while_others_open_connections(serve, connect, monkeypatch):
     monkeypatch.setattr("catstream.web.feed.SILENCE_SECONDS", 0.1)  # after which the page is told of it
     page = serve()
     with page.stream("GET", "/events") as events:

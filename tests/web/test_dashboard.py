@@ -13,7 +13,7 @@ def dashboard():
     return Dashboard()
 
 
-def test_a_page_is_told_once_of_what_is_new(dashboard, facts):
+def test_a_page_gets_each_update_once(dashboard, facts):
     seen = {}
     dashboard.take(facts.track(3), 1.0)
     assert dashboard.updates(seen)["track"] == {"frame": 3, "time": 0.3, "state": "present", "version": 1}
@@ -22,7 +22,7 @@ def test_a_page_is_told_once_of_what_is_new(dashboard, facts):
     assert set(dashboard.updates(seen)) == {"track"}
 
 
-def test_who_comes_late_gets_all_there_is(dashboard, facts):
+def test_a_page_that_connects_late_gets_all_parts(dashboard, facts):
     for frame in range(20):
         dashboard.take(facts.track(frame), 0.5 * frame)
     early, late = {}, {}
@@ -40,7 +40,7 @@ def test_two_minutes_of_points_are_kept_however_fast_tracks_come(dashboard, fact
     assert moments[-1] - moments[0] == pytest.approx(120, abs=10)
 
 
-def test_frames_a_second_are_those_of_the_last_two(dashboard, facts):
+def test_frames_per_second_are_counted_over_the_last_two_seconds(dashboard, facts):
     for frame in range(100):
         dashboard.take(facts.track(frame), frame / 50)
     assert dashboard.rate(2.0) == pytest.approx(50, abs=1)
@@ -48,14 +48,14 @@ def test_frames_a_second_are_those_of_the_last_two(dashboard, facts):
     assert dashboard.rate(9.0) == 0
 
 
-def test_latency_is_from_a_frame_to_the_model_that_learned_from_it(dashboard, facts):
+def test_latency_is_measured_from_a_track_to_the_model_trained_on_its_frame(dashboard, facts):
     for frame in range(10):
         dashboard.take(facts.track(frame), float(frame))
     dashboard.take(facts.model(1, frame=6), 9.5)
     assert dashboard.model_latency == pytest.approx(3.5)
 
 
-def test_silence_and_the_end_are_told_apart(dashboard, facts):
+def test_silence_and_the_end_are_different_phases(dashboard, facts):
     told = {}
     dashboard.take(Health("detector", 1.0, {"sent": 1.0}), 0.0)
     assert dashboard.updates(told)["status"]["phase"] == "running"
@@ -68,7 +68,7 @@ def test_silence_and_the_end_are_told_apart(dashboard, facts):
     assert (status["phase"], status["reason"]) == ("ended", "the source came to its end")
 
 
-def test_a_process_that_is_silent_is_not_among_those_that_are_heard(dashboard):
+def test_a_silent_process_is_not_listed(dashboard):
     names, told = ("compressor", "detector", "trainer"), {}
     for name in names:
         dashboard.take(Health(name, 1.0, {"sent": 1.0}), 0.0)
@@ -83,7 +83,7 @@ def test_a_process_that_is_silent_is_not_among_those_that_are_heard(dashboard):
     assert dashboard.updates(told)["status"]["processes"] == []
 
 
-def test_the_last_health_of_a_pipeline_is_not_taken_for_the_next_one(dashboard):
+def test_the_last_health_report_of_a_pipeline_does_not_belong_to_the_next_one(dashboard):
     dashboard.take(Health("detector", 1.0, {"sent": 7.0}), 9.0)
     dashboard.take(End(2, "the source came to its end"), 10.0)
     dashboard.take(Health("detector", 1.0, {"sent": 8.0}), 10.5)
@@ -93,7 +93,7 @@ def test_the_last_health_of_a_pipeline_is_not_taken_for_the_next_one(dashboard):
     assert dashboard.phase == "running"
 
 
-def test_the_trees_are_shown_as_the_last_health_said_after_the_end_too(dashboard):
+def test_the_trees_of_the_last_health_report_are_shown_after_the_end(dashboard):
     dashboard.take(End(2, "the source came to its end"), 10.0)
     dashboard.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 200.0}), 10.1)
     dashboard.mark_silent("no pipeline is running")
@@ -131,7 +131,7 @@ FIRST_SIGNS = {
 
 
 @pytest.mark.parametrize(("endpoint", "ended", "sign"), FIRST_SIGNS.values(), ids=FIRST_SIGNS)
-def test_nothing_of_a_pipeline_is_left_once_another_one_is_seen(dashboard, facts, endpoint, ended, sign):
+def test_all_state_is_dropped_when_another_pipeline_appears(dashboard, facts, endpoint, ended, sign):
     told = followed(dashboard, facts, "a")
     if ended:
         dashboard.take(End(52, "the source came to its end"), 6.0)
@@ -182,7 +182,7 @@ def test_another_run_begins_with_no_surprising_frames(dashboard, facts):
     assert dashboard.updates({})["surprising"]["frames"] == []
 
 
-def test_pictures_that_were_told_of_lately_are_there_and_older_ones_are_not(dashboard, facts):
+def test_recent_pictures_are_kept_and_older_ones_are_not(dashboard, facts):
     for frame in range(30):
         dashboard.take(facts.preview(frame), 0.1 * frame)
     assert dashboard.updates({})["picture"] == {"frame": 29, "width": 64, "height": 48, "box": (4.0, 3.0, 20.0, 10.0)}

@@ -58,7 +58,7 @@ def browse(tmp_path):
         browser.stdout.close()
 
 
-def test_a_box_drawn_with_the_mouse_is_followed_until_it_leaves_and_after_a_restart(browse, folder, tmp_path, until):
+def test_an_object_drawn_with_the_mouse_is_tracked_until_it_leaves_and_after_a_restart(browse, folder, tmp_path, until):
     path, boxes = tmp_path / "demo.mp4", []
     with VideoWriter(path, RATE, SIZE) as video:
         for image, box in render(145, SIZE, begin=LEAVES - 120):

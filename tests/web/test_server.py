@@ -74,7 +74,7 @@ def updates(page, name, turn):
     return found.result()
 
 
-def test_the_page_needs_nothing_from_elsewhere_and_runs_no_script_of_others(page):
+def test_the_page_loads_nothing_from_other_hosts_and_has_no_inline_script(page):
     answer = page.get("/")
     assert answer.status_code == 200
     policy = dict(part.split(" ", 1) for part in answer.headers["content-security-policy"].split("; "))
@@ -88,18 +88,18 @@ def test_the_page_needs_nothing_from_elsewhere_and_runs_no_script_of_others(page
 @pytest.mark.parametrize(
     "name", ["style.css", "page.js", "stage.js", "charts.js", "trees.js", "surprising.js", "svg.js"]
 )
-def test_each_file_of_the_page_is_served_as_what_it_is(page, name):
+def test_each_file_of_the_page_has_its_content_type(page, name):
     answer = page.get(f"/page/{name}")
     assert answer.headers["content-type"].startswith("text/css" if name.endswith("css") else "text/javascript")
     assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-def test_files_beside_the_page_are_not_served(page):
+def test_files_outside_the_page_folder_are_not_served(page):
     assert page.get("/page/..%2fguard.py").status_code == 404
     assert page.get("/page/%2e%2e/guard.py").status_code == 404
 
 
-def test_it_is_healthy_by_itself_and_ready_with_all_processes(page, pipeline, until):
+def test_the_server_is_healthy_alone_and_ready_with_all_processes(page, pipeline, until):
     assert page.get("/healthz").status_code == 200
     assert page.get("/readyz").status_code == 503
 
@@ -115,7 +115,7 @@ def test_it_is_healthy_by_itself_and_ready_with_all_processes(page, pipeline, un
     assert '\ncatstream_rejected_messages_total{process="trainer"} 1.0\n' in shown
 
 
-def test_it_is_not_ready_where_one_process_is_silent(page, pipeline, until, monkeypatch):
+def test_the_server_is_not_ready_if_one_process_is_silent(page, pipeline, until, monkeypatch):
     monkeypatch.setattr("catstream.web.dashboard.SILENCE_SECONDS", 0.5)
 
     def answer(*heard):
@@ -128,7 +128,7 @@ def test_it_is_not_ready_where_one_process_is_silent(page, pipeline, until, monk
     assert answer("detector", "compressor").text == "no health report from: trainer\n"
 
 
-def test_tracks_come_to_the_page_as_they_are_sent(page, pipeline, facts):
+def test_tracks_reach_the_page_when_they_are_sent(page, pipeline, facts):
     def turn():
         pipeline["detector"].send(Health("detector", time.monotonic(), {}))
         pipeline["tracks"].send(facts.track(5))
@@ -136,7 +136,7 @@ def test_tracks_come_to_the_page_as_they_are_sent(page, pipeline, facts):
     assert updates(page, "track", turn) == {"frame": 5, "time": 0.5, "state": "present", "version": 1}
 
 
-def test_a_message_that_it_fails_on_does_not_end_the_feed(page, pipeline, facts, monkeypatch, caplog):
+def test_an_error_on_a_message_does_not_end_the_feed(page, pipeline, facts, monkeypatch, caplog):
     def fails(*_):
         monkeypatch.undo()
         raise ArithmeticError("it cannot be")
@@ -150,7 +150,7 @@ def test_a_message_that_it_fails_on_does_not_end_the_feed(page, pipeline, facts,
     assert "ArithmeticError: it cannot be" in caplog.text
 
 
-def test_pictures_are_asked_of_the_pipeline_only_while_somebody_looks(page, pipeline, facts, until):
+def test_pictures_are_subscribed_only_while_a_page_is_open(page, pipeline, facts, until):
     frames = itertools.count()
 
     def turn():
@@ -191,17 +191,17 @@ def test_the_live_picture_has_the_track_of_its_frame_drawn_in(page, pipeline, fa
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1", ""])
-def test_other_names_that_lead_here_are_not_answered_to(page, host):
+def test_a_request_with_a_foreign_host_name_is_rejected(page, host):
     assert page.get("/", headers={"Host": host}).status_code in (400, 421)
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1"])
-def test_other_pages_may_not_steer(page, origin):
+def test_a_page_of_another_origin_cannot_steer(page, origin):
     answer = page.post("/control", json={"verb": "pause"}, headers={"Origin": origin})
     assert answer.status_code == 403
 
 
-def test_a_form_of_another_page_may_not_steer_though_it_names_no_origin(page):
+def test_a_form_of_another_page_cannot_steer_without_an_origin_header(page):
     assert page.post("/control", data={"verb": "pause"}).status_code == 415
 
 
@@ -221,7 +221,7 @@ def test_a_form_of_another_page_may_not_steer_though_it_names_no_origin(page):
     ],
     ids=repr,
 )
-def test_a_command_that_cannot_be_is_refused_before_it_is_sent(page, command):
+def test_an_invalid_command_is_rejected_before_it_is_sent(page, command):
     body = json.dumps(command)
     answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 400
@@ -231,13 +231,13 @@ def test_a_command_that_cannot_be_is_refused_before_it_is_sent(page, command):
 @pytest.mark.parametrize(
     "body", ["[" * 4000, '{"verb": "set-box", "box": [1, 2, 3, %s]}' % ("9" * 400)], ids=["deep", "many digits"]
 )
-def test_a_command_that_is_hard_to_read_is_refused_like_any_other(page, body):
+def test_malformed_json_is_rejected_like_any_invalid_command(page, body):
     answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 400
     assert "expected" in answer.json()["reason"]
 
 
-def test_who_steers_too_often_is_told_to_wait(page):
+def test_commands_above_the_rate_limit_are_rejected(page):
     answers = [page.post("/control", json={"verb": "format"}) for _ in range(40)]
     assert 429 in {answer.status_code for answer in answers}
     assert int(next(answer for answer in answers if answer.status_code == 429).headers["retry-after"]) >= 0
@@ -250,7 +250,7 @@ def test_without_the_token_nothing_of_the_pipeline_is_shown(locked, path):
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/control"])
-def test_no_host_that_reads_like_an_open_path_opens_another(path):
+def test_a_host_header_that_looks_like_a_public_path_does_not_open_another_path(path):
     # An older Starlette begins an address with this header, a newer one, where that names no host, with the server.
     head = [(b"host", b"x/page/")]
     scope = {"type": "http", "method": "GET", "path": path, "query_string": b"", "headers": head}
@@ -270,17 +270,17 @@ def test_no_host_that_reads_like_an_open_path_opens_another(path):
     assert said[0]["status"] == 401
 
 
-def test_whoever_asks_how_it_is_needs_no_token(locked):
+def test_health_checks_need_no_token(locked):
     assert locked.get("/healthz").status_code == 200
     assert locked.get("/readyz").status_code == 503
 
 
-def test_the_token_opens_as_a_header(locked):
+def test_the_token_is_accepted_as_a_header(locked):
     assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
     assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}x"}).status_code == 401
 
 
-def test_the_token_opens_by_the_door_and_the_browser_does_not_keep_it(locked):
+def test_the_login_form_accepts_the_token_and_the_browser_does_not_store_it(locked):
     answer = locked.post("/login", data={"token": TOKEN})
     assert (answer.status_code, answer.headers["location"]) == (303, "/")
     kept = answer.headers["set-cookie"]
@@ -290,7 +290,7 @@ def test_the_token_opens_by_the_door_and_the_browser_does_not_keep_it(locked):
     assert locked.get("/").status_code == 200
 
 
-def test_wrong_tokens_become_too_many_and_the_right_one_opens_all_the_same(locked):
+def test_wrong_tokens_are_rate_limited_and_the_correct_one_is_still_accepted(locked):
     wrong = [locked.post("/login", data={"token": f"guess {guess}"}) for guess in range(12)]
     assert [answer.status_code for answer in wrong] == [401] * 8 + [429] * 4
     assert int(wrong[-1].headers["retry-after"]) >= 0
@@ -300,7 +300,7 @@ def test_wrong_tokens_become_too_many_and_the_right_one_opens_all_the_same(locke
     assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}x"}).status_code == 429
 
 
-def test_a_bucket_lets_as_many_through_as_it_says():
+def test_a_token_bucket_allows_its_burst_and_its_rate():
     bucket, passed = TokenBucket(3, 0.5), []
     for moment in range(20):
         if not bucket.wait(moment):
@@ -310,13 +310,13 @@ def test_a_bucket_lets_as_many_through_as_it_says():
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::"])
-def test_where_others_can_look_a_token_is_needed(host):
+def test_a_public_address_requires_a_token(host):
     with pytest.raises(ServiceError, match="VIEW_TOKEN"):
         Server(host=host, port=0)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_a_page_at_all_addresses_of_this_machine_names_those_that_others_can_open(host):
+def test_a_server_on_all_interfaces_lists_the_addresses_for_other_machines(host):
     server = Server(host=host, port=0, token=TOKEN)
     with server.in_background():
         urls = [urlsplit(url) for url in server.urls]
@@ -328,12 +328,12 @@ def test_a_page_at_all_addresses_of_this_machine_names_those_that_others_can_ope
             other.bind((url.hostname, 0))
 
 
-def test_a_token_that_could_be_guessed_is_refused():
+def test_a_short_token_is_an_error():
     with pytest.raises(ServiceError, match="can be guessed"):
         Server(port=0, token="secret")
 
 
-def test_a_port_that_is_taken_is_named(page):
+def test_a_port_in_use_is_an_error(page):
     port = urlsplit(str(page.base_url)).port
     with pytest.raises(ServiceError, match=rf"127.0.0.1:{port} .* another port"):
         Server(port=port)

@@ -31,7 +31,7 @@ def seen(tmp_path):
     return {(state["scheme"], state["state"]): state for state in json.loads(run.stdout)}
 
 
-def test_each_state_of_the_page_is_readable_for_all_and_says_what_is_so(seen):
+def test_each_state_of_the_page_is_accessible_and_correct(seen):
     assert len(seen) == 28
     assert {key: state["violations"] for key, state in seen.items() if state["violations"]} == {}, "found by axe"
     assert {key for key, state in seen.items() if state["wide"] > 0} == set(), "wider than its window"

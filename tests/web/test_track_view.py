@@ -11,7 +11,7 @@ import httpx
 TOKEN = "correct-horse-battery"
 
 
-def test_the_first_box_comes_from_the_page_which_tells_of_the_end_of_the_run_and_its_own(
+def test_the_first_box_can_come_from_the_page_which_shows_the_end_of_the_run_and_of_the_server(
     demo_video, folder, tmp_path, until
 ):
     source, boxes = demo_video(40)

@@ -56,7 +56,7 @@ def attached(endpoint, tracks, channel="tracks", **options):
     return subscription
 
 
-def test_tracks_come_in_order_until_the_end(endpoint, tracks):
+def test_tracks_arrive_in_order_until_the_end(endpoint, tracks):
     with attached(endpoint, tracks) as subscription:
         for seq in range(2, 50):
             tracks.send(track(seq))
@@ -76,7 +76,7 @@ def test_each_gap_is_counted_also_the_one_before_the_end(endpoint, tracks):
         assert subscription.missed == 2 + 3 + 2
 
 
-def test_a_restarted_detector_takes_nothing_away(endpoint, tracks):
+def test_repeated_numbers_of_a_restarted_detector_do_not_count_as_missed(endpoint, tracks):
     with attached(endpoint, tracks) as subscription:
         for seq in (2, 3, 4, 2, 3, 4, 5):
             tracks.send(track(seq))
@@ -85,7 +85,7 @@ def test_a_restarted_detector_takes_nothing_away(endpoint, tracks):
         assert subscription.missed == 0
 
 
-def test_a_reader_that_lost_the_end_among_its_tracks_still_ends(endpoint, tracks):
+def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks):
     count = 200_000  # more than all buffers on the way hold: those of tcp grow to many megabytes
     with attached(endpoint, tracks) as subscription:
         for seq in range(2, count):
@@ -96,7 +96,7 @@ def test_a_reader_that_lost_the_end_among_its_tracks_still_ends(endpoint, tracks
         assert len(heard) + subscription.missed == count - 2
 
 
-def test_a_model_comes_to_who_is_late_once_and_the_end_of_the_tracks_is_that_of_all(endpoint, tracks):
+def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(endpoint, tracks):
     with Publisher(MODELS, endpoint) as models:
         models.send(model(1))
         models.send(model(2))
@@ -121,7 +121,7 @@ def test_a_model_comes_to_who_is_late_once_and_the_end_of_the_tracks_is_that_of_
     assert subscription.end.reason == "the source came to its end"
 
 
-def test_each_process_is_heard_and_nothing_twice(endpoint):
+def test_the_health_of_each_process_arrives_once(endpoint):
     names = CHANNELS["health"].senders
     with contextlib.ExitStack() as stack:
         publishers = [stack.enter_context(Publisher(HEALTH, endpoint, name)) for name in names]
@@ -158,7 +158,7 @@ def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, un
     assert subscription.losses() == "5 missed, 2 of them before this subscriber connected"
 
 
-def test_what_nobody_listens_to_is_not_even_made(endpoint, until):
+def test_a_message_without_a_subscriber_is_not_encoded(endpoint, until):
     no_message = object()
     with Publisher(TRAINING, endpoint) as training:
         training.send(no_message)
@@ -170,7 +170,7 @@ def test_what_nobody_listens_to_is_not_even_made(endpoint, until):
         training.send(no_message)
 
 
-def test_silence_is_an_error_after_the_time_given_and_one_may_go_on(endpoint, tracks):
+def test_silence_is_an_error_after_the_timeout_and_iteration_may_continue(endpoint, tracks):
     with attached(endpoint, tracks) as subscription:
         subscription.timeout = 0.1
         with pytest.raises(SilenceError, match="is a pipeline running there"):
@@ -199,7 +199,7 @@ def test_async_for_gives_the_same(endpoint, tracks):
         assert subscription.missed == 2
 
 
-def test_a_waiting_task_can_be_cancelled_and_hears_silence(endpoint, tracks):
+def test_a_waiting_task_can_be_cancelled_and_times_out(endpoint, tracks):
     async def waits():
         with pytest.raises(asyncio.TimeoutError):
             await asyncio.wait_for(anext(subscription), 0.05)
@@ -215,12 +215,12 @@ def test_a_waiting_task_can_be_cancelled_and_hears_silence(endpoint, tracks):
 
 
 @pytest.mark.parametrize("channel", ["training", "results", "frames"])
-def test_a_channel_for_one_receiver_is_refused(endpoint, channel):
+def test_subscribing_to_a_channel_with_one_receiver_is_an_error(endpoint, channel):
     with pytest.raises(ServiceError, match="expected one of the channels samples, models, tracks, health"):
         catstream.subscribe(str(endpoint), channel)
 
 
-def test_who_hears_only_the_end_has_missed_all(endpoint, tracks, until):
+def test_a_subscriber_that_receives_only_the_end_has_missed_all(endpoint, tracks, until):
     with catstream.subscribe(str(endpoint), "tracks", timeout=20) as subscription:
         until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
         tracks.send(End(61, "the source came to its end"))
@@ -229,7 +229,7 @@ def test_who_hears_only_the_end_has_missed_all(endpoint, tracks, until):
 
 
 @pytest.mark.parametrize("channel", ["tracks", "features"])
-def test_a_subscriber_that_was_there_first_is_expected_until_it_is_connected(endpoint, until, channel):
+def test_a_pipeline_waits_for_a_subscriber_that_started_first(endpoint, until, channel):
     with catstream.subscribe(str(endpoint), channel, timeout=20) as subscription:
         (name, readers), *others = readers_of(endpoint).items()
         assert not others
