@@ -148,7 +148,7 @@ class SendWindow:
             self.version = reply.version
             self._samples.append((self.taken + 1, reply.version))
         self._forget(reply)
-        self.taken = self.acknowledged if isinstance(reply, Position) else min(reply.taken, self.sent)
+        self.taken = min(reply.seq if isinstance(reply, Position) else reply.taken, self.sent)
         return None
 
     def sample_of(self, seq: int) -> int:

@@ -269,6 +269,15 @@ def test_a_position_makes_the_sender_go_back_to_it_whatever_is_in_flight():
     assert frames(window) == [payload(3), payload(4)]
 
 
+def test_after_a_restart_of_the_receiver_its_first_acknowledgements_count():
+    window = filled(size=4, count=4)
+    window.receive(Stored(1, 4), now=0.0)
+    window.receive(Position(1), now=0.0)
+    assert window.taken == 1
+    assert window.receive(Stored(1, 2), now=0.0) is None
+    assert window.taken == 2
+
+
 def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_patience():
     window = SendWindow("features", 4, now=0.0)
     assert not window.must_ask(99.0)
