@@ -15,7 +15,7 @@ from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.heads import APPEARANCE, EXTENT
+from catstream.heads import APPEARANCE, EXTENT, HEADS
 from catstream.messages import DetectorState, Features, Motion, Sample, TrainingRows
 from catstream.settings import Settings
 
@@ -67,7 +67,8 @@ def test_each_row_goes_where_its_label_says(settings, messages):
     compressor = Compressor(settings)
     sample = take(compressor, messages, 60)[-1]
     frames = sample.frame + 1
-    counts = {"object": 2 * frames, "background": 3 * frames, "loss": 6 * frames, "extent": 3 * frames}
+    rows = {(APPEARANCE, 1.0): 2, (APPEARANCE, 0.0): 3, (APPEARANCE, None): 6, (EXTENT, None): 3}
+    counts = {name: frames * rows[head.group, head.label] for name, head in HEADS.items()}
     assert {name: tree.count for name, tree in sample.trees.items()} == counts
 
 
