@@ -1,4 +1,4 @@
-# Everything sets itself up: `make demo` or `make test` is all that a fresh checkout needs.
+# Each command installs what it needs: run `make demo` or `make test` in a fresh checkout.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
 VENV := .venv
@@ -10,16 +10,16 @@ TOOLS := $(VENV)/.tools
 .DEFAULT_GOAL := help
 .PHONY: help setup develop demo test test-slow lint format docs pythons picture settings protocol bench results lock clean fuzz audit
 
-help:  ## say what there is
+help:  ## list all commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
 		|| sed -n 's/^\([a-z-]*\):.*## /make \1  /p' Makefile
 
-setup: $(READY)  ## make the environment in .venv, from requirements.lock
+setup: $(READY)  ## create the environment in .venv, from requirements.lock
 
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 		echo "catstream needs Python 3.11 or newer, '$(PYTHON)' is $$($(PYTHON) --version 2>/dev/null || echo missing):" \
-			"install one, or say where it is: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
+			"install one, or give its path: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
 	@test -x $(BIN)/pip || .ci/step "making $(VENV) with $$($(PYTHON) --version)" $(PYTHON) -m venv --clear $(VENV)
 	@.ci/step "installing $$(grep -c '==' requirements.lock) packages, 900 MB on disk: a minute or more" \
 		$(PIP) --require-hashes -r requirements.lock
@@ -27,54 +27,54 @@ $(READY): requirements.lock pyproject.toml
 	@.ci/step "compiling kernels, once" $(BIN)/python -P -c 'import logging; logging.disable(); import catstream.detection.detector'
 	@touch $@
 
-develop: $(TOOLS)  ## add what tests and checks need, from requirements-dev.lock
+develop: $(TOOLS)  ## add the packages for tests and checks, from requirements-dev.lock
 
 $(TOOLS): $(READY) requirements-dev.lock
 	@.ci/step "installing $$(grep -c '==' requirements-dev.lock) packages for tests, 600 MB on disk: a minute or more" \
 		$(PIP) --require-hashes -r requirements-dev.lock -r requirements.lock
 	@touch $@
 
-demo: $(READY)  ## render a video, follow the object in it, say how well that went
+demo: $(READY)  ## render a video, track the object in it, print the accuracy
 	@$(BIN)/catstream demo
 
-test: $(TOOLS)  ## all tests but the slow ones, doctests too
+test: $(TOOLS)  ## all tests except the slow ones, with doctests
 	@$(BIN)/pytest -n auto --dist worksteal
 
 test-slow: $(TOOLS)  ## the slow ones: long real sequences, soaks
 	@$(BIN)/pytest -m slow --timeout 3600 -o faulthandler_timeout=0
 
-lint: $(TOOLS)  ## style, types, and what is unsafe
+lint: $(TOOLS)  ## style, types, and unsafe code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/bandit --quiet --configfile pyproject.toml --recursive catstream services
 
-format: $(TOOLS)  ## put style right where that needs no thought
+format: $(TOOLS)  ## fix the style automatically
 	$(BIN)/ruff check --fix-only --quiet .
 	$(BIN)/ruff format .
 
 docs: $(TOOLS)  ## the documentation, into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-pythons:  ## follow the demo on each Python of this machine that catstream supports
+pythons:  ## run the demo on each supported Python of this machine
 	@.ci/pythons
 
-picture: $(READY)  ## make the animated picture of README.md anew
+picture: $(READY)  ## render the animated picture of README.md
 	@$(BIN)/python .ci/picture
 
-settings: $(TOOLS)  ## write the table of docs/settings.md anew
+settings: $(TOOLS)  ## update the table of docs/settings.md
 	$(BIN)/python tests/test_docs.py
 
-protocol: $(TOOLS)  ## write the tables of docs/protocol.md anew
+protocol: $(TOOLS)  ## update the tables of docs/protocol.md
 	$(BIN)/python tests/wire/test_protocol_page.py
 
-bench: $(TOOLS)  ## measure speed, memory and growth on a quiet machine, into benchmarks/results: 20 minutes
+bench: $(TOOLS)  ## measure speed, memory and growth on an idle machine, into benchmarks/results: 20 minutes
 	PYTHON=$${PYTHON_OF_PEERS:-$(BIN)/python} benchmarks/measure.sh
 
 results: $(TOOLS)  ## write docs/results.md, and the figures of README, from benchmarks/results
 	$(BIN)/python benchmarks/page.py
 
-audit: $(TOOLS)  ## known holes in what the lock files install; asks PyPI
+audit: $(TOOLS)  ## known vulnerabilities of the packages in the lock files, from PyPI
 	$(BIN)/python .ci/audit
 
 fuzz: $(TOOLS)  ## a million hostile inputs for each decoder: half an hour
@@ -83,6 +83,6 @@ fuzz: $(TOOLS)  ## a million hostile inputs for each decoder: half an hour
 lock:  ## pin the newest versions of everything in both lock files, with their hashes
 	@PYTHON=$(PYTHON) .ci/lock
 
-clean:  ## remove the environment and all that was made
+clean:  ## remove the environment and all generated files
 	rm -rf $(VENV) build dist site demo *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
