@@ -1,9 +1,9 @@
 """The schema of messages: what each field may hold, as metadata of its annotation.
 
-`catstream.messages` states the schema. The checks of `catstream.wire.codec`, the tables of `docs/protocol.md` and
-the fuzzers are derived from it by `fields`. Without metadata a field keeps the limits that hold for all: a whole
-number is from 0 to `LARGEST_INTEGER`, a number is finite, a text has at most `LONGEST_TEXT` bytes, a list or map
-has at most `LONGEST_LIST` entries, and the width and the height of a box are above 0.
+`catstream.messages` states the schema. The checks of `catstream.wire.checks`, the files of `catstream.packing`, the
+tables of `docs/protocol.md` and the fuzzers are derived from it by `fields`. Without metadata a field has the limits
+that hold for all fields: a whole number is from 0 to `LARGEST_INTEGER`, a number is finite, a text has at most
+`LONGEST_TEXT` bytes, a list or map has at most `LONGEST_LIST` entries, and width and height of a box are above 0.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Array:
     shape       lengths of its sides; a letter stands for the same length in all arrays of one message
     low, high   its numbers are from `low` to `high`
     above       its numbers are larger than this
-    may_be_nan  whether NaN is allowed; infinity never is
+    may_be_nan  whether numbers may be other than finite, because NaN has a meaning
     """
 
     dtype: Literal["float32", "float64"]

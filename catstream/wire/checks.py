@@ -27,7 +27,7 @@ _Check = Callable[[Any, _Lengths], object]
 def check(message: object) -> _Lengths:
     """Check every field of a message.
 
-    Types are not checked, except for dtypes: the codec has done that if the message comes from outside.
+    Types are not checked, except for dtypes: the codec checks them in messages from outside.
 
     Returns
     -------

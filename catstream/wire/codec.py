@@ -2,7 +2,7 @@
 
 A message is one frame of msgpack, `[version, kind, fields]`:
 
-    version   2; another one is refused
+    version   2; another one is rejected
     kind      name of the message in small letters: "features", "track" ...
     fields    map from each field's name to its value, see `catstream.messages`
     a box     [x, y, w, h]
@@ -57,7 +57,7 @@ def encode(message: object) -> bytes:
     Raises
     ------
     ProtocolError
-        If it breaks its schema: it would be refused on arrival.
+        If it breaks its schema: it would be rejected on arrival.
     """
     check(message)
     return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
