@@ -115,7 +115,7 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
     assert (page["endpoint"], page["port"]) == (settings("detector").run.endpoint, 8000)
     server = Server(page["endpoint"], host=page["host"], port=0, token=page["token"])
     script = service["healthcheck"]["test"][-1].replace(":8000", f":{urlsplit(server.url).port}")
-    with server.beside():
+    with server.in_background():
         subprocess.run([sys.executable, "-P", "-c", script], check=True)
 
 
