@@ -1,7 +1,7 @@
 """Ablation: accuracy without each ingredient of the tracker, over all sequences and several starts of each.
 
 Single runs are chaotic: what counts is the difference sequence by sequence, beside its standard error. How many runs
-changed at all says how much the sequences ask for an ingredient.
+changed shows how much the sequences depend on an ingredient.
 """
 
 from __future__ import annotations

@@ -144,7 +144,7 @@ class Arena:
 
     Attributes
     ----------
-    tracks : all that came, in order
+    tracks : the received tracks, in order
     end : the last message of the stream, None before it
     deaths : how often a process ended and was started again
     links : by channel
@@ -190,7 +190,7 @@ class Arena:
         Raises
         ------
         ServiceError
-            Where nothing comes for two minutes, or a process says that it would only fail again.
+            If no track arrives for two minutes, or a process reports an error that a restart cannot solve.
         """
         message = self._results.receive(seconds)
         if message is not None:
@@ -280,7 +280,7 @@ def small_disk(folder: Path) -> Iterator[Path]:
     Raises
     ------
     OSError
-        Where it cannot be mounted; says why.
+        If it cannot be mounted.
     """
     folder.mkdir(exist_ok=True)
     mount = ["mount", "-t", "tmpfs", "-o", f"size={_DISK},mode=0700", "catstream", str(folder)]

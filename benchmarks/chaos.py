@@ -109,9 +109,9 @@ FAULTS: dict[str, tuple[Fault, float]] = {
 class Ordeal:
     """The results of a run with faults.
 
-    recovery  of each kind of fault: seconds from its end until all goes on
+    recovery  of each kind of fault: seconds from its end to the next track and the next model
     tracks    of each frame
-    totals    features messages `sent` and `stored`, as the last message of the stream tells them
+    totals    features messages `sent` and `stored`, from the last message of the stream
     deaths    how often a process was started again
     learned   the compressor, from its last checkpoint
     """
@@ -164,12 +164,12 @@ def schedule(cycles: int, seed: int) -> list[str]:
 def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: int = 0) -> Ordeal:
     """Track a source to its end with some faults; progress is printed to stderr.
 
-    The disk is a small one where it is to be filled, and these faults are left out where that cannot be mounted.
+    Faults of a full disk need a small file system; they are left out if it cannot be mounted.
 
     Raises
     ------
     ServiceError
-        Where the pipeline does not get to its end, or the source is too short for all faults.
+        If the pipeline does not reach its end, or the source is too short for all faults.
     """
     random, recovery = np.random.default_rng(seed), defaultdict(list)
     with ExitStack() as stack:

@@ -18,7 +18,7 @@ class Hosts:
     Raises
     ------
     OSError
-        Where they cannot be made; says why.
+        If they cannot be made.
     """
 
     def __init__(self, *names: str) -> None:

@@ -269,7 +269,7 @@ SECTIONS = (
             Shown("root_or_hierarchy-ours", of()),
             Shown("sampling", of(without=".*paper")),
             Shown("sampling-ours", of(without=".*paper")),
-            Shown("coreset.size", of(without="2.5 %|10 %")),
+            Shown("coreset_size", of(without="2.5 %|10 %")),
             Shown("bootstrap", of()),
             Shown("long_videos-50000", of(without="TLD_06_car")),
             Shown("long_videos", of(without="paper: (CAT, n = (5|10|15|20)00|TLD|TGPR) ")),

@@ -1,7 +1,7 @@
 """Kills all processes of a run at random moments, as a power cut does, and checks that --resume continues the run.
 
-Again and again `catstream track` and all its processes get SIGKILL, once a random number of new rows has come, and
-`--resume` goes on. When all moments are through, the run goes on to its end.
+After a random number of new rows, `catstream track` and all its processes get SIGKILL, and `--resume` continues the
+run; this is repeated. After the last kill, the run continues to its end.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def sequences(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
     Raises
     ------
     VideoError
-        Where there is none.
+        If there is none.
     """
     if options.quick:
         return [rendered(_QUICK_FRAMES, (320, 240))]

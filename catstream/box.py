@@ -18,7 +18,7 @@ __all__ = ["Box", "Window"]
 
 
 class _Rectangle(NamedTuple):
-    """A rectangle in pixels: its top left corner, its width and its height."""
+    """A rectangle in pixels: top left corner, width and height."""
 
     x: float
     y: float
@@ -27,25 +27,25 @@ class _Rectangle(NamedTuple):
 
     @property
     def centre(self) -> tuple[float, float]:
-        """The point in the middle, (x, y)."""
+        """Centre, (x, y)."""
         return self.x + self.w / 2, self.y + self.h / 2
 
     @property
     def area(self) -> float:
-        """Square pixels."""
+        """Area in square pixels."""
         return self.w * self.h
 
     def scaled(self, across: float, down: float | None = None) -> Self:
-        """The same centre, `across` times the width and `down` times the height (`across` if None)."""
+        """Return the rectangle with the same centre; `across` scales the width, `down` the height (None: `across`)."""
         w, h = self.w * across, self.h * (across if down is None else down)
         return type(self)(self.x + (self.w - w) / 2, self.y + (self.h - h) / 2, w, h)
 
     def centred(self, x: float, y: float) -> Self:
-        """The same size around another centre."""
+        """Return the rectangle of the same size with another centre."""
         return type(self)(x - self.w / 2, y - self.h / 2, self.w, self.h)
 
     def with_centre_in(self, width: int, height: int) -> Self:
-        """Moved, if necessary, until its centre lies in a frame of this size.
+        """Return the rectangle, moved if necessary so that its centre is inside a frame of this size.
 
         Examples
         --------
@@ -56,7 +56,7 @@ class _Rectangle(NamedTuple):
         return self.centred(min(max(x, 0), width - 1), min(max(y, 0), height - 1))
 
     def overlap(self, other: Self) -> float:
-        """Intersection over union, 0 to 1: the overlap score S of the benchmarks."""
+        """Return the intersection over union with another rectangle, from 0 to 1."""
         w = min(self.x + self.w, other.x + other.w) - max(self.x, other.x)
         h = min(self.y + self.h, other.y + other.h) - max(self.y, other.y)
         if w <= 0 or h <= 0:
@@ -66,7 +66,7 @@ class _Rectangle(NamedTuple):
 
 
 class Box(_Rectangle):
-    """Where an object is: its top left corner, its width and its height, in pixels of the frame.
+    """The bounding box of an object in pixels of the frame: top left corner, width and height.
 
     Examples
     --------
@@ -80,12 +80,12 @@ class Box(_Rectangle):
 
     @classmethod
     def parse(cls, value: str | Iterable[float]) -> Box:
-        """Read a box as people write it: four numbers, or a text `x,y,w,h` (commas, blanks or tabs between them).
+        """Make a box from four numbers or from a text `x,y,w,h`, separated by commas, blanks or tabs.
 
         Raises
         ------
         BoxError
-            If these are not four numbers.
+            If the value is not four numbers.
 
         Examples
         --------
@@ -105,7 +105,7 @@ class Box(_Rectangle):
         return cls(x, y, w, h)
 
     def validated(self, width: int, height: int) -> Box:
-        """This box, after a check that tracking can start with it in a frame of this size.
+        """Return the box unchanged if tracking can start with it in a frame of this size.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class Box(_Rectangle):
             raise BoxError(f"a box needs four finite numbers, got {self}: give x,y,w,h in pixels")
         if self.w < 2 or self.h < 2:
             raise BoxError(f"a box needs a width and a height of at least 2 pixels, got {self.w:g} x {self.h:g}")
-        # Such a box covers the frame from edge to edge, wherever in it its centre lies: it says nothing of an object.
+        # With its centre inside the frame, such a box covers the whole frame: it does not select an object.
         if self.w > 2 * width or self.h > 2 * height:
             raise BoxError(
                 f"a box may be twice as wide and high as the frame of {width} x {height} pixels, got "
@@ -136,7 +136,7 @@ class Box(_Rectangle):
 
 
 class Window(_Rectangle):
-    """What the features of an object are computed from: its box with some of its surroundings.
+    """The part of a frame that features are computed from: the box of an object and some of its surroundings.
 
     Examples
     --------

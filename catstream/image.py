@@ -58,7 +58,7 @@ def _validated(image: Any) -> np.ndarray:
             hint = "give one image of a batch at a time"
         raise FrameError(f"{_EXPECTED}, got the shape {shape}: {hint}")
     if not image.size:
-        raise FrameError(f"{_EXPECTED}, got the shape {shape}, which has no pixels: check where it was cut from")
+        raise FrameError(f"{_EXPECTED}, got the shape {shape}, which has no pixels: check how it was cropped")
     return np.asarray(image)
 
 

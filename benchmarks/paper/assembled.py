@@ -32,7 +32,7 @@ class Recipe:
     """The parts of a tracker.
 
     settings  of the stages
-    tree      class of the compressor's trees: `sample` says what is learned from
+    tree      class of the compressor's trees: its `sample` is the training set
     learned   share of the frames that it learns from, the first ones; the rest it only follows
     """
 

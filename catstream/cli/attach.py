@@ -16,7 +16,7 @@ __all__ = ["wait_for_pipeline", "with_endpoint", "with_wait"]
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 _ENDPOINT = click.option(
-    "--endpoint", default="", metavar="PLACE", help="Where the pipeline runs; not needed if only one does."
+    "--endpoint", default="", metavar="PLACE", help="Endpoint of the pipeline; not needed if only one runs."
 )
 _KEYS = click.option("--keys", default="", metavar="DIR", help="Folder of keys, if the pipeline requires keys.")
 

@@ -35,12 +35,13 @@ class Step:
 
 @dataclass(slots=True)
 class LoadTest:
-    """What was run.
+    """The runs of a load test.
 
-    is_search     whether a rate was looked for
-    steps        all runs, in order; empty where it was stopped before the first was measured
-    highest_rate        the highest rate that holds; None where none was looked for, or highest_rate
-    interrupted  whether it was stopped before its end
+    limits        the limits of each run
+    is_search     whether the highest rate is searched for
+    steps         all runs, in order; empty if it was interrupted before the first measurement
+    highest_rate  the highest rate that meets the limits; None if there was no search, or no such rate
+    interrupted   whether it was interrupted
     """
 
     limits: list[Limit]

@@ -54,19 +54,19 @@ class Recovery:
 
 @dataclass(slots=True)
 class Result:
-    """What one run gave.
+    """The results of one run.
 
-    plan         what was asked
-    seconds      of frames that were measured: less than asked where it was interrupted
-    streams      figures of each
-    restarts     of processes, in all
-    recoveries   of each kill
-    usage        processor and memory of each process, and of all that is not of the load test
-    received        tracks that each quick subscriber received, and missed
-    frozen       seconds for which the frozen subscribers were that
-    camera_late  seconds by which the camera itself sent a frame too late at most
-    errors       of streams that failed
-    interrupted  whether it was stopped before its end
+    plan         parameters of the run
+    seconds      duration of the measured frames: less than planned if the run was interrupted
+    streams      measures of each stream
+    restarts     total number of restarted processes
+    recoveries   recovery of each kill
+    usage        readings of each process, and of the load by processes outside the load test
+    received     number of tracks that each fast subscriber received; `missed` is the number that it missed
+    frozen       seconds for which the frozen subscribers were stopped
+    camera_late  largest delay in seconds of a frame that the camera itself caused
+    errors       errors of failed streams
+    interrupted  whether the run was interrupted
     """
 
     plan: Plan

@@ -81,7 +81,7 @@ class Connection(H11Protocol):
             self._stop_waiting()
         elif (
             self._between_requests and not self.conn.trailing_data[0]
-        ):  # it is kept as long as `timeout_keep_alive` says
+        ):  # an idle connection has the time-out `timeout_keep_alive`
             self._stop_waiting()
             self.waiting_since = self.loop.time()
         elif self._timer is None:

@@ -154,8 +154,8 @@ class Dashboard:
 
     def _add_health(self, health: Health, now: float) -> None:
         self.health[health.process] = health
-        heard = self.last_reports | {health.process: now}
-        self.last_reports = {name: last for name, last in heard.items() if now - last <= SILENCE_SECONDS}
+        times = self.last_reports | {health.process: now}
+        self.last_reports = {name: last for name, last in times.items() if now - last <= SILENCE_SECONDS}
         self._last[health.process] = health
         self.source = health.source or self.source
         if self.phase in ("waiting", "silent"):

@@ -63,7 +63,7 @@ export class Charts {
       make("polyline", { points: piece.map((point) => `${x(point[0]).toFixed(1)},${y(point[column]).toFixed(1)}`).join(" ") }));
     drawing.replaceChildren(...away, ...grid, ...line);
     drawing.setAttribute("aria-label", `${title}: ${right.textContent}, from ${show(Math.min(...points.map((p) => p[column])))}`
-      + ` to ${show(Math.max(...points.map((p) => p[column])))} in the last two minutes; shaded where the object was absent`);
+      + ` to ${show(Math.max(...points.map((p) => p[column])))} in the last two minutes; shaded: the object was absent`);
   }
 }
 

@@ -50,7 +50,7 @@ export class Trees {
     const ends = ({ level, from }) => [EDGE + apart * from, EDGE + apart * (from + 2 ** level)];
     const below = (node) => {
       if (!node.level) return;
-      if (apart * 2 ** (node.level - 1) < CLOSEST) { // too close to be told apart
+      if (apart * 2 ** (node.level - 1) < CLOSEST) { // too close to be distinguished
         fans.push(`M${x(node)} ${y(node)}L${ends(node).map((end) => `${end} ${HEIGHT - 14}`).join("L")}Z`);
         return;
       }
