@@ -25,8 +25,8 @@ OBSERVED = np.eye(2, 4)  #: of the state, x and y are measured
 def prepare() -> None:
     """Import filterpy in a thread, once; returns at once.
 
-    It imports scipy.stats, half a second of a processor. A filter that is asked for meanwhile waits for the
-    import, so that no result depends on when it ends.
+    filterpy imports scipy.stats, which takes half a second. A filter that is needed meanwhile waits for the import, so
+    that no result depends on its end.
     """
     Thread(target=_imported, name="filterpy").start()  # no daemon: an interpreter must not end inside an import
 

@@ -80,10 +80,10 @@ class Shared:
         self.told = 0
         return self
 
-    def step(self, image: np.ndarray) -> tuple[float, Box]:
+    def follow(self, image: np.ndarray) -> tuple[float, Box]:
         """Return the cached result of SCM for a frame."""
         if self.told == len(self.found):
-            self.found.append(self.model.step(image))
+            self.found.append(self.model.follow(image))
         self.told += 1
         return self.found[self.told - 1]
 

@@ -1,8 +1,4 @@
-"""The detector: frames in, tracks and training rows out (paper, "Classification").
-
-`step` is a pure function: the same state, frame, model and settings give the same result. `Detector` holds the state
-and the model from one frame to the next.
-"""
+"""The detector: frames in, tracks and training rows out. It holds state and model from one frame to the next."""
 
 from __future__ import annotations
 
@@ -12,73 +8,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from catstream.box import Box, Window
-from catstream.detection import belief, colour_centroid, extent, motion, search, teacher
+from catstream.detection import motion, teacher
 from catstream.detection.search import Detection, ScoreMap
+from catstream.detection.step import step, track_of
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
-from catstream.features.cells import COLOURS, row_length
+from catstream.features.cells import row_length
 from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.messages import DetectorState, Features, Model, State, Track
+from catstream.messages import DetectorState, Features, Model, Track
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel
 
-__all__ = ["Detector", "step"]
-
-
-def step(
-    state: DetectorState,
-    frame: Pyramid,
-    seq: int,
-    time: float,
-    model: Model,
-    settings: Settings,
-    found: Detection | None = None,
-) -> tuple[DetectorState, Track, Training]:
-    """Find the object in the next frame, and cut the training rows that the belief in the detection allows.
-
-    Costs the same for every frame: a few small patches around the object, and the whole frame if the belief is low (or
-    always, if `search.mode` is "full").
-
-    Parameters
-    ----------
-    seq, time : of the frame's messages
-    found : what the paper's first tracker found, in place of a search; it never reports the object as absent
-    """
-    if found is not None:
-        level = belief.level_of(found.score, belief.ALWAYS, True, settings.belief)
-        state = replace(state, level=level, window=found.window)
-    else:
-        state = motion.expected(state)
-        state, found = search.searched(frame, state, seq, model, settings)
-        state = belief.updated(state, found.score, found.redetected, settings.belief)
-        if belief.policies(settings)[state.level].reported:
-            state = _followed(state, found, frame.size, model, settings)
-            state = motion.observed(state)
-    training = teacher.training_of(frame, found, state, seq, model, settings)
-    return state, _track(state, seq, time, found.score, model, settings), training
-
-
-def _followed(
-    state: DetectorState, found: Detection, size: tuple[int, int], model: Model, settings: Settings
-) -> DetectorState:
-    """The state with the window moved to a detection, as far as the belief in it allows."""
-    policy, colours = belief.policies(settings)[state.level], state.colour_centroid
-    window = extent.followed(state.window, found.window, found.score >= policy.resize, settings.extent)
-    if found.around is not None and found.score >= policy.recentre:
-        slack, weights = settings.extent.colour_slack, model.weights[COLOURS]
-        colours, window = colour_centroid.recentred(colours, window, found.around, weights, slack)
-    window = window.with_centre_in(*size)
-    confident = window if found.score >= policy.remember else state.confident_window
-    return replace(state, window=window, confident_window=confident, colour_centroid=colours)
-
-
-def _track(state: DetectorState, seq: int, time: float, score: float, model: Model, settings: Settings) -> Track:
-    box = None if state.level == "lost" else state.window.box(settings.search.context)
-    reported: State = "absent" if box is None else "present" if model.version else "bootstrapping"
-    return Track(seq, seq - 1, time, reported, box, float(score), model.version)
+__all__ = ["Detector"]
 
 
 class Detector:
@@ -139,7 +83,7 @@ class Detector:
         model, training = teacher.first_training(frame, window, np.random.default_rng(rng), self.settings)
         self.state, self.model, self._scm = DetectorState(self.seq, "confident", window, window, window), model, scm
         self.seq += 1
-        return self._messages(_track(self.state, self.seq, time, 1.0, model, self.settings), training, begins=True)
+        return self._messages(track_of(self.state, self.seq, time, 1.0, model, self.settings), training, begins=True)
 
     def seek(self, model: Model, box: Box) -> None:
         """Start with a model: the object is absent until it is found, in whichever frame and size that is.
@@ -173,7 +117,7 @@ class Detector:
         self.seq += 1
         found = None
         if self._scm is not None:
-            score, box = self._scm.step(image)
+            score, box = self._scm.follow(image)
             found = Detection(score, Window.of(box, self.settings.search.context).with_centre_in(*frame.size))
         state = self.state
         self.state, track, training = step(state, frame, self.seq, time, self.model, self.settings, found)
@@ -205,7 +149,7 @@ class Detector:
         )
         score = float(ScoreMap.around(frame, window, WINDOW, self.model).scores[0, 0])
         training = teacher.training_at(frame, window, self.seq, self.model, self.settings)
-        return self._messages(_track(self.state, self.seq, time, score, self.model, self.settings), training)
+        return self._messages(track_of(self.state, self.seq, time, score, self.model, self.settings), training)
 
     def miss(self, time: float = 0.0) -> tuple[Track, Features]:
         """Let a frame pass without a search: the object counts as absent."""

@@ -51,7 +51,7 @@ def _steps(count: int) -> list[int]:
 
 def size(step: float, settings: ExtentSettings) -> float:
     """Factor of both sides."""
-    return (1 + settings.size_step) ** step
+    return float((1 + settings.size_step) ** step)
 
 
 def stretch(step: float, settings: ExtentSettings) -> tuple[float, float]:

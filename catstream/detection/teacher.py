@@ -196,7 +196,8 @@ def _ellipse(context: float) -> np.ndarray:
     """Share of the object in each pixel of a patch, float32: 1 inside its ellipse, falling to 0 around it."""
     across = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / context / 2)
     out = np.hypot(across[:, None], across)
-    return ((_GONE - out) / (_GONE - _SOLID)).clip(0, 1).astype(np.float32)
+    share: np.ndarray = ((_GONE - out) / (_GONE - _SOLID)).clip(0, 1).astype(np.float32)
+    return share
 
 
 def _appearance(

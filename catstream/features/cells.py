@@ -1,6 +1,6 @@
-"""Cells: the features of an image, in a grid, and of every window in it.
+"""Cells: the features of an image in a grid of cells, and the score of every window in it.
 
-A window is 8 x 8 cells. Its row is their HOG and mean colour, and the histogram of its colours.
+A window is 8 x 8 cells. Its feature row holds their HOG and mean colours, and the histogram of its colours.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from catstream.features.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
 __all__ = ["COLOURS", "Cells", "row_length"]
 
 _PLACES = WINDOW * WINDOW * CHANNELS
-#: Where in a row the histogram of colours is.
+#: The columns of a row that hold the histogram of colours.
 COLOURS = slice(_PLACES, _PLACES + SHADES)
 
 
@@ -49,7 +49,7 @@ class Cells:
 
     @classmethod
     def within(cls, image: np.ndarray) -> Cells:
-        """The same without the margin, whose features depend on what is beyond the image."""
+        """The same without the margin, whose features depend on pixels beyond the image."""
         edge = MARGIN * CELL
         return cls(grid(image, MARGIN), colours.shades(image[edge:-edge, edge:-edge]))
 

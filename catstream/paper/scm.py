@@ -93,7 +93,7 @@ class SparseCollaborativeModel:
         self._generative = _Generative(*(arrays[f"scm.{name}"] for name in ("atoms", "first", "histogram")))
         return self
 
-    def step(self, image: np.ndarray) -> tuple[float, Box]:
+    def follow(self, image: np.ndarray) -> tuple[float, Box]:
         """Find the object in the next frame, of the size of the first.
 
         Returns

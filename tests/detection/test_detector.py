@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.detection.detector import Detector, step
+from catstream.detection.detector import Detector
+from catstream.detection.step import step
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import row_length
 from catstream.features.pyramid import Pyramid

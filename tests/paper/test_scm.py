@@ -38,7 +38,7 @@ def scene(rng):
 def followed(frames, start, seed=0):
     frames = iter(frames)
     model = SparseCollaborativeModel(next(frames), start, np.random.default_rng(seed), particles=100)
-    return [model.step(frame) for frame in frames]
+    return [model.follow(frame) for frame in frames]
 
 
 @pytest.mark.parametrize("centre", [0.0, 1.0])
