@@ -48,15 +48,15 @@ _log = logging.getLogger(__name__)
 
 
 class Pipeline:
-    """Follows an object with three processes, and gives one `Track` a frame, none missing.
+    """Follows an object with three processes, and yields exactly one `Track` for each frame.
 
-    Iterate it, with `for` or `async for`: the processes are started, and stopped at the end of the loop. Use it in a
-    `with` or `async with` to have its endpoint and its counters too, and to iterate it piece by piece. A pipeline runs
+    Iterate over it with `for` or `async for`: the processes are started, and stopped at the end of the loop. Use it in
+    a `with` or `async with` to read its endpoint and its counters too, and to iterate over it in parts. A pipeline runs
     once; make another one to follow the source again.
 
-    A process that dies is restarted, and the run goes on. A slow consumer slows a file down: the detector waits. A
-    live source never waits: the frames that pass meanwhile are skipped and counted. It has no end, and is opened again
-    whenever it is lost.
+    A process that dies is restarted, and the run continues. Backpressure: on a file, a slow consumer blocks the
+    detector; on a live source, frames are skipped and counted. A live source has no end, and is opened again whenever
+    it is lost.
 
     Parameters
     ----------
@@ -64,40 +64,39 @@ class Pipeline:
         A video file, a folder of images, a pattern such as `images/%05d.png`, a camera (`0`), or a stream
         (`rtsp://...`).
     box : str or four numbers
-        x, y, w, h of the object in the first frame, in pixels: `(120, 80, 64, 48)` or `"120,80,64,48"`. With neither
-        this nor a model the first frame is held, or those of a live source pass by, until `catstream.control` sets a
-        box.
+        x, y, w, h of the object in the first frame, in pixels: `(120, 80, 64, 48)` or `"120,80,64,48"`. Without a
+        box or a model, the run waits for the box that `catstream.control` gives: a file stays at its first frame, a
+        live source goes on.
     settings : Settings or mapping of str
-        Those that are not the defaults. If a run goes on, those that are to be different.
+        The settings that differ from the defaults, or from those of the run that is resumed.
     model : path
-        File that `catstream save` wrote. The object is searched for, is absent until it is found, and learning goes on
-        from there.
+        File that `catstream save` wrote. The object is searched for, and absent until it is found; learning continues
+        from the file.
     part : slice
         The frames of a file or folder to follow: `slice(100, 200, 2)` for 100, 102 ... 198.
     record : path
         File to record all messages to, see `catstream replay`. No features are missing in it.
     state : path
-        Folder to keep what was learned in, once a second and at the end, so that a power cut does not end the run.
+        Folder for checkpoints, written once a second and at the end, from which the run can be resumed.
     resume : path
-        Folder of an earlier run to go on with, from the frame that it had reached. Source, box, part and settings are
-        kept there too.
+        State folder of an earlier run, which continues at the frame that it had reached. The folder also contains the
+        source, the box, the part and the settings.
     after : Position
-        With `resume`: the last track that the caller has. The run goes on with the next one. If None, it goes on after
-        the last frame that was learned from: tracks of the last second may come again.
+        With `resume`: the last track that the caller has; the run continues with the next one. If None, it continues
+        after the last checkpoint: tracks of the last second may be repeated.
     results : Results
-        The files that the program writes, to be kept with the state for the program that goes on.
+        The files that the program writes, stored in the state folder for the program that resumes the run.
     save_model : path
-        File to write what was learned to once the processes have ended, however the run ended: what
-        `catstream save` writes.
+        File for the model, written as by `catstream save` once the processes have ended, however the run ended.
 
     Attributes
     ----------
     name : str
-        Of the source.
+        Name of the source.
     frames : int or None
-        How many the source has, None if that is not known.
+        Number of frames of the source, None if it is not known.
     rate : float
-        Frames a second of the source.
+        Frames per second of the source.
     size : tuple of int
         Width and height of a frame.
     live : bool
@@ -235,11 +234,11 @@ class Pipeline:
         await asyncio.shield(asyncio.to_thread(self.close))
 
     def close(self) -> None:
-        """Stop the processes, each in order; what was learned is stored first. It cannot be started again."""
+        """Stop the processes in order, after they have stored everything. The pipeline cannot be started again."""
         stack, self._stack = self._stack, _CLOSED
         if stack is not None and stack is not _CLOSED:
             with stack:
-                self._listen()  # also to what came since the last track, before Ctrl-C
+                self._receive_health()  # also what arrived since the last track, before Ctrl-C
 
     def __del__(self) -> None:
         if getattr(self, "_stack", None) not in (None, _CLOSED):
@@ -266,7 +265,7 @@ class Pipeline:
                 yield track
 
     def _tracks(self) -> Iterator[Track]:
-        """The tracks that come from now on."""
+        """The tracks that arrive from now on."""
         while not self._over():
             if (track := self._take(_CHECK_SECONDS)) is not None:
                 yield track
@@ -275,7 +274,7 @@ class Pipeline:
         self._raise_failure()
 
     async def _tracks_async(self) -> AsyncIterator[Track]:
-        """The same, for an event loop: nothing here waits but in `await`."""
+        """The same for an event loop: it waits only in `await`."""
         while not self._over():
             if (track := self._take(0)) is not None:
                 yield track
@@ -286,12 +285,13 @@ class Pipeline:
         self._raise_failure()
 
     def _over(self) -> bool:
+        """Whether the end of the stream was received."""
         if self._stack is _CLOSED:
             raise ServiceError(_ONCE)
         return self._end is not None
 
     def _take(self, seconds: float) -> Track | None:
-        """The next track if it comes in time; looks after the processes too."""
+        """The next track, None if none arrives in time; checks the processes now and then."""
         message = self._incoming.receive(seconds)
         if isinstance(message, Track):
             self._incoming.acknowledge(Position(message.seq, message.frame, message.box or self._box))
@@ -305,17 +305,18 @@ class Pipeline:
         return message if isinstance(message, Track) else None
 
     def _raise_failure(self) -> None:
+        """Raise VideoError if the source broke."""
         if self._end is not None and self._end.failed:
             raise VideoError(self._end.reason)
 
     @property
     def endpoint(self) -> str:
-        """Where the processes meet, for `catstream.subscribe` and `catstream.control`.
+        """The address of the pipeline, for `catstream.subscribe` and `catstream.control`.
 
         Raises
         ------
         ServiceError
-            If it was not started yet.
+            If the pipeline was not started yet.
         """
         if not self._endpoint:
             raise ServiceError("a pipeline has no endpoint before it has started: use it in a `with`")
@@ -323,70 +324,72 @@ class Pipeline:
 
     @property
     def totals(self) -> dict[str, int]:
-        """At the end: how many features were `sent`, and `stored` in the coreset trees."""
+        """At the end: the number of features messages that were `sent`, and `stored` in the coreset trees."""
         return {name: int(value) for name, value in self._end.totals.items()} if self._end else {}
 
     @property
     def health(self) -> dict[str, dict[str, float]]:
-        """The latest counters of each process that came while iterating or by the end, by its name."""
+        """The counters of each process that were received last, by the name of the process."""
         return {name: health.counters for name, health in self._health.items()}
 
     @property
     def trouble(self) -> dict[str, str]:
-        """What is wrong with a process, for a person, by its name; of those with which something is."""
+        """What is wrong, for a person, by the name of the process; only of processes with a problem."""
         return {name: health.trouble for name, health in self._health.items() if health.trouble}
 
     @property
     def pids(self) -> dict[str, int]:
-        """Process id by name, of those that run."""
+        """Process ids by name, of the processes that run."""
         return self._supervisor.pids if self._supervisor is not None else {}
 
     @property
     def restarts(self) -> int:
-        """How often a process died and was restarted."""
+        """How many times a process was restarted."""
         return self._supervisor.restarts if self._supervisor is not None else 0
 
     @property
     def lost_seconds(self) -> float:
-        """For how long a live source has been lost, 0 while it is not."""
+        """For how long a live source has been lost, 0 if it is not lost."""
         return self.health.get("detector", {}).get("lost_seconds", 0.0)
 
     @property
     def waits(self) -> bool:
-        """Whether it begins by waiting for a box; one that goes on may have one by now."""
+        """Whether the run begins by waiting for a box; one that is resumed may have a box by now."""
         return self._box is None and self._job.model is None and self._kept is None
 
     @property
     def complete(self) -> bool:
-        """Whether it is to go on with a run that has followed all frames; asked before it starts."""
+        """Whether the run that would be resumed has followed all frames already; ask this before the start."""
         if self._kept is None or self._state is None or self.frames is None or self.live:
             return False
         return self._start(self._state).seq >= self.frames
 
     @property
     def holding(self) -> str:
-        """Why no frame is followed though there are some, empty where they are: "paused", or "waiting" for a box."""
-        told = self.health.get("detector", {})
-        return next((name for name in ("waiting", "paused") if told.get(name)), "")
+        """Why frames are not followed: "paused", or "waiting" for a box; empty if they are followed."""
+        counters = self.health.get("detector", {})
+        return next((name for name in ("waiting", "paused") if counters.get(name)), "")
 
     def _start(self, state: Path) -> Position:
-        """After which track to go on."""
+        """The track after which the run continues."""
         if self._after is not None and not self.live:
             return self._after
-        # The frames of a live source cannot be had again: what was learned from is not lost, though no track tells.
+        # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
         learned = position(state, self.settings)
         return max(learned, self._after or learned, key=lambda start: start.seq)
 
     def _watch(self) -> None:
-        self._listen()
+        """Take in the health, restart processes that died, and log what the user should know."""
+        self._receive_health()
         self._children.check()
         for line in self._children.news("detector"):
-            if self.live or line == COMPILING:  # of a live source: when it is lost, why, and when it is back
+            if self.live or line == COMPILING:  # a live source is lost, or is back
                 _log.warning("%s", line)
         if self._children.finished:
             raise ServiceError("the processes ended before the video did: this should not happen, please report it")
 
-    def _listen(self) -> None:
+    def _receive_health(self) -> None:
+        """Take in the health of the processes, and log each new trouble."""
         for health in self._reports.receive_all():
             before = self._health.get(health.process)
             if health.trouble and (before is None or before.trouble != health.trouble):
@@ -394,14 +397,14 @@ class Pipeline:
             self._health[health.process] = health
 
     def _farewell(self) -> Iterator[None]:
-        """Turns until the detector has heard that its end is stored, though it may have to be told twice, and ended."""
+        """Turns until the detector has ended, which it does once it knows that its end was received."""
         deadline = time.monotonic() + _FAREWELL_SECONDS
         while not self._children.finished and time.monotonic() < deadline:
             yield
             self._incoming.receive(0)
-            self._listen()
+            self._receive_health()
             self._children.check()
-        self._listen()
+        self._receive_health()
 
     @property
     def _children(self) -> Supervisor:

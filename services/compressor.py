@@ -1,134 +1,165 @@
-"""Features in, samples out; owns the coreset trees, and keeps them on disk as they grow."""
+"""Features in, samples out; owns the coreset trees, and stores them on disk as they grow."""
 
 from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
 from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
+from catstream.job import Job
 from catstream.learned import Learned
-from catstream.messages import End, Features, Position
+from catstream.messages import End, Features
 from catstream.recording.file import RecordingWriter
 from catstream.services.loop import Process
+from catstream.services.progress import Progress
 from catstream.services.recorder import Recorder
 from catstream.state import TREES, locked
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import FEATURES, SAMPLES
 from catstream.wire.newest import Publisher
 
-__all__ = ["main"]
+__all__ = ["main", "reading_seconds"]
 
-_FAREWELL_SECONDS = 5.0  # that the sender may take to end where all were asked to
-_END_SECONDS = 5.0  # that the end of the tracks, after that of the features, may take
-_STORE_SECONDS = 60.0  # that a slow disk may take
-_READ_SECONDS = 1e-7  # that it may take for a byte
-_LOCK_SECONDS = 10.0  # that a compressor before this one may take to end
+_FAREWELL_SECONDS = 5.0  # limit for the sender to end, if all processes were asked to end
+_END_SECONDS = 5.0  # limit for the end of the tracks, after that of the features
+_STORE_SECONDS = 60.0  # limit for a slow disk
+_READ_SECONDS = 1e-7  # limit for reading one byte
+_LOCK_SECONDS = 10.0  # limit for an earlier compressor to end
 
 
 def main(process: Process) -> None:
-    """Take every message once, until the stream ends.
-
-    Parameters
-    ----------
-    model : file of what was learned of the object before: the trees go on from it
-    state : folder of the checkpoints that a restarted compressor goes on from; without one,
-        what was taken counts as stored
-    record : file to write all that travels to, features as they are taken; one that is there is gone on with
-    """
-    settings, job = process.settings, process.job
-    model, state, record = job.model, job.state, job.record
+    """Receive each message once, until the stream ends."""
     with ExitStack() as stack:
-        checkpoints = None
-        if state is not None:
-            checkpoints = CheckpointStore(stack.enter_context(locked(state / TREES, _LOCK_SECONDS)))
-        compressor = checkpoints.load(settings) if checkpoints else Compressor(settings)
-        if model is not None and not compressor.seq:
-            compressor = Compressor.of(Learned.load(model).sample, settings)
-        stored, tried, settled = compressor.seq, time.monotonic(), compressor.position
-
-        def store(needed: bool = True) -> Position:
-            """Write a checkpoint. Where the disk takes none and it is needed, memory has to do: learning goes on."""
-            nonlocal stored, tried, settled
-            process.allow(_STORE_SECONDS)
-            if checkpoints is None or checkpoints.save(compressor):
-                stored, needed = compressor.seq, True
-            tried = time.monotonic()
-            if needed:
-                settled = replace(compressor.position, unsaved=compressor.seq - stored)
-            return settled
-
-        recorder = None
-        if record is not None:
-            process.allow(reading_seconds(record))
-            writer = stack.enter_context(RecordingWriter(record, process.run, resume=True))
-            recorder = stack.enter_context(Recorder(writer, process.endpoint))
-
-        def check(message: Features | End) -> None:
-            if isinstance(message, Features):
-                compressor.check(message)
-
-        features = stack.enter_context(
-            Receiver(FEATURES, process.endpoint, settled, settings.run.unstored_frames, check)
-        )
-        samples = stack.enter_context(Publisher(SAMPLES, process.endpoint))
-
-        def counters() -> dict[str, float]:
-            own: dict[str, float] = {"stored": stored}
-            if recorder is not None:
-                own |= {"recorded": writer.written, "unrecorded": float(recorder.failed != "")}
-            return compressor.counters() | own
-
-        if compressor.last_sample is not None:
-            samples.send(compressor.last_sample)
-        end = False
-        while not process.ended_for(_FAREWELL_SECONDS if features.has_sender else 0):
-            message = features.receive(0.1)
-            end = isinstance(message, End)
-            if message is None:
-                reduce.prepare()
-            if recorder is not None:
-                recorder.listen()
-            if isinstance(message, Features):
-                if recorder is not None:  # before it can count as stored: none is missing that a checkpoint holds
-                    recorder.keep(message)
-                sample = compressor.take(message)
-                if sample is not None:
-                    samples.send(sample)
-            before, waiting = settled, compressor.seq - settled.seq
-            needed = checkpoints is None or end or 2 * waiting >= settings.run.unstored_frames or features.asked
-            overdue = time.monotonic() - tried >= settings.run.checkpoint_seconds
-            if compressor.seq > stored and (needed or overdue):
-                store(needed)
-            if features.asked:
-                features.answer(settled)
-            if message is not None or settled is not before:
-                # The end of the stream holds no features: with all before it, it is stored too. A sample needs
-                # no checkpoint to be made: in lockstep the detector waits for its model.
-                now = replace(settled, version=compressor.sampled)
-                if isinstance(message, End):
-                    now = replace(now, seq=message.seq, unsaved=now.unsaved and now.unsaved + 1)
-                features.acknowledge(now)
-            samples.serve_late_joiners()
-            process.trouble = checkpoints.trouble if checkpoints else ""
-            process.beat(counters, now=end)
+        loop = CompressorLoop(process, stack)
+        end: End | None = None
+        while end is None and not loop.over:
+            message = loop.receive()
             if isinstance(message, End):
-                process.broken = message.failed
-                samples.send(message)
-                break
+                end = message
+            elif message is not None:
+                loop.take(message)
+            loop.store_and_acknowledge(message)
+            loop.publish_health(last=end is not None)
+        if end is not None:
+            process.broken = end.failed
+            loop.end(end)
         else:
-            if compressor.seq > stored:  # who goes on sending has nothing of it to repeat
-                features.acknowledge(store(needed=False))
+            loop.leave()
+
+
+class CompressorLoop:
+    """A compressor, its checkpoints, its recording, and the sockets that it is connected to."""
+
+    def __init__(self, process: Process, stack: ExitStack) -> None:
+        job, settings, endpoint = process.job, process.settings, process.endpoint
+        self._process = process
+        self._checkpoints = _checkpoints(job, stack)
+        self._compressor = _compressor(job, self._checkpoints)
+        position = self._compressor.position
+        self._progress = Progress(position, position.seq, time.monotonic())
+        self._recorder = None
+        if job.record is not None:
+            process.allow(reading_seconds(job.record))
+            writer = stack.enter_context(RecordingWriter(job.record, process.run, resume=True))
+            self._recorder = stack.enter_context(Recorder(writer, endpoint))
+        self._features = stack.enter_context(
+            Receiver(FEATURES, endpoint, position, settings.run.unstored_frames, check=self._check)
+        )
+        self._samples = stack.enter_context(Publisher(SAMPLES, endpoint))
+        if self._compressor.last_sample is not None:
+            self._samples.send(self._compressor.last_sample)
+
+    @property
+    def over(self) -> bool:
+        """Whether the process was asked to end, and its sender, if there is one, did not end in time."""
+        return self._process.ended_for(_FAREWELL_SECONDS if self._features.has_sender else 0)
+
+    def receive(self) -> Features | End | None:
+        """The next message, None if none arrives in a tenth of a second."""
+        message = self._features.receive(0.1)
+        if message is None:
+            reduce.prepare()
+        if self._recorder is not None:
+            self._recorder.receive()
+        return message
+
+    def take(self, features: Features) -> None:
+        """Insert features into the trees, and send the sample if there is a new one."""
+        if self._recorder is not None:  # before a checkpoint: the recording misses nothing that a checkpoint holds
+            self._recorder.write(features)
+        sample = self._compressor.take(features)
+        if sample is not None:
+            self._samples.send(sample)
+
+    def store_and_acknowledge(self, message: Features | End | None) -> None:
+        """Write a checkpoint if one is due, then answer and acknowledge what was received."""
+        before, seq, run = self._progress, self._compressor.seq, self._process.settings.run
+        end = message if isinstance(message, End) else None
+        urgent = self._checkpoints is None or end is not None or before.is_urgent(seq, run.unstored_frames)
+        urgent = urgent or self._features.asked
+        if (urgent and seq > before.stored) or before.is_due(seq, time.monotonic(), run.checkpoint_seconds):
+            self._store(urgent)
+        if self._features.asked:
+            self._features.answer(self._progress.position)
+        if message is not None or self._progress.position is not before.position:
+            self._features.acknowledge(self._progress.acknowledgement(self._compressor.sampled, end))
+
+    def _store(self, urgent: bool) -> None:
+        """Write a checkpoint, or count all messages as stored if there are no checkpoints."""
+        self._process.allow(_STORE_SECONDS)
+        saved = self._checkpoints is None or self._checkpoints.save(self._compressor)
+        self._progress = self._progress.after(self._compressor.position, time.monotonic(), saved=saved, urgent=urgent)
+
+    def publish_health(self, *, last: bool = False) -> None:
+        """Serve late joiners and publish the health."""
+        self._samples.serve_late_joiners()
+        self._process.trouble = self._checkpoints.trouble if self._checkpoints is not None else ""
+        self._process.beat(self._counters, now=last)
+
+    def end(self, end: End) -> None:
+        """Send the end of the stream, and wait for the end of the tracks if they are recorded."""
+        self._samples.send(end)
         deadline = time.monotonic() + _END_SECONDS
-        while end and recorder is not None and recorder.end is None and time.monotonic() < deadline:
-            features.receive(0.02)  # a detector that did not hear that its end is stored asks again
-            recorder.listen()
-            process.beat(counters)
+        while self._recorder is not None and self._recorder.end is None and time.monotonic() < deadline:
+            self._features.receive(0.02)  # a detector that did not receive the last acknowledgement asks again
+            self._recorder.receive()
+            self._process.beat(self._counters)
+
+    def leave(self) -> None:
+        """Store what was received: the sender goes on with another compressor."""
+        if self._compressor.seq > self._progress.stored:
+            self._store(urgent=False)
+            self._features.acknowledge(self._progress.position)
+
+    def _check(self, message: Features | End) -> None:
+        """Raise ProtocolError for features of another stream."""
+        if isinstance(message, Features):
+            self._compressor.check(message)
+
+    def _counters(self) -> dict[str, float]:
+        """The counters for the health of the process."""
+        own: dict[str, float] = {"stored": self._progress.stored}
+        if self._recorder is not None:
+            own |= {"recorded": self._recorder.written, "unrecorded": float(self._recorder.failed != "")}
+        return self._compressor.counters() | own
+
+
+def _checkpoints(job: Job, stack: ExitStack) -> CheckpointStore | None:
+    """The checkpoints of a run, locked for this process; None if nothing is kept."""
+    return None if job.state is None else CheckpointStore(stack.enter_context(locked(job.state / TREES, _LOCK_SECONDS)))
+
+
+def _compressor(job: Job, checkpoints: CheckpointStore | None) -> Compressor:
+    """A compressor that goes on from the newest checkpoint, or from a saved model, or begins anew."""
+    compressor = checkpoints.load(job.settings) if checkpoints is not None else Compressor(job.settings)
+    if job.model is not None and not compressor.seq:
+        return Compressor.of(Learned.load(job.model).sample, job.settings)
+    return compressor
 
 
 def reading_seconds(file: Path) -> float:
-    """Limit for opening a recording, which is read to its last whole message."""
+    """Limit for opening a recording, which is read up to its last whole message."""
     return _STORE_SECONDS + (file.stat().st_size if file.exists() else 0) * _READ_SECONDS

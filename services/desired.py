@@ -35,7 +35,7 @@ class DesiredState:
         return self.paused or self.box is None
 
     def save(self, path: Path) -> None:
-        """Write a file of it, whole or not at all.
+        """Write it to a file atomically.
 
         Raises
         ------

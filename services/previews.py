@@ -1,4 +1,4 @@
-"""Pictures of what the detector sees, for those who look."""
+"""Small pictures of the newest frames, for subscribers."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from catstream.wire.newest import Publisher
 
 __all__ = ["Previews"]
 
-_PERIOD = 0.1  # seconds between two pictures, at least
+_PERIOD = 0.1  # shortest time between two pictures, in seconds
 
 
 class Previews(Publisher[Preview]):
-    """Sends the newest frame as a small picture, at most ten a second; none is made while nobody listens."""
+    """Sends the newest frame as a small picture, at most ten a second; none is made if there are no subscribers."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         super().__init__(PREVIEWS, endpoint)
@@ -27,19 +27,19 @@ class Previews(Publisher[Preview]):
         self._shown = 0.0
 
     def show(self, frame: int, image: np.ndarray, box: Box | None) -> None:
-        """Have a frame sent, unless a newer one comes before it is due.
+        """Send a frame, unless a newer one arrives before it is due.
 
         Parameters
         ----------
-        frame : its number
+        frame : number of the frame
         image : uint8 (h, w, 3) BGR, not to be changed afterwards
-        box : where the object is in it, or None
+        box : the object in the frame, or None
         """
         self._waiting = frame, image, box
         self.turn()
 
     def turn(self) -> None:
-        """Send what is due; call it now and then, also while no frame comes: somebody may begin to look."""
+        """Send the picture that is due; call it in every turn, also while no frame arrives: subscribers may join."""
         self.serve_late_joiners()
         if self._waiting is None or not self.has_subscribers or monotonic() - self._shown < _PERIOD:
             return

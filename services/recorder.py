@@ -47,13 +47,18 @@ class Recorder:
             ]
             self._stack = stack.pop_all()
 
-    def listen(self) -> None:
+    @property
+    def written(self) -> int:
+        """Number of messages that were written."""
+        return self._writer.written
+
+    def receive(self) -> None:
         """Write the messages that were received."""
         for subscriber in self._subscribers:
             for message in subscriber.receive_all():
-                self.keep(message)
+                self.write(message)
 
-    def keep(self, message: Recorded) -> None:
+    def write(self, message: Recorded) -> None:
         """Write a message."""
         if isinstance(message, End):
             self.end = message

@@ -1,8 +1,8 @@
-"""Starts the processes of catstream, so that no file in the current folder is run.
+"""Starts processes of catstream without importing anything from the current folder.
 
-Python puts the current folder first on `sys.path` for `python -m` and `python -c`: a `zmq.py` in it would be imported
-in place of the library. A child here gets the `sys.path` of its parent without the current folder, so it imports the
-same catstream and the same libraries as its parent, and nothing else.
+For `python -m` and `python -c`, Python puts the current folder first on `sys.path`, so a file `zmq.py` there would be
+imported in place of the library. A child process gets the `sys.path` of its parent without the current folder: it
+imports the same catstream and the same libraries as its parent.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["SPAWN", "environment", "import_path", "service_command"]
 
 
 def service_command(*arguments: str) -> list[str]:
-    """The command that starts `catstream.services` with these arguments, in the variables that `environment` gives.
+    """The command that runs `catstream.services` with these arguments; run it with the variables of `environment`.
 
     Raises
     ------
@@ -38,13 +38,13 @@ def service_command(*arguments: str) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    """The variables of a child: without those that are settings, and with no current folder in `PYTHONPATH`."""
+    """The environment variables of a child: no settings, and no current folder in `PYTHONPATH`."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("CATSTREAM_")}
     return kept | {"PYTHONPATH": _python_path()}
 
 
 class _Process(SpawnProcess):
-    """A process of `multiprocessing` that looks for no module in the current folder."""
+    """A process of `multiprocessing` that imports nothing from the current folder."""
 
     @staticmethod
     def _Popen(process_obj: Any) -> Any:
@@ -53,24 +53,24 @@ class _Process(SpawnProcess):
 
 
 class _Context(SpawnContext):
-    """The start method "spawn", for processes that look for no module in the current folder."""
+    """The start method "spawn" for processes that import nothing from the current folder."""
 
     Process = _Process
 
     def get_context(self, method: str | None = None) -> Any:
-        """As of any context; called for each lock and queue, which would start the resource tracker as it is."""
+        """Called for each lock and queue, which would otherwise start the resource tracker with the unsafe path."""
         with _safe_path():
             resource_tracker.ensure_running()
         return super().get_context(method)
 
 
-#: For processes that run a function of this program: worker pools, and the readers of a load test.
+#: The start method for processes that run a function of this program: worker pools, subscribers of a load test.
 SPAWN = _Context()
 
 
 @contextmanager
 def _safe_path() -> Iterator[None]:
-    """Set variables of this process while `multiprocessing` starts a child, which offers no other way."""
+    """Change variables of this process while `multiprocessing` starts a child: it offers no other way."""
     names = ("PYTHONSAFEPATH", "PYTHONPATH")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(zip(names, ("1", _python_path()), strict=True))
@@ -95,11 +95,11 @@ def import_path() -> list[str]:
 
 
 def _without_the_current_folder(entries: list[str]) -> list[str]:
-    """Absolute folders among these, and the one that catstream itself was imported from, wherever that is."""
+    """The absolute folders among these, except the current one unless catstream itself was imported from it."""
     home = Path(errors.__file__).parents[1]
     try:
         here = Path.cwd()
-    except FileNotFoundError:  # it was removed, and there is nothing to import from it
+    except FileNotFoundError:  # it was removed
         here = home
     kept = []
     for entry in entries:
@@ -110,7 +110,7 @@ def _without_the_current_folder(entries: list[str]) -> list[str]:
 
 
 def _interpreter() -> str:
-    """Path of the Python interpreter: a program that embeds Python may be `sys.executable` itself, or have none."""
+    """Path of the Python interpreter; `sys.executable` may be a program that embeds Python, or empty."""
     given = os.fsdecode(spawn.get_executable() or "")
     if given and (given != sys.executable or "py" in Path(given).name):
         return given

@@ -1,9 +1,9 @@
-"""Samples in, models out: always from the newest, older ones are stale."""
+"""Samples in, models out; always from the newest sample, as older ones are stale."""
 
 from __future__ import annotations
 
 from catstream import kalman
-from catstream.messages import End, Sample
+from catstream.messages import End
 from catstream.services.loop import Process
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
@@ -11,29 +11,26 @@ from catstream.wire.newest import Publisher, Subscriber
 
 __all__ = ["main"]
 
-_TRAIN_SECONDS = 60.0  # that learning a model may take, and the first one its imports
+_TRAIN_SECONDS = 60.0  # limit for training a model, and for the imports of the first one
 
 
 def main(process: Process) -> None:
-    """Learn a model from each sample that comes, until the stream ends."""
+    """Train a model from each sample that arrives, until the stream ends."""
     trainer = Trainer(process.settings)
-    version = trained = 0
+    counters = {"version": 0.0, "trained": 0.0}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:
-
-        def counters() -> dict[str, float]:
-            return {"version": version, "trained": trained}
-
         while not process.ended:
             message = samples.receive(0.1)
-            # An older one comes from a compressor that lost the newer: it is made again, and a detector may need this.
-            if isinstance(message, Sample) and message.version != version:
+            if isinstance(message, End):
+                process.broken = message.failed
+                process.beat(counters.copy, now=True)
+                return
+            # An older version is of a compressor that lost the newer one: it is made again, and a detector may need it.
+            if message is not None and message.version != counters["version"]:
                 process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
                 if message.frame >= process.settings.search.motion_frames // 2:
-                    kalman.prepare()  # so many more, and a sample brings the centres
-                version, trained = message.version, trained + 1
+                    kalman.prepare()  # after as many frames more, a sample contains the centres
+                counters = {"version": float(message.version), "trained": counters["trained"] + 1}
             models.serve_late_joiners()
-            process.beat(counters, now=isinstance(message, End))
-            if isinstance(message, End):
-                process.broken = message.failed
-                break
+            process.beat(counters.copy)

@@ -74,9 +74,9 @@ def _record(output: Path, place: Endpoint, training: Subscriber[Run | Features |
             # A restarted detector repeats frames whose features the compressor has already taken.
             if isinstance(message, Features) and message.seq > seq:
                 seq = message.seq
-                recorder.keep(message)
+                recorder.write(message)
                 status.update(f"frame {message.frame}, {writer.written} messages in {output}")
-            recorder.listen()
+            recorder.receive()
             if recorder.failed:
                 raise RecordingError(recorder.failed)
             if last is not None or recorder.end is not None:  # each channel has an end of its own

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn, Task
-from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli import INTERRUPTED
 from catstream.cli.interrupts import Interrupts
+from catstream.cli.progress import RunProgress
 from catstream.cli.serving import PORT, Address, AddressType, with_token
 from catstream.errors import ServiceError
 from catstream.extras import require_extra
@@ -180,32 +179,15 @@ def track(
         return
     interrupts = Interrupts()
     interrupts.install()
-    run = _Run(pipeline)
+    run = RunProgress(pipeline)
     interrupted = False
     try:
-        with ExitStack() as stack:
-            stack.enter_context(pipeline)
+        with pipeline, ExitStack() as stack:
             if view is not None:
-                from catstream.web.server import Server
-
-                server = Server(
-                    pipeline.endpoint, pipeline.settings.run.keys, host=view.host, port=view.port, token=token
-                )
-                stack.enter_context(server.in_background())
-                for url in server.urls:
-                    console.print(f"page: {url}", highlight=False)
+                _serve(pipeline, view, token, console, stack)
             if pipeline.waits:
                 console.print(f"it waits for a box: {_ways_to_give_it(pipeline, view is not None)}", highlight=False)
-            progress = stack.enter_context(run.progress(console))
-            keep: Callable[[Track, float], None] | None = None
-            moment = time.perf_counter()
-            for found in pipeline:
-                # Not before there is something to write: a run that cannot start leaves older results alone.
-                keep = keep or stack.enter_context(files.opened(resume=resume is not None))
-                before, moment = moment, time.perf_counter()
-                with interrupts.deferred():  # a frame is in all results, and counted, or in none
-                    keep(found, moment - before)
-                    run.show(progress, found)
+            _write_tracks(pipeline, files, run, console, interrupts, resumed=resume is not None)
     except KeyboardInterrupt:
         interrupted = True
     finally:
@@ -219,6 +201,32 @@ def track(
         go_on = f", go on with: catstream track --resume {state or resume}" if state or resume else ""
         console.print(f"stopped: the results so far are kept{go_on}", highlight=False)
         sys.exit(INTERRUPTED)
+
+
+def _serve(pipeline: Pipeline, view: Address, token: str | None, console: Console, stack: ExitStack) -> None:
+    """Serve the web page of a pipeline until the stack is left."""
+    from catstream.web.server import Server
+
+    server = Server(pipeline.endpoint, pipeline.settings.run.keys, host=view.host, port=view.port, token=token)
+    stack.enter_context(server.in_background())
+    for url in server.urls:
+        console.print(f"page: {url}", highlight=False)
+
+
+def _write_tracks(
+    pipeline: Pipeline, files: RunFiles, run: RunProgress, console: Console, interrupts: Interrupts, *, resumed: bool
+) -> None:
+    """Write every track to all files, and show the progress."""
+    with run.progress(console) as progress, ExitStack() as stack:
+        write: Callable[[Track, float], None] | None = None
+        moment = time.perf_counter()
+        for track in pipeline:
+            # The files are opened with the first track: a run that cannot start leaves older results alone.
+            write = write or stack.enter_context(files.opened(resume=resumed))
+            before, moment = moment, time.perf_counter()
+            with interrupts.deferred():  # a frame is in all results, and counted, or in none
+                write(track, moment - before)
+                run.show(progress, track)
 
 
 def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
@@ -261,11 +269,6 @@ def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
     return files
 
 
-def _shown(path: Path) -> str:
-    """As it is named from the current folder."""
-    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
-
-
 def _check_model(file: Path, overwrite: bool) -> None:
     if file.exists() and not overwrite:
         raise ServiceError(f"{file} is there already: replace it with --overwrite, or give another name")
@@ -277,91 +280,3 @@ def _ways_to_give_it(pipeline: Pipeline, page: bool) -> str:
     place = f"--endpoint {pipeline.endpoint}"
     drawn = "draw one on the page" if page else f"draw one on the page of catstream view {place}"
     return f"{drawn}, or say it: catstream set-box X,Y,W,H {place}"
-
-
-class _Line(ProgressColumn):
-    """State, frames and figures on one line: in a narrow terminal those that matter least are left out."""
-
-    _BAR = 24
-
-    def __init__(self, pipeline: Pipeline, console: Console) -> None:
-        super().__init__()
-        self._pipeline, self._console = pipeline, console
-
-    def render(self, task: Task) -> Text:
-        # Why no track comes to say the state: the source is lost, or it is told to wait.
-        lost = self._pipeline.lost_seconds
-        state = f"lost {lost:.0f} s" if lost else self._pipeline.holding or task.fields["state"]
-        total = "" if self._pipeline.live else f"/{'?' if task.total is None else int(task.total)}"
-        parts = [f"{state:13}", f"{int(task.completed)}{total}", *task.fields["figures"]]
-        room = self._console.width - 1
-        while len(line := "  ".join(parts)) > room and len(parts) > 2:
-            parts.pop()
-        bar = min(self._BAR, room - len(line) - 2)
-        if task.total and bar >= 6:
-            done = round(bar * min(task.completed / task.total, 1.0))
-            parts.insert(1, "━" * done + "─" * (bar - done))
-        return Text("  ".join(parts), no_wrap=True, overflow="ellipsis")
-
-
-class _Run:
-    """What a person wants to see of a run, while it goes on and afterwards."""
-
-    def __init__(self, pipeline: Pipeline) -> None:
-        self._pipeline = pipeline
-        self._started = time.perf_counter()
-        self._first = 0.0
-        self._shown = 0.0
-        self.frames = self.present = 0
-        self.version = 0
-
-    def progress(self, console: Console) -> Progress:
-        progress = Progress(_Line(self._pipeline, console), console=console, transient=True, refresh_per_second=8)
-        self._task = progress.add_task("", total=self._pipeline.frames, state="starting", figures=())
-        return progress
-
-    def show(self, progress: Progress, found: Track) -> None:
-        now = time.perf_counter()
-        if not self.frames:
-            self._first = now - self._started
-        self.frames += 1
-        self.present += found.box is not None
-        self.version = found.model_version
-        if now - self._shown < 0.1:
-            return
-        self._shown = now
-        leaves = self._pipeline.health.get("compressor", {}).get("leaves", 0)
-        figures = (
-            f"{self._rate(now):.0f} frames/s",
-            *([f"{self._detector('skipped'):.0f} skipped"] if self._pipeline.live else []),
-            f"score {found.score:+.2f}",
-            f"model {found.model_version}",
-            f"{leaves:.0f} leaves",
-        )
-        progress.update(self._task, completed=self.frames, state=found.state, figures=figures)
-
-    def summary(self, results: Sequence[Path]) -> str:
-        lines = [
-            f"{self.frames} frames, present in {self.present}, {self._rate(time.perf_counter()):.0f} frames/s, "
-            f"first track after {self._first:.2f} s, model version {self.version}"
-        ]
-        if self._pipeline.live:
-            lines.append(
-                f"live: {self._detector('skipped'):.0f} frames skipped, "
-                f"lost and opened again {self._detector('reopened'):.0f} times"
-            )
-        if damaged := self._detector("damaged"):
-            lines.append(f"damaged: {damaged:.0f} frames could not be decoded, and were left out")
-        if totals := self._pipeline.totals:
-            lines.append(f"features: {totals['sent']} messages sent, {totals['stored']} stored in the coreset trees")
-        if self._pipeline.restarts:
-            lines.append(f"processes restarted: {self._pipeline.restarts}")
-        if written := [_shown(file) for file in results if file != STDOUT]:
-            lines.append(f"results: {', '.join(written)}")
-        return "\n".join(lines)
-
-    def _detector(self, counter: str) -> float:
-        return self._pipeline.health.get("detector", {}).get(counter, 0)
-
-    def _rate(self, now: float) -> float:
-        return (self.frames - 1) / max(now - self._started - self._first, 1e-9)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from catstream.cli.track import _Run
+from catstream.cli.progress import RunProgress
 from catstream.messages import Track
 
 
@@ -19,7 +19,7 @@ def test_the_line_fits_and_begins_with_the_state_and_the_frames(width, live):
     pipeline = SimpleNamespace(live=live, frames=None if live else 30000, health=health, lost_seconds=0, holding="")
     written = StringIO()
     console = Console(file=written, width=width, force_terminal=True, color_system=None, soft_wrap=True)
-    run = _Run(pipeline)
+    run = RunProgress(pipeline)
     with run.progress(console) as progress:
         run.show(progress, Track(1, 0, 0.0, "bootstrapping", None, -12.25, 12345))
         progress.refresh()

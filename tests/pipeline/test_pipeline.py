@@ -78,12 +78,13 @@ def test_what_a_process_said_after_the_last_track_was_taken_counts_too(video, un
     assert pipeline.health["detector"]["sent"] >= sent
 
 
-def test_three_processes_run_while_it_is_open_and_none_afterwards(run, alive):
+def test_three_processes_run_while_it_is_open_and_none_afterwards(run, video, alive):
     _, pipeline, processes = run
     assert set(processes) == set(NAMES)
     for name, (pid, command) in processes.items():
         assert "catstream.services" in " ".join(command)
         assert name in command
+        assert not any(video[0] in word for word in command), "an address may contain a password"
         assert not alive(pid)
     assert not pipeline.pids
 

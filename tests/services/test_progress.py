@@ -1,0 +1,69 @@
+"""Laws of storing: what a sender may forget is on disk, or is counted as unsaved; its window never stays full."""
+
+from __future__ import annotations
+
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from catstream.messages import End, Position
+from catstream.services.progress import Progress
+
+WINDOW = 8
+INTERVAL = 3.0
+
+
+class Storing(RuleBasedStateMachine):
+    """A receiver with a disk that fails now and then."""
+
+    def __init__(self):
+        super().__init__()
+        self.progress = Progress(Position(5), 5, 0.0)
+        self.seq = self.on_disk = 5
+        self.now = 0.0
+
+    def store(self, works, urgent):
+        if works:
+            self.on_disk = self.seq
+        position = Position(self.seq, version=self.seq)
+        self.progress = self.progress.after(position, self.now, saved=works, urgent=urgent)
+
+    @rule(works=st.booleans())
+    def receive(self, works):
+        self.seq += 1
+        urgent = self.progress.is_urgent(self.seq, WINDOW)
+        if urgent or self.progress.is_due(self.seq, self.now, INTERVAL):
+            self.store(works, urgent)
+
+    @rule(works=st.booleans(), seconds=st.floats(0, 2 * INTERVAL))
+    def time_passes(self, works, seconds):
+        self.now += seconds
+        if self.progress.is_due(self.seq, self.now, INTERVAL):
+            self.store(works, urgent=False)
+            assert not self.progress.is_due(self.seq, self.now, INTERVAL)
+
+    @rule(works=st.booleans())
+    def a_sender_asks(self, works):
+        self.store(works, urgent=True)
+        assert self.progress.position.seq == self.seq
+
+    @invariant()
+    def what_a_sender_may_forget_is_on_disk_or_counted(self):
+        position = self.progress.position
+        assert self.progress.stored == self.on_disk
+        assert position.seq - position.unsaved <= self.on_disk
+        assert self.on_disk <= self.seq or position.unsaved == 0
+
+    @invariant()
+    def half_of_the_window_is_free(self):
+        assert 2 * (self.seq - self.progress.position.seq) < WINDOW
+
+    @invariant()
+    def the_end_is_stored_as_much_as_the_message_before_it(self):
+        acknowledged = self.progress.acknowledgement(9, End(self.seq + 1, "it ended"))
+        position = self.progress.position
+        assert (acknowledged.seq, acknowledged.version) == (self.seq + 1, 9)
+        assert acknowledged.unsaved == (position.unsaved + 1 if position.unsaved else 0)
+        assert self.progress.acknowledgement(9, None).seq == position.seq
+
+
+TestStoring = Storing.TestCase
