@@ -1,4 +1,4 @@
-"""The house, as in `docs/architecture.md`: imports run downward only, and each foreign library has one home."""
+"""The rules of imports in `docs/architecture.md`: downward only, and each foreign library in one place."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from catstream.extras import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 
-#: From the ground up. A module imports from the floors below its own, and from its own folder.
-FLOORS = [
+#: From the lowest. A module imports only from lower levels than its own, and from its own folder.
+LEVELS = [
     {"arrays", "errors", "threads"},
     {"box", "heads", "image", "schema", "storage", "extras"},
     {"messages", "packing", "settings", "ridge", "kalman", "html"},
@@ -31,8 +31,8 @@ FLOORS = [
     {"cli"},
 ]
 
-#: Who may import a foreign library: files, or folders.
-HOMES = {
+#: The files or folders that may import a foreign library.
+IMPORTERS = {
     "numpy": ["catstream", "services"],
     "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
     "cv2": [
@@ -77,10 +77,10 @@ HOMES = {
 #: Libraries that take long to import: inside the function that needs them.
 SLOW = {"filelock", "sklearn", "av", "scipy", "filterpy", "pyarrow", "supervision"}
 
-#: What a stage does not touch: it could run on a desert island.
-MAINLAND = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
+#: Modules of I/O, threads, clocks and randomness, which a stage does not import.
+IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
 
-#: State machines of the wire: bytes, events and the time are handed in, as to a stage.
+#: State machines with the same rule: bytes, events and the time are arguments.
 PURE = ["catstream/wire/go_back_n.py"]
 
 FILES = sorted([*ROOT.glob("catstream/**/*.py"), *ROOT.glob("services/**/*.py")])
@@ -109,72 +109,78 @@ def imports(path: Path, tree: ast.AST | None = None) -> Iterator[str]:
 
 
 def unit(module: str) -> str:
-    """The folder or file of the house that a module belongs to; empty for the face, `catstream` itself."""
+    """The folder or file below `catstream` that contains a module; empty for the package `catstream` itself."""
     return module.partition(".")[2].partition(".")[0]
 
 
-def floor(name: str) -> int:
-    for height, names in enumerate(FLOORS):
+def level(name: str) -> int:
+    for height, names in enumerate(LEVELS):
         if name in names:
             return height
-    raise AssertionError(f"{name} is on no floor: say in FLOORS which ones it may import from")
+    raise AssertionError(f"{name} has no level: add it to LEVELS")
 
 
-def broken_by(rule: Callable[[Path], Iterator[str]]) -> str:
-    """What breaks a rule in any file, a line each."""
+def violations(rule: Callable[[Path], Iterator[str]]) -> str:
+    """The violations of a rule in all files, one line each."""
     return "\n".join(f"{path.relative_to(ROOT)}: {wrong}" for path in FILES for wrong in rule(path))
 
 
 def upward(path: Path) -> Iterator[str]:
     own = unit(dotted(path))
-    for module in imports(path) if own else ():  # the face shows what is inside
+    for module in imports(path) if own else ():  # the package exports names of all levels
         if module.partition(".")[0] != "catstream" or unit(module) == own:
             continue
         if not unit(module):
-            yield "imports from the face of the house: import from where the name is at home"
-        elif floor(unit(module)) >= floor(own):
+            yield "imports from the package itself: import from the module that defines the name"
+        elif level(unit(module)) >= level(own):
             yield f"{own} imports {module}, but imports run downward only"
 
 
+def test_the_page_shows_the_levels():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    shown = page.partition("The levels, from the top, are:\n\n```\n")[2].partition("```")[0]
+    assert [set(level.replace(",", " ").split()) for level in shown.split(">")] == LEVELS[::-1]
+
+
 def test_imports_run_downward_only():
-    assert not broken_by(upward)
+    assert not violations(upward)
 
 
-def strangers(path: Path) -> Iterator[str]:
+def misplaced(path: Path) -> Iterator[str]:
     place = str(path.relative_to(ROOT))
     for library in {module.partition(".")[0] for module in imports(path)} - sys.stdlib_module_names - {"catstream"}:
-        if library not in HOMES:
-            yield f"imports {library}, which has no home yet: give it one in HOMES"
-        elif not any(place == home or place.startswith(f"{home}/") for home in HOMES[library]):
-            yield f"imports {library}, which is at home in {' and '.join(HOMES[library])} only"
+        if library not in IMPORTERS:
+            yield f"imports {library}, which has no entry in IMPORTERS: add one"
+        elif not any(place == home or place.startswith(f"{home}/") for home in IMPORTERS[library]):
+            yield f"imports {library}, which may be imported in {' and '.join(IMPORTERS[library])} only"
 
 
-def test_each_foreign_library_has_one_home():
-    assert not broken_by(strangers)
+def test_each_foreign_library_is_imported_in_one_place():
+    assert not violations(misplaced)
 
 
 def slow_at_the_top(path: Path) -> Iterator[str]:
     tree = ast.parse(path.read_text())
     top = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
     for library in {module.partition(".")[0] for module in imports(path, top)} & SLOW:
-        yield f"imports {library} at its top: others would wait for it, import it in the function"
+        yield f"imports {library} at module level: this is slow, import it in the function that needs it"
 
 
 def test_slow_libraries_are_imported_where_they_are_used():
-    assert not broken_by(slow_at_the_top)
+    assert not violations(slow_at_the_top)
 
 
-def touched(path: Path) -> Iterator[str]:
+def impure(path: Path) -> Iterator[str]:
     if (
         unit(dotted(path)) in {"features", "paper", "detection", "compression", "training"}
         or str(path.relative_to(ROOT)) in PURE
     ):
-        for module in set(imports(path)) & MAINLAND:
-            yield f"imports {module}: sockets, threads, clocks and chance are handed to a stage"
+        for module in set(imports(path)) & IO_MODULES:
+            yield f"imports {module}: a stage gets sockets, threads, clocks and randomness as arguments, or not at all"
 
 
-def test_a_stage_could_run_on_a_desert_island():
-    assert not broken_by(touched)
+def test_a_stage_imports_no_io_threads_clocks_or_randomness():
+    assert not violations(impure)
 
 
 @pytest.mark.parametrize(
@@ -182,20 +188,20 @@ def test_a_stage_could_run_on_a_desert_island():
     [
         (upward, "catstream/wire/codec.py", "from catstream.pipeline import Pipeline"),
         (upward, "catstream/wire/codec.py", "from catstream import Pipeline"),
-        (strangers, "catstream/box.py", "import nobody_knows_it"),
-        (strangers, "catstream/box.py", "import zmq"),
+        (misplaced, "catstream/box.py", "import an_unknown_library"),
+        (misplaced, "catstream/box.py", "import zmq"),
         (slow_at_the_top, "catstream/box.py", f"import {min(SLOW)}"),
-        (touched, "catstream/training/trainer.py", "def f():\n    import socket"),
-        (touched, "catstream/wire/go_back_n.py", "from time import monotonic"),
+        (impure, "catstream/training/trainer.py", "def f():\n    import socket"),
+        (impure, "catstream/wire/go_back_n.py", "from time import monotonic"),
     ],
 )
-def test_what_is_looked_for_is_found(rule, place, source, monkeypatch):
+def test_each_rule_detects_a_violation(rule, place, source, monkeypatch):
     monkeypatch.setattr(Path, "read_text", lambda _: source)
     assert list(rule(ROOT / place))
 
 
-def test_every_dependency_has_a_home():
-    """What pyproject.toml asks for, and nothing else."""
+def test_every_dependency_has_an_entry():
+    """The dependencies of pyproject.toml, and no others."""
     distributions = {
         "hdrhistogram": "hdrh",
         "opencv-python-headless": "cv2",
@@ -206,4 +212,4 @@ def test_every_dependency_has_a_home():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [*project["dependencies"], *(name for extra in EXTRAS for name in project["optional-dependencies"][extra])]
     names = {dependency.partition(">=")[0] for dependency in wanted}
-    assert {distributions.get(name, name) for name in names} == set(HOMES)
+    assert {distributions.get(name, name) for name in names} == set(IMPORTERS)

@@ -1,4 +1,4 @@
-"""Each decision says whether it still holds, and which others it changed or was changed by."""
+"""Each decision has a status, and names the decisions that it changed and those that changed it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FOLDER = Path(__file__).parents[1] / "docs" / "decisions"
 PAGES = {int(path.name[:4]): path for path in sorted(FOLDER.glob("0*.md"))}
 EVERY_DECISION = pytest.mark.parametrize("number", PAGES)
 
-#: What a decision says of another one -> what that one says of it.
+#: Relation of a decision to another one -> relation of that one to it.
 MUTUAL = {
     "supersedes": "superseded by",
     "superseded by": "supersedes",
@@ -28,7 +28,7 @@ def status(number: int) -> str:
 
 
 def relations(number: int) -> dict[str, list[int]]:
-    """What a decision says of others, by their numbers."""
+    """Relations to other decisions: their numbers, by relation."""
     parts = (part.partition(" [") for part in status(number).split("; ") if "[" in part)
     return {word: [int(link) for link in re.findall(r"(\d+)\]\(", links)] for word, _, links in parts}
 
@@ -41,7 +41,7 @@ def test_a_decision_is_accepted_or_superseded(number):
 
 
 @EVERY_DECISION
-def test_what_one_decision_says_of_another_that_one_says_of_it(number):
+def test_relations_between_decisions_are_mutual(number):
     for word, others in relations(number).items():
         for other in others:
             assert number in relations(other).get(MUTUAL[word], []), f"{other} does not say: {MUTUAL[word]} {number}"

@@ -1,6 +1,6 @@
-"""The docs say what the code does: whatever a person can name has its line, and what the pages show runs.
+"""The documentation matches the code: it describes every public name, and its examples run.
 
-Run as a program, it writes the table of `docs/settings.md` anew: `make settings`.
+Run as a program, this file updates the table of `docs/settings.md`: `make settings`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def blocks(path: Path, language: str) -> Iterator[str]:
 
 
 def commands(path: Path) -> Iterator[list[str]]:
-    """Words of each command that a page shows after a prompt."""
+    """Words of each command after a prompt on a page."""
     for block in blocks(path, "console"):
         for line in block.replace("\\\n", " ").splitlines():
             if line.startswith("$ "):
@@ -58,7 +58,7 @@ def commands(path: Path) -> Iterator[list[str]]:
 
 
 def anchors(path: Path) -> set[str]:
-    """What a link may name after #."""
+    """Anchors of a page, which a link may name after #."""
     headings = re.findall(r"^#+ (.*)", prose(path), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
@@ -82,20 +82,20 @@ def verbs() -> dict[str, click.Command]:
 
 
 def commands_of(verb: click.Command) -> Iterator[click.Command]:
-    """A verb, or the commands of one that has some."""
+    """A command, or the commands of a group."""
     yield from verb.commands.values() if isinstance(verb, click.Group) else [verb]
 
 
 def test_every_setting_and_preset_has_its_row():
     shown = _TABLE.search(page("docs/settings.md"))
-    assert shown, "docs/settings.md has lost the marks around its table"
+    assert shown, "docs/settings.md: the marks around its table are missing"
     assert settings_table() in shown[0], "docs/settings.md does not show the settings as they are: run `make settings`"
 
 
 @pytest.mark.parametrize("name", CHANNELS)
 def test_every_channel_has_its_row(name):
     for where in ("docs/architecture.md", "docs/protocol.md"):
-        assert f"`{name}`" in page(where), f"{where} says nothing of the channel {name}"
+        assert f"`{name}`" in page(where), f"{where}: add the channel {name}"
 
 
 @pytest.mark.parametrize("name", VERBS)
@@ -137,7 +137,7 @@ def in_the_house() -> set[str]:
     return named
 
 
-def test_the_house_has_every_module_and_none_that_is_gone():
+def test_the_tree_of_files_is_complete_and_current():
     named = in_the_house()
     modules = {
         path.relative_to(ROOT).as_posix()
@@ -147,7 +147,7 @@ def test_the_house_has_every_module_and_none_that_is_gone():
     missing = {path for path in modules if not path.endswith("__init__.py")} - named
     assert not missing, f"docs/architecture.md, the house: add {', '.join(sorted(missing))}"
     gone = sorted(path for path in named if not (ROOT / path).exists())
-    assert not gone, f"docs/architecture.md, the house: {', '.join(gone)} is gone"
+    assert not gone, f"docs/architecture.md, the house: remove {', '.join(gone)}"
 
 
 def test_every_file_that_track_writes_is_explained(tmp_path):
@@ -159,8 +159,8 @@ def test_every_file_that_track_writes_is_explained(tmp_path):
         assert f"`{name}`" in page("docs/tutorial.md"), f"docs/tutorial.md does not say what is in {name}"
 
 
-def wrong_on(check: Callable[[Path], Iterator[str]]) -> str:
-    """What is wrong on all pages, a line each."""
+def errors_on(check: Callable[[Path], Iterator[str]]) -> str:
+    """The errors of all pages, one line each."""
     return "\n".join(f"{path.relative_to(ROOT)} {wrong}" for path in PAGES for wrong in check(path))
 
 
@@ -169,20 +169,20 @@ def broken_links(path: Path) -> Iterator[str]:
         file, _, anchor = link.partition("#")
         target = (path.parent / file).resolve() if file else path
         if "://" not in link and not target.exists():
-            yield f"links to {link}, which is not there"
+            yield f"links to {link}, which does not exist"
         elif "://" not in link and anchor and anchor not in anchors(target):
             yield f"links to {link}, but it has no such heading"
 
 
-def test_links_lead_somewhere():
-    assert not wrong_on(broken_links)
+def test_the_targets_of_links_exist():
+    assert not errors_on(broken_links)
 
 
 def wrong_commands(path: Path) -> Iterator[str]:
     targets = set(re.findall(r"^([a-z-]+):", page("Makefile"), re.MULTILINE))
     for program, *words in commands(path):
         if program == "make" and words[0] not in targets:
-            yield f"shows `make {words[0]}`, which is no target"
+            yield f"shows `make {words[0]}`, but there is no such target"
         if program == "catstream":
             yield from wrong_words(*words)
 
@@ -190,24 +190,24 @@ def wrong_commands(path: Path) -> Iterator[str]:
 def wrong_words(name: str, *words: str) -> Iterator[str]:
     """Of a command of catstream."""
     if name not in VERBS:
-        yield f"shows `catstream {name}`, which is no verb"
+        yield f"shows `catstream {name}`, but there is no such command"
         return
     verb = verbs()[name]
     if isinstance(verb, click.Group):
         command, *words = words
         if command not in verb.commands:
-            yield f"shows `catstream {name} {command}`, which is no command"
+            yield f"shows `catstream {name} {command}`, but there is no such command"
             return
         verb = verb.commands[command]
     with click.Context(verb) as context:
         known = {flag for option in verb.get_params(context) for flag in option.opts}
     if wrong := {word for word in words if word.startswith("--")} - known:
-        yield f"shows `catstream {name}` with {wrong}, which it does not take"
+        yield f"shows `catstream {name}` with {wrong}, which are no options of it"
 
 
-def test_commands_are_ones_that_exist():
-    """Their verbs, options and make's targets."""
-    assert not wrong_on(wrong_commands)
+def test_the_commands_of_the_pages_exist():
+    """Commands, options and targets of make."""
+    assert not errors_on(wrong_commands)
 
 
 def unknown_names(path: Path) -> Iterator[str]:
@@ -219,8 +219,8 @@ def unknown_names(path: Path) -> Iterator[str]:
             yield from () if node.attr in catstream.__all__ else (f"uses catstream.{node.attr}",)
 
 
-def test_python_on_a_page_uses_names_that_exist():
-    assert not wrong_on(unknown_names)
+def test_the_python_examples_use_existing_names():
+    assert not errors_on(unknown_names)
 
 
 def test_the_tutorials_tracker_follows(demo_video, tmp_path, monkeypatch):
@@ -238,11 +238,11 @@ def test_the_tutorials_tracker_follows(demo_video, tmp_path, monkeypatch):
 def test_every_test_that_a_page_names_exists():
     tests = "\n".join(path.read_text(encoding="utf-8") for path in ROOT.glob("tests/**/test_*.py"))
     for name in set(re.findall(r"`(test_\w+)`", everything())):
-        assert f"def {name}(" in tests, f"docs/ name {name}, which is no test"
+        assert f"def {name}(" in tests, f"a page names {name}, but there is no such test"
 
 
 def test_no_test_of_a_guarantee_is_slow():
-    """`make test` holds every promise."""
+    """`make test` checks every guarantee."""
     promised = set(re.findall(r"`(test_\w+)`", page("docs/guarantees.md")))
     trees = (ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.glob("tests/**/test_*.py"))
     functions = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
@@ -255,7 +255,7 @@ def test_every_extra_that_a_page_names_can_be_installed():
     assert set(re.findall(r"catstream\[(\w+)\]", everything())) <= set(extras), "pyproject.toml: add the extra"
 
 
-def test_one_version_is_told_everywhere():
+def test_the_version_is_the_same_everywhere():
     assert tomllib.loads(page("pyproject.toml"))["project"]["version"] == catstream.__version__
 
 
