@@ -78,7 +78,6 @@ class DetectorState:
     confident_window  the same in the last frame in which the belief was confident
     first_window      the same in the first frame; None while the object of a saved model has not been found
     trusted           false after the object was found again elsewhere in the frame, until its score is high
-    usual_score       running mean of the score in the frames in which the object was present
     sightings         frames in a row in which the object of a saved model was seen in one place
     motion            of the Kalman filter of the centre, None before a model had any
     centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
@@ -92,7 +91,6 @@ class DetectorState:
     confident_window: Window
     first_window: Window | None
     trusted: bool = True
-    usual_score: float = 0.0
     sightings: int = 0
     motion: Motion | None = None
     centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None

@@ -151,14 +151,6 @@ class SearchSettings(_Group):
     ] = "local"
     context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
     area: Annotated[float, _about("Side of the local search area as a multiple of the window's.", ge=1.5, le=6)] = 2.5
-    distance_penalty: Annotated[
-        float,
-        _about(
-            "Weight of the squared displacement, in window widths, that is subtracted from the score in the local "
-            "search.",
-            ge=0,
-        ),
-    ] = 0.1
     whole_interval: Annotated[
         int, _about("Frames between two searches of the whole frame while the score is not confident.", ge=1)
     ] = 10
@@ -174,16 +166,23 @@ class BeliefSettings(_Group):
 
     group = "belief"
 
-    present_score: Annotated[float, _about("Score below which the object is reported as absent.")] = 0.3
-    present_share: Annotated[
+    weak_score: Annotated[
         float,
-        _about("The same threshold as a share of the object's mean score; the higher of the two counts.", ge=0, le=1),
+        _about("Score below which the object is lost: reported as absent, and searched for in each whole frame."),
+    ] = 0.3
+    confident_score: Annotated[
+        float,
+        _about(
+            "Score from which the detector is confident: it learns from the frame and adapts the size. A lost object "
+            "returns at this score."
+        ),
     ] = 0.45
-    return_score: Annotated[float, _about("Score from which an absent object is reported as present again.")] = 0.5
-    return_share: Annotated[
-        float,
-        _about("The same threshold as a share of the object's mean score; the higher of the two counts.", ge=0, le=1),
-    ] = 0.65
+    trusted_score: Annotated[
+        float, _about("Score from which an object that was found elsewhere in the frame is learned from again.")
+    ] = 0.75
+    jump_margin: Annotated[
+        float, _about("Difference of score by which a window elsewhere in the frame must exceed the local one.")
+    ] = 0.4
     sighting_lead: Annotated[
         float,
         _about(
@@ -194,20 +193,6 @@ class BeliefSettings(_Group):
     sighting_frames: Annotated[
         int, _about("Successive frames that must agree before an object of a saved model is detected.", ge=1)
     ] = 3
-    confident_score: Annotated[
-        float, _about("Score below which the whole frame is searched every search.whole_interval frames.")
-    ] = 0.55
-    lost_score: Annotated[float, _about("Score below which the whole frame is searched in every frame.")] = 0.3
-    jump_margin: Annotated[
-        float, _about("Difference of score by which a window elsewhere in the frame must exceed the local one.")
-    ] = 0.4
-    trust_score: Annotated[
-        float,
-        _about("Score from which a redetected object is trusted: it is learned from again."),
-    ] = 0.75
-    teach_score: Annotated[float, _about("Score below which no training rows are cut from a frame.")] = 0.4
-    mine_score: Annotated[float, _about("Score below which no hard negatives are searched for.")] = 0.6
-    extent_score: Annotated[float, _about("Score below which size and aspect ratio do not change.")] = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,21 +229,9 @@ class TeachingSettings(_Group):
             le=1,
         ),
     ] = 0.9
-    object_weight: Annotated[
-        float, _about("Weight of a frame's object row in the loss tree; an ordinary row has weight 1.", gt=0)
-    ] = 8.0
     near_misses: Annotated[
         int, _about("Windows beside the object in each frame, with a label between 0 and 1.", ge=0)
     ] = 12
-    near_sigma: Annotated[
-        float,
-        _about(
-            "Standard deviation, in cells, of the Gaussian label of a window beside the object: "
-            "exp(-d^2 / (2 sigma^2)).",
-            gt=0,
-        ),
-    ] = 0.9
-    near_negatives: Annotated[int, _about("Background windows around the object in each frame.", ge=1)] = 12
     hard_negatives: Annotated[
         int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
     ] = 10
@@ -272,19 +245,10 @@ class ExtentSettings(_Group):
     group = "extent"
 
     size_count: Annotated[int, _about("Sizes that a search may try, an odd number.", ge=1, le=15)] = 7
-    size_step: Annotated[float, _about("Relative change of size from one to the next.", gt=0, le=0.5)] = 0.04
-    size_rate: Annotated[float, _about("Share of a change of size that is applied in one frame.", ge=0, le=1)] = 0.7
     aspect_count: Annotated[
         int,
         _about("Aspect ratios that a search may try, an odd number (1: the ratio never changes).", ge=1, le=15),
     ] = 5
-    aspect_step: Annotated[float, _about("Relative change of aspect ratio from one to the next.", gt=0, le=0.5)] = 0.08
-    aspect_rate: Annotated[
-        float, _about("Share of a change of aspect ratio that is applied in one frame.", ge=0, le=1)
-    ] = 0.2
-    penalty: Annotated[
-        float, _about("Weight of |log f|, for a change of size or aspect ratio by the factor f.", ge=0)
-    ] = 0.3
     prior: Annotated[
         float,
         _about(
@@ -295,10 +259,6 @@ class ExtentSettings(_Group):
         float,
         _about("Weight of the extent head beside the appearance score if size and aspect ratio are chosen.", ge=0),
     ] = 1.0
-    sigma: Annotated[
-        float, _about("Standard deviation, in steps, of the Gaussian label of a size or an aspect ratio.", gt=0)
-    ] = 1.0
-    interval: Annotated[int, _about("Frames between two sets of training rows for the extent head.", ge=1)] = 2
     colour_slack: Annotated[
         float,
         _about(
@@ -501,9 +461,7 @@ _PAPER = {
     "extent.colour_slack": 1.0,
     "teaching.other_backgrounds": 0.0,
     "teaching.mirrored": 0,
-    "belief.present_share": 0.0,
-    "belief.return_share": 0.0,
-    "belief.trust_score": 0.0,
+    "belief.trusted_score": 0.0,
 }
 
 #: Settings of the paper, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.

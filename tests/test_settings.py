@@ -55,9 +55,9 @@ WAYS = {
         ("coreset.size", 1, "int >= 2, <= 4096"),
         ("coreset.size", 2.5, "int >= 2, <= 4096"),
         ("extent.size_count", -3, "int >= 1, <= 15"),
-        ("teaching.near_sigma", 0, "float > 0"),
-        ("teaching.near_sigma", float("nan"), "float > 0"),
-        ("belief.trust_score", float("inf"), "float"),
+        ("run.checkpoint_seconds", 0, "float > 0, <= 3600"),
+        ("run.checkpoint_seconds", float("nan"), "float > 0, <= 3600"),
+        ("belief.trusted_score", float("inf"), "float"),
         ("run.lockstep", 7, "bool"),
         ("teaching.classifier", "wrong", "joint | least-squares | one-class"),
     ],
@@ -65,7 +65,7 @@ WAYS = {
 def test_a_value_that_does_not_fit_is_refused_with_what_the_setting_takes(way, name, value, takes):
     with pytest.raises(SettingsError) as error:
         WAYS[way](name, value)
-    shown = (repr(value), repr(str(value)), repr(float(value)) if name == "teaching.near_sigma" else "")
+    shown = (repr(value), repr(str(value)), repr(float(value)) if name == "run.checkpoint_seconds" else "")
     assert str(error.value) in [f"setting {name} cannot be {each}: it takes {takes}" for each in shown]
 
 
@@ -125,7 +125,7 @@ def test_groups_may_be_written_in_one_way_or_the_other():
     ("pair", "name", "value"),
     [
         ("search.area=.25e1", "search.area", 2.5),
-        ("teaching.near_sigma=1e-3", "teaching.near_sigma", 0.001),
+        ("run.checkpoint_seconds=1e-3", "run.checkpoint_seconds", 0.001),
         ("search.area=5.", "search.area", 5.0),
         ("run.seed=007", "run.seed", 7),
         ("run.lockstep=True", "run.lockstep", True),

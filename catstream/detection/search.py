@@ -35,6 +35,7 @@ __all__ = [
 _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a cell away from that at another size
 _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
+_DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
 _SAME_OVERLAP = 0.3  # above which two windows in successive frames show the same object
 
 
@@ -141,14 +142,14 @@ def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings:
     confident = state.confident_window.centred(*state.window.centre)  # as large as in the last confident detection
     if settings.search.mode == "full":
         doubtful = not state.trusted or state.level == "lost"
-        best = whole(frame, confident if doubtful else state.window, model, settings.extent)
+        best = whole(frame, confident if doubtful else state.window, model)
         best = _fitted(frame, best, state.first_window, model, settings.extent)
         return replace(best, redetected=not best.window.overlap(state.window))
     near = _near(frame, state.window, state, model, settings)
-    level = belief.level_of(near.score, settings.belief.lost_score, state.trusted, settings.belief)
-    interval = belief.policies(settings)[level].search_interval
+    level = belief.level_of(near.score, state.trusted, settings.belief)
+    interval = belief.policies(settings.search.whole_interval)[level].search_interval
     if interval and seq % interval == 0:
-        other = whole(frame, confident, model, settings.extent)
+        other = whole(frame, confident, model)
         if belief.is_redetection(other.score, near.score, settings.belief):
             other = _near(frame, other.window, state, model, settings)
             if other.score > near.score:
@@ -164,10 +165,10 @@ def seek(
     The object counts as found once this window has led the rest of the frame in one place in several frames in a
     row: the state then has a first window. While no score is high, each frame is searched at a third of the sizes.
     """
-    best, lead = _sought(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model, settings.extent)
-    if state.sightings or best.score >= settings.belief.return_score:
-        best, lead = _sought(frame, state.window, _SOUGHT_FACTORS, model, settings.extent)
-    seen = best.score >= settings.belief.return_score and lead >= settings.belief.sighting_lead
+    best, lead = _sought(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model)
+    if state.sightings or best.score >= settings.belief.confident_score:
+        best, lead = _sought(frame, state.window, _SOUGHT_FACTORS, model)
+    seen = best.score >= settings.belief.confident_score and lead >= settings.belief.sighting_lead
     again = state.sightings > 0 and best.window.overlap(state.confident_window) > _SAME_OVERLAP
     state = replace(
         state,
@@ -183,24 +184,22 @@ def seek(
 def local(frame: Pyramid, window: Window, model: Model, settings: SearchSettings) -> Detection:
     """The best window near another, of its size.
 
-    The squared distance, in windows, costs `distance_penalty` of the score: of two equal windows the nearer wins.
+    A small part of the squared displacement is subtracted from the score: of two equal windows, the nearer wins.
     """
     side = WINDOW + 2 * round((settings.area - 1) * WINDOW / 2)
     scores = ScoreMap.around(frame, window, side, model)
     away = (np.arange(side - WINDOW + 1) - (side - WINDOW) // 2) / WINDOW
-    return replace(scores.best(settings.distance_penalty * (away[:, None] ** 2 + away**2)), around=scores)
+    return replace(scores.best(_DISTANCE_PENALTY * (away[:, None] ** 2 + away**2)), around=scores)
 
 
-def whole(frame: Pyramid, window: Window, model: Model, settings: ExtentSettings) -> Detection:
+def whole(frame: Pyramid, window: Window, model: Model) -> Detection:
     """The best window of a whole frame at three sizes: that of a window, 0.8 and 1.25 times as large."""
     found = [ScoreMap.whole(frame, window.scaled(factor), model).best() for factor in _WHOLE_FACTORS]
-    costs = [settings.penalty * abs(np.log(factor)) for factor in _WHOLE_FACTORS]
+    costs = [extent.cost(math.log(factor)) for factor in _WHOLE_FACTORS]
     return found[int(np.argmax([each.score - cost for each, cost in zip(found, costs, strict=True)]))]
 
 
-def _sought(
-    frame: Pyramid, window: Window, factors: tuple[float, ...], model: Model, settings: ExtentSettings
-) -> tuple[Detection, float]:
+def _sought(frame: Pyramid, window: Window, factors: tuple[float, ...], model: Model) -> tuple[Detection, float]:
     """The best window of a whole frame at several sizes, and by how much it leads the rest of the frame.
 
     In a scene that the model never saw, anything may score high. The windows that do not touch the best
@@ -211,7 +210,7 @@ def _sought(
     factors : the sizes, as factors of that of the window
     """
     maps = [ScoreMap.whole(frame, window.scaled(factor), model) for factor in factors]
-    costs = [settings.penalty * abs(np.log(factor)) for factor in factors]
+    costs = [extent.cost(math.log(factor)) for factor in factors]
     worths = [float(each.scores.max()) - cost for each, cost in zip(maps, costs, strict=True)]
     best = maps[int(np.argmax(worths))].best()
     return best, best.score - max(0.0, *(each.highest_apart(best.window) for each in maps))
@@ -244,13 +243,13 @@ def _at_best_size(frame: Pyramid, found: Detection, first: Window, model: Model,
     head = model.heads.get(EXTENT)
 
     def tried(step: int) -> tuple[float, Detection]:
-        scores = ScoreMap.around(frame, found.window.scaled(extent.size(step, settings)), _FINE_SIDE, model)
+        scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
         best = scores.best()
         fit = 0.0 if head is None else settings.weight * float(scores.row(1, 1) @ head)
-        return best.score + fit - extent.cost(step * math.log(1 + settings.size_step), grown, settings), best
+        return best.score + fit - extent.cost(step * extent.SIZE_CHANGE, grown, settings.prior), best
 
     best, _, beside = _climb(tried, settings.size_count // 2)
-    return replace(found, score=best.score, window=best.window.scaled(extent.size(beside, settings)))
+    return replace(found, score=best.score, window=best.window.scaled(extent.size(beside)))
 
 
 def _at_best_aspect(
@@ -260,13 +259,13 @@ def _at_best_aspect(
     head = model.heads[EXTENT]
 
     def tried(step: int) -> tuple[float, Detection]:
-        scores = ScoreMap.around(frame, found.window.scaled(*extent.stretch(step, settings)), WINDOW, model)
+        scores = ScoreMap.around(frame, found.window.scaled(*extent.stretch(step)), WINDOW, model)
         fit = settings.weight * float(scores.row(0, 0) @ head)
-        cost = extent.cost(step * math.log(1 + settings.aspect_step), widened, settings)
+        cost = extent.cost(step * extent.ASPECT_CHANGE, widened, settings.prior)
         return float(scores.scores[0, 0]) + fit - cost, found
 
     _, step, beside = _climb(tried, settings.aspect_count // 2)
-    return replace(found, window=found.window.scaled(*extent.stretch(step + beside, settings)))
+    return replace(found, window=found.window.scaled(*extent.stretch(step + beside)))
 
 
 def _climb(tried: Callable[[int], tuple[float, Detection]], most: int) -> tuple[Detection, int, float]:

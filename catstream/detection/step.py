@@ -38,16 +38,18 @@ def step(
     found : what the paper's first tracker found, in place of a search; it never reports the object as absent
     """
     if found is not None:
-        level = belief.level_of(found.score, belief.ALWAYS, True, settings.belief)
+        level = belief.level_of(max(found.score, settings.belief.weak_score), True, settings.belief)
         state = replace(state, level=level, window=found.window)
     else:
         state = motion.expected(state)
         state, found = search.searched(frame, state, seq, model, settings)
         state = belief.updated(state, found.score, found.redetected, settings.belief)
-        if belief.policies(settings)[state.level].reported:
+        if _policy(state, settings).report:
             state = _followed(state, found, frame.size, model, settings)
             state = motion.observed(state)
-    training = teacher.training_of(frame, found, state, seq, model, settings)
+    training = {}
+    if _policy(state, settings).teach:
+        training = teacher.training_of(frame, state.window, found.around, seq, model, settings)
     return state, track_of(state, seq, time, found.score, model, settings), training
 
 
@@ -55,19 +57,23 @@ def _followed(
     state: DetectorState, found: Detection, size: tuple[int, int], model: Model, settings: Settings
 ) -> DetectorState:
     """The state with the window moved to a detection, as far as the belief in it allows."""
-    policy, colours = belief.policies(settings)[state.level], state.colour_centroid
-    window = extent.followed(state.window, found.window, found.score >= policy.resize, settings.extent)
-    if found.around is not None and found.score >= policy.recentre:
+    policy, colours = _policy(state, settings), state.colour_centroid
+    window = extent.followed(state.window, found.window, policy.resize)
+    if found.around is not None and policy.recentre:
         slack, weights = settings.extent.colour_slack, model.weights[COLOURS]
         colours, window = colour_centroid.recentred(colours, window, found.around, weights, slack)
     window = window.with_centre_in(*size)
-    confident = window if found.score >= policy.remember else state.confident_window
+    confident = window if policy.remember else state.confident_window
     return replace(state, window=window, confident_window=confident, colour_centroid=colours)
 
 
 def track_of(state: DetectorState, seq: int, time: float, score: float, model: Model, settings: Settings) -> Track:
     """What is reported of a state: the box, unless the level of belief forbids it."""
-    reported = belief.policies(settings)[state.level].reported
+    reported = _policy(state, settings).report
     box = state.window.box(settings.search.context) if reported else None
     present: State = "present" if model.version else "bootstrapping"
     return Track(seq, seq - 1, time, present if reported else "absent", box, float(score), model.version)
+
+
+def _policy(state: DetectorState, settings: Settings) -> belief.Policy:
+    return belief.policies(settings.search.whole_interval)[state.level]

@@ -16,14 +16,14 @@ import numpy as np
 
 from catstream import ridge
 from catstream.box import Window
-from catstream.detection import belief, extent
-from catstream.detection.search import Detection, ScoreMap, non_maximum_suppression
+from catstream.detection import extent
+from catstream.detection.search import ScoreMap, non_maximum_suppression
 from catstream.errors import BoxError
 from catstream.features.cells import COLOURS, Cells, row_length
 from catstream.features.hog import CELL, MARGIN, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.heads import APPEARANCE, BACKGROUND, EXTENT
-from catstream.messages import DetectorState, Model, TrainingRows
+from catstream.messages import Model, TrainingRows
 from catstream.settings import Settings, TeachingSettings
 
 __all__ = [
@@ -41,6 +41,11 @@ Training = dict[str, TrainingRows]
 
 _NEAR = 2  # cells around the object whose windows are near misses, not background
 _NEAREST = 0.9  # cells: a nearer window shows the object as well as its own does
+_NEAR_SIGMA = 0.9  # cells: standard deviation of the Gaussian label of a near miss
+_EXTENT_SIGMA = 1.0  # steps of size or aspect ratio: the same of a window of a wrong extent
+_EXTENT_INTERVAL = 2  # frames from one set of rows of group "extent" to the next
+_OBJECT_WEIGHT = 8.0  # of a frame's rows of the object together; any other row has weight 1
+_BACKGROUND = 12  # windows of the background around the object, of each frame
 _SIDE = 20  # cells around the object, at least, from which background is taken
 _HARD_OVERLAP = 0.2  # of a hard negative with the object's window, at most
 
@@ -66,7 +71,7 @@ def first_training(
     else:
         context, moved = settings.search.context, teaching.other_backgrounds
         copies = affine_copies(frame, window, count, rng, context=context, moved=moved)
-        rows = _rows(copies, 1, teaching.object_weight, teaching)
+        rows = _rows(copies, 1, _OBJECT_WEIGHT, teaching)
         rows += _surroundings(ScoreMap.around(frame, window, _SIDE, None), window, count, 0, rng, teaching)
     training = _extents(frame, window, rows, settings)
     rows += hard_negatives(frame, window, initial_model(rows), teaching)
@@ -74,23 +79,19 @@ def first_training(
 
 
 def training_of(
-    frame: Pyramid, found: Detection, state: DetectorState, seq: int, model: Model, settings: Settings
+    frame: Pyramid, window: Window, around: ScoreMap | None, seq: int, model: Model, settings: Settings
 ) -> Training:
-    """What the belief in a detection allows to learn from it, in this frame.
+    """The rows of a frame in which the object was detected.
 
     Parameters
     ----------
-    state : after the detection: its level of belief, and the window that the rows are cut around
+    window : of the detection; the rows are cut around it
+    around : as for `training_at`
     seq : of the frame: rows of group "extent" and hard negatives are not cut in each
     """
-    policy, teaching = belief.policies(settings)[state.level], settings.teaching
-    if found.score < policy.teach:
-        return {}
-    training = training_at(
-        frame, state.window, seq, model, settings, found.around, extents=seq % settings.extent.interval == 0
-    )
-    if found.score >= policy.mine and seq % teaching.mining_interval == 0:
-        training[APPEARANCE] += hard_negatives(frame, state.window, model, teaching)
+    training = training_at(frame, window, seq, model, settings, around, extents=seq % _EXTENT_INTERVAL == 0)
+    if seq % settings.teaching.mining_interval == 0:
+        training[APPEARANCE] += hard_negatives(frame, window, model, settings.teaching)
     return training
 
 
@@ -210,11 +211,11 @@ def _appearance(
 ) -> TrainingRows:
     """The object, affine copies of it, near misses and background; half of this scores highest, if there is a model."""
     own = affine_copies(frame, window, 1 + teaching.copies, rng, mirrored=teaching.mirrored)
-    rows = _rows(own, 1, teaching.object_weight / len(own), teaching)
+    rows = _rows(own, 1, _OBJECT_WEIGHT / len(own), teaching)
     if around is None or min(around.cells.shape) < _SIDE:
         around = ScoreMap.around(frame, window, _SIDE, model)
-    hardest = 0 if model is None else teaching.near_negatives // 2
-    return rows + _surroundings(around, window, teaching.near_negatives, hardest, rng, teaching)
+    hardest = 0 if model is None else _BACKGROUND // 2
+    return rows + _surroundings(around, window, _BACKGROUND, hardest, rng, teaching)
 
 
 def _surroundings(
@@ -231,7 +232,7 @@ def _surroundings(
         distance = math.hypot(down[place[0], 0], across[place[1]])
         if distance > _NEAREST:
             misses.append(around.row(*place))
-            labels.append(_gaussian(distance, teaching.near_sigma))
+            labels.append(_gaussian(distance, _NEAR_SIGMA))
     places = non_maximum_suppression(np.where(outside, around.scores, -np.inf), hardest, _NEAR)
     anywhere = np.argwhere(outside)
     places += list(map(tuple, rng.choice(anywhere, count - len(places), replace=count > len(anywhere))))
@@ -245,7 +246,7 @@ def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Setti
     if not trials:
         return {}
     cuts = [Cells.within(frame.around(trial, WINDOW)).row(0, 0) for _, trial in trials]
-    labels = [_gaussian(steps, settings.extent.sigma) for steps, _ in trials]
+    labels = [_gaussian(steps, _EXTENT_SIGMA) for steps, _ in trials]
     return {EXTENT: _rows([rows.rows[0], *cuts], [1.0, *labels], 1, settings.teaching)}
 
 

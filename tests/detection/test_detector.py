@@ -88,16 +88,6 @@ def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
     assert not features.training
 
 
-@pytest.mark.parametrize(("share", "state"), [(0.0, "bootstrapping"), (0.9, "absent")])
-def test_a_score_is_judged_by_the_one_that_the_object_usually_has(scene, share, state):
-    detector, there = started(scene, {"belief.present_share": share}), scene((60, 50))
-    for _ in range(200):
-        detector.step(there)
-    track, _ = detector.step(cv2.addWeighted(there, 0.4, scene(), 0.6, 0))
-    assert 0.3 < track.score < 0.8
-    assert track.state == state
-
-
 def test_an_object_that_comes_back_elsewhere_is_found_in_the_whole_frame(scene):
     detector = started(scene)
     detector.step(scene())
@@ -108,7 +98,7 @@ def test_an_object_that_comes_back_elsewhere_is_found_in_the_whole_frame(scene):
 @pytest.mark.parametrize("detection", ["local", "full"])
 @pytest.mark.parametrize(("trust", "teaches"), [(0.0, True), (10.0, False)])
 def test_what_is_found_elsewhere_teaches_only_once_it_is_trusted(scene, trust, teaches, detection):
-    detector = started(scene, {"belief.trust_score": trust, "search.mode": detection})
+    detector = started(scene, {"belief.trusted_score": trust, "search.mode": detection})
     detector.step(scene())
     _, features = detector.step(scene((250, 180)))
     assert features.box.overlap(Box(250, 180, 48, 40)) > 0.6
@@ -304,7 +294,7 @@ def test_a_window_that_does_not_lead_its_frame_is_not_the_object(scene, learned)
     frame[150:190, 200:248] = frame[60:100, 90:138]
     tracks = sought(learned, [frame] * 10)
     assert {track.state for track in tracks} == {"absent"}
-    assert tracks[-1].score > Settings().belief.return_score
+    assert tracks[-1].score > Settings().belief.confident_score
 
 
 def test_what_is_in_another_place_in_each_frame_is_not_the_object(scene, learned):

@@ -38,16 +38,15 @@ def test_the_box_follows_an_object_that_gets(draw, w, h):
 
 
 def test_trials_are_windows_of_wrong_sizes_and_then_of_wrong_aspect_ratios():
-    settings = ExtentSettings(size_count=5, aspect_count=3)
-    trials = extent.trials(WINDOW, settings)
+    trials = extent.trials(WINDOW, ExtentSettings(size_count=5, aspect_count=3))
     assert [steps for steps, _ in trials] == [-2, -1, 1, 2, -1, 1]
     sizes, aspects = trials[:4], trials[4:]
     for steps, window in sizes:
         assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h)
-        assert window.w / WINDOW.w == pytest.approx((1 + settings.size_step) ** steps)
+        assert window.w / WINDOW.w == pytest.approx(1.04**steps)
     for steps, window in aspects:
         assert window.area == pytest.approx(WINDOW.area)
-        assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h * (1 + settings.aspect_step) ** steps)
+        assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h * 1.08**steps)
 
 
 def test_without_a_weight_of_the_extent_head_there_are_no_trials():
@@ -55,19 +54,18 @@ def test_without_a_weight_of_the_extent_head_there_are_no_trials():
 
 
 def test_a_window_follows_by_its_rates():
-    settings = ExtentSettings(size_rate=0.5, aspect_rate=0.25)
     found = WINDOW.scaled(1.1).scaled(1.05, 1 / 1.05).centred(90, 80)
-    window = extent.followed(WINDOW, found, True, settings)
+    window = extent.followed(WINDOW, found, True)
     assert window.centre == pytest.approx((90, 80))
-    assert window.area == pytest.approx(WINDOW.area * 1.1)
-    assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h * 1.05 ** (2 * 0.25))
+    assert window.area == pytest.approx(WINDOW.area * 1.1 ** (2 * 0.7))
+    assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h * 1.05 ** (2 * 0.2))
 
 
 def test_if_the_belief_is_low_only_the_place_is_followed():
     found = WINDOW.scaled(1.1).centred(90, 80)
-    assert extent.followed(WINDOW, found, False, ExtentSettings()) == pytest.approx(WINDOW.centred(90, 80))
+    assert extent.followed(WINDOW, found, False) == pytest.approx(WINDOW.centred(90, 80))
 
 
 def test_a_far_larger_change_is_a_detection_elsewhere_and_taken_as_it_is():
     found = WINDOW.scaled(1.5).centred(90, 80)
-    assert extent.followed(WINDOW, found, False, ExtentSettings()) == found
+    assert extent.followed(WINDOW, found, False) == found

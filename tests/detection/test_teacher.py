@@ -48,7 +48,7 @@ def test_the_label_of_a_near_miss_is_a_gaussian_of_its_distance(frame, model):
     worth = {around.row(*place).tobytes(): np.hypot(place[0] - row, place[1] - column) for place in np.ndindex(13, 13)}
     assert misses.sum() > 100
     for features, label in zip(rows.rows[misses], rows.labels[misses], strict=True):
-        assert label == pytest.approx(np.exp(-((worth[features.tobytes()] / SETTINGS.teaching.near_sigma) ** 2) / 2))
+        assert label == pytest.approx(np.exp(-((worth[features.tobytes()] / 0.9) ** 2) / 2))
 
 
 def test_a_window_nearer_than_most_of_a_cell_is_no_near_miss(frame, model):
@@ -63,7 +63,7 @@ def test_a_window_nearer_than_most_of_a_cell_is_no_near_miss(frame, model):
 def test_background_is_beyond_the_near_misses_and_half_of_it_scores_highest(frame, model):
     around = ScoreMap.around(frame, OBJECT, 20, model)
     rows, _, _, background = cut(frame, model, around)
-    assert background.sum() == SETTINGS.teaching.near_negatives
+    assert background.sum() == 12
     taken = places(around, rows.rows[background])
     assert all(max(abs(row - 6), abs(column - 6)) > 2 for row, column in taken)
     outside = [place for place in np.ndindex(13, 13) if max(abs(place[0] - 6), abs(place[1] - 6)) > 2]
@@ -76,7 +76,7 @@ def test_the_object_at_the_edge_of_what_was_searched_is_learned_from_as_well(fra
     edge = around.window(0, 12)
     rows, own, misses, background = cut(frame, model, around, edge)
     assert own.sum() == 1 + SETTINGS.teaching.copies
-    assert background.sum() == SETTINGS.teaching.near_negatives
+    assert background.sum() == 12
     assert misses.any()
     assert np.isfinite(rows.rows).all()
 
@@ -86,7 +86,7 @@ def test_where_no_search_left_cells_they_are_cut_around_the_box(frame, model, kn
     rows, own, misses, background = cut(frame, model if known else None)
     assert own.sum() == 1 + SETTINGS.teaching.copies
     assert misses.any()
-    assert background.sum() == SETTINGS.teaching.near_negatives
+    assert background.sum() == 12
     scored = ScoreMap.around(frame, OBJECT, 20, model)
     assert scored.scores.shape == (20 - WINDOW + 1,) * 2
     assert len(places(scored, rows.rows[~own])) > 20
