@@ -8,15 +8,15 @@ command line prints it as one line and exits with 1; a program catches
 __all__ = [
     "BoxError",
     "CatstreamError",
+    "CommandRejectedError",
     "FrameError",
     "MissingExtraError",
     "ProtocolError",
     "RecordingError",
-    "RefusedError",
     "ServiceError",
-    "SetBackError",
     "SettingsError",
     "SilenceError",
+    "StreamRewoundError",
     "VideoError",
 ]
 
@@ -57,20 +57,20 @@ class ProtocolError(CatstreamError, ValueError):
 
 
 class RecordingError(CatstreamError):
-    """A recording cannot be written or read, or lacks messages that are needed."""
+    """A recording cannot be written or read, or required messages are missing from it."""
 
 
 class ServiceError(CatstreamError):
     """A process of the pipeline failed or cannot start."""
 
 
-class SetBackError(ServiceError):
-    """A receiver lost messages that it had acknowledged as stored, and its sender no longer has them."""
+class StreamRewoundError(ServiceError):
+    """A restarted receiver is behind the position that it had acknowledged; its sender cannot retransmit the rest."""
 
 
 class SilenceError(ServiceError, TimeoutError):
     """No message arrived from a pipeline within the time-out."""
 
 
-class RefusedError(ServiceError):
-    """A running pipeline did not execute a command; the message has the reason."""
+class CommandRejectedError(ServiceError):
+    """A running pipeline did not carry out a command; the message has the reason."""

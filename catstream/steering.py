@@ -18,7 +18,7 @@ from typing import Self
 from uuid import uuid4
 
 from catstream.box import Box
-from catstream.errors import RefusedError, SilenceError
+from catstream.errors import CommandRejectedError, SilenceError
 from catstream.learned import Learned
 from catstream.messages import Answer, Command, Model, Sample, Verb
 from catstream.wire.channels import MODELS, SAMPLES
@@ -43,7 +43,7 @@ class Control:
 
     Raises
     ------
-    RefusedError
+    CommandRejectedError
         From each command, if the pipeline does not execute it.
     SilenceError
         From each command, if no answer arrives in time; the command may still be executed later.
@@ -84,7 +84,7 @@ class Control:
         """
         answer = self._ask("save")
         if answer.box is None:
-            raise RefusedError("save: the object was not detected yet: try again once it was")
+            raise CommandRejectedError("save: the object was not detected yet: try again once it was")
         model, sample = self._newest(answer.version)
         Learned(model, sample, answer.box).save(path)
         return replace(answer, version=model.version)
@@ -125,7 +125,7 @@ class Control:
                 "Check it with catstream status"
             )
         if not answer.done:
-            raise RefusedError(f"{verb}: {answer.reason}")
+            raise CommandRejectedError(f"{verb}: {answer.reason}")
         return answer
 
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from catstream.errors import CatstreamError, SetBackError
+from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.job import Job
 from catstream.messages import Health, Run
 from catstream.services.watchdog import PATIENCE, Watchdog
@@ -134,7 +134,7 @@ def run(name: str, main: Callable[[Process], None], job: Job, parent: Parent | N
             main(process)
         finally:
             process.close()
-    except SetBackError as error:
+    except StreamRewoundError as error:
         _log.warning("%s", error)
         return 1
     except CatstreamError as error:

@@ -27,7 +27,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from catstream.errors import CatstreamError, ProtocolError, RefusedError, SilenceError
+from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages import Answer
 from catstream.steering import Control
 from catstream.video.annotate import draw_preview
@@ -148,7 +148,7 @@ class _Pages:
             return _refused(400, str(error))
         try:
             answer = await run_in_threadpool(_execute, self._feed, verb, box, keep)
-        except RefusedError as error:
+        except CommandRejectedError as error:
             return _refused(409, str(error))
         except ProtocolError as error:
             return _refused(400, str(error))

@@ -105,7 +105,7 @@ class Sender(ChannelSocket[Message]):
         ------
         ProtocolError
             If the receiver holds another stream.
-        SetBackError
+        StreamRewoundError
             If the receiver has lost messages that it had acknowledged.
         """
         if self._wait(seconds):

@@ -14,7 +14,7 @@ hello). The sender asks if it was started anew, and after `PATIENCE` seconds wit
 So either side may be restarted, and any frame may be lost or arrive twice: each message is still taken once, in order.
 
 `Stored.seq` may include messages that the receiver has only in memory, because its disk takes nothing; `unsaved`
-says how many. If such a receiver is restarted, the sender cannot retransmit them and raises `SetBackError`.
+says how many. If such a receiver is restarted, the sender cannot retransmit them and raises `StreamRewoundError`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from catstream.errors import ProtocolError, SetBackError
+from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages import Position, Stored
 
 __all__ = ["HELLO", "PATIENCE", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
@@ -130,7 +130,7 @@ class SendWindow:
         ------
         ProtocolError
             If the receiver has stored messages that were never sent: it holds another stream.
-        SetBackError
+        StreamRewoundError
             If the receiver needs messages that it had acknowledged before, and that were forgotten here.
         """
         if reply.seq > max(self.sent, self._sent_before):
@@ -163,7 +163,7 @@ class SendWindow:
     def _go_back(self, position: Position) -> None:
         """Transmit everything again that the receiver has not."""
         if position.seq < self.acknowledged:
-            raise SetBackError(
+            raise StreamRewoundError(
                 f"the receiver of {self._channel} had {self.acknowledged} messages and now has {position.seq}: "
                 "what came between is made again from the source"
             )

@@ -12,7 +12,7 @@ import cv2
 import pytest
 import zmq
 
-from catstream.errors import ProtocolError, RefusedError, ServiceError, SettingsError
+from catstream.errors import CommandRejectedError, ProtocolError, ServiceError, SettingsError
 from catstream.learned import Learned
 from catstream.pipeline import Pipeline
 from catstream.services.desired import DesiredState
@@ -93,9 +93,9 @@ def test_without_a_box_the_first_frame_is_held_and_in_a_pause_a_box_is_for_the_f
 def refuses_what_cannot_be_done(pipeline, steering):
     """A pipeline that has no box yet says why, and counts what is no command."""
     for box, why in (((400, 10, 20, 20), "outside the frame"), ((10, 10, 1, 9), "at least 2 pixels")):
-        with pytest.raises(RefusedError, match=why):
+        with pytest.raises(CommandRejectedError, match=why):
             steering.set_box(box)
-    with pytest.raises(RefusedError, match="nothing was learned"):
+    with pytest.raises(CommandRejectedError, match="nothing was learned"):
         steering.save("never.safetensors")
     with zmq.Context.instance().socket(zmq.DEALER) as stranger:
         stranger.connect(Endpoint.parse(pipeline.endpoint).address(CHANNELS["control"]))

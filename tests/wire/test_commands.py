@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from catstream.box import Box
-from catstream.errors import ProtocolError, RefusedError, SilenceError
+from catstream.errors import CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages import Answer, Command
 from catstream.steering import Control
 from catstream.wire.channels import CHANNELS
@@ -147,7 +147,7 @@ def test_what_is_refused_says_why(endpoint):
     with (
         answering(endpoint, refuse),
         Control(str(endpoint), timeout=20) as control,
-        pytest.raises(RefusedError, match=r"^pause: it is no time for that$"),
+        pytest.raises(CommandRejectedError, match=r"^pause: it is no time for that$"),
     ):
         control.pause()
 

@@ -12,7 +12,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from catstream.errors import ProtocolError, SetBackError
+from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages import Position, Stored
 from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow
 
@@ -85,7 +85,7 @@ class Histories(RuleBasedStateMachine):
             return
         try:
             assert self.sender.receive(message, self.now) is None or isinstance(message, Stored)
-        except SetBackError:
+        except StreamRewoundError:
             assert self.in_memory, "only what was never stored may be asked for again after it was acknowledged"
             self.sender_dies()
 
@@ -350,7 +350,7 @@ def test_what_a_full_disk_keeps_in_memory_is_acknowledged_and_does_not_count_as_
     window = filled(size=4, count=3)
     window.receive(Stored(3, 3, unsaved=2), now=0.0)
     assert (window.acknowledged, window.stored, window.full) == (3, 1, False)
-    with pytest.raises(SetBackError, match="had 3 messages and now has 1"):
+    with pytest.raises(StreamRewoundError, match="had 3 messages and now has 1"):
         window.receive(Position(1), now=0.0)
 
 
