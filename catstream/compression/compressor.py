@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from catstream import storage
+from catstream.arrays import Bool, Float32
 from catstream.box import Box
 from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
@@ -247,11 +248,13 @@ class Compressor:
         return self.last_sample
 
 
-def _rows_of(head: Head, training: TrainingRows) -> np.ndarray:
+def _rows_of(head: Head, training: TrainingRows) -> Float32:
     """The rows that the tree of a head takes."""
-    rows = training.rows
+    rows: Float32 = training.rows
     if head.label is not None:
-        return rows[training.labels == head.label]
+        of_label: Bool = training.labels == head.label
+        return rows[of_label]
     wide = np.empty((len(rows), rows.shape[1] + 2), np.float32)
     wide[:, :-2], wide[:, -2], wide[:, -1] = rows, 1, training.labels
-    return wide * np.sqrt(training.weights, dtype=np.float32)[:, None]
+    roots: Float32 = np.sqrt(training.weights, dtype=np.float32)
+    return wide * roots[:, None]

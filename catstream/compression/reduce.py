@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from catstream.arrays import Float32
+
 __all__ = ["energy", "prepare", "reduce"]
 
 
@@ -53,6 +55,6 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     gram = rows @ rows.T
     # Divide and conquer: the default driver loses orthogonality, or vectors, if many eigenvalues are equal.
     _, vectors = scipy.linalg.eigh(gram, driver="evd", overwrite_a=True, check_finite=False)
-    kept = vectors[:, : -keep - 1 : -1].T @ rows
+    kept: Float32 = vectors[:, : -keep - 1 : -1].T @ rows
     kept[kept @ (rows.sum(axis=0) if towards is None else towards).astype(np.float32) < 0] *= -1
     return kept

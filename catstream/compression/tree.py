@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from catstream import storage
+from catstream.arrays import Float64
 from catstream.compression import sampling
 from catstream.compression.node import Node
 from catstream.compression.reduce import energy, reduce
@@ -84,7 +85,7 @@ class CoresetTree:
     @property
     def sum(self) -> np.ndarray:
         """Exact sum of all inserted rows, float64 (d,)."""
-        total = self.pending.sum(axis=0, dtype=np.float64)
+        total: Float64 = self.pending.sum(axis=0, dtype=np.float64)
         for node in self.nodes:
             total = total + node.sum
         return total

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from catstream.arrays import Float64
 from catstream.kalman import OBSERVED, TRANSITION, constant_velocity
 from catstream.messages import Motion
 
@@ -89,8 +90,8 @@ def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lag
     return Motion(_floored(process, PROCESS_FLOOR), _floored(observation, OBSERVATION_FLOOR))
 
 
-def _floored(covariance: np.ndarray, floor: float) -> np.ndarray:
+def _floored(covariance: Float64, floor: float) -> Float64:
     """The covariance with its eigenvalues raised to the floor: the constrained maximum of the likelihood."""
     values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, floor))
+    root: Float64 = vectors * np.sqrt(np.maximum(values, floor))
     return root @ root.T
