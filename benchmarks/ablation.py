@@ -62,7 +62,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     note = f"{len(whole)} runs each; spread: standard deviation over {options.starts} starts, mean over the sequences"
     yield Table("Ablation", COLUMNS, beside(whole, runs), note)
     if not options.quick and not options.only:  # last, because SCM takes longer than all variants above
-        paper = compared(options, found, {"the paper's tracker": Settings.of(PRESETS["one-class-paper"])})
+        paper = compared(options, found, {"the paper's tracker": Settings.from_values(PRESETS["one-class-paper"])})
         yield Table("The paper's tracker", COLUMNS, beside(whole, paper), note)
 
 

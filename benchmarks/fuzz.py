@@ -111,7 +111,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
     for seq in range(1, 12):
         rows = np.random.default_rng(seq).normal(size=(4, 6)).astype("f4")
         labels = [1, 0, 1, 0]
-        training = dict.fromkeys(GROUPS, TrainingRows.of(rows, labels))
+        training = dict.fromkeys(GROUPS, TrainingRows.labelled(rows, labels))
         compressor.take(Features(seq, seq, 0.0, Box(1.0, 2.0, 9.0, 9.0), training))
     compressor.save(folder / "checkpoint")
     Learned(seeds["model"][0], seeds["sample"][0], Box(1.0, 2.0, 9.0, 9.0)).save(folder / "learned")

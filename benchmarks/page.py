@@ -76,7 +76,7 @@ def _block(record: Record, tables: Callable[[Record], Iterable[Table]]) -> str:
     return f"$ {record['command']}  # {made}{settings}\n" + "\n\n".join(map(text, tables(record)))
 
 
-def of(number: int = 0, *, columns: Sequence[str] = (), without: str = "") -> Callable[[Record], Iterator[Table]]:
+def select(number: int = 0, *, columns: Sequence[str] = (), without: str = "") -> Callable[[Record], Iterator[Table]]:
     """Return a function that selects table `number` of a record, with these columns, without the rows of a pattern."""
 
     def chosen(record: Record) -> Iterator[Table]:
@@ -96,7 +96,7 @@ def strongest(count: int) -> Callable[[Record], Iterator[Table]]:
     def chosen(record: Record) -> Iterator[Table]:
         columns = ("variant", "AUC", "success", "AUC lost", "± standard error", "runs changed")
         first, *others = [
-            table.rows for number in range(len(record["tables"])) for table in of(number, columns=columns)(record)
+            table.rows for number in range(len(record["tables"])) for table in select(number, columns=columns)(record)
         ]
         ranked = sorted(first[1:], key=lambda row: -float(row[3] or 0))
         yield Table("", columns, [first[0], *ranked[:count], *(row for rows in others for row in rows)])
@@ -114,7 +114,7 @@ def faults(record: Record) -> Iterator[Table]:
 
 def totals(record: Record) -> Iterator[Table]:
     """Summarise the fuzzing record over all decoders."""
-    (table,) = of()(record)
+    (table,) = select()(record)
     inputs, taken, refused, _, memory, crashes, hangs = list(zip(*table.rows, strict=True))[1:]
     heads = ("decoders", "inputs", "taken", "refused", "most MB more", "crashes", "hangs")
     yield Table(
@@ -126,7 +126,7 @@ def speeds(record: Record) -> Iterator[Table]:
     """Select the speed in a user's program, of the other trackers, and by size of the image."""
     for number, table in enumerate(record["tables"]):
         if table["title"] in _SPEEDS:
-            yield from of(number, without=_SPEEDS[table["title"]])(record)
+            yield from select(number, without=_SPEEDS[table["title"]])(record)
 
 
 def load(record: Record) -> Iterator[Table]:
@@ -268,16 +268,16 @@ SECTIONS = (
         "The paper's experiments",
         _PAPER,
         (
-            Shown("tld", of(without="TLD|Struck|TGPR|SCM")),
-            Shown("root_or_hierarchy", of()),
-            Shown("root_or_hierarchy-ours", of()),
-            Shown("sampling", of(without=".*paper")),
-            Shown("sampling-ours", of(without=".*paper")),
-            Shown("coreset_size", of(without="2.5 %|10 %")),
-            Shown("bootstrap", of()),
-            Shown("long_videos-50000", of(without="TLD_06_car")),
-            Shown("long_videos", of(without="paper: (CAT, n = (5|10|15|20)00|TLD|TGPR) ")),
-            Shown("time_complexity", of(without="512|1024|2048|4096")),
+            Shown("tld", select(without="TLD|Struck|TGPR|SCM")),
+            Shown("root_or_hierarchy", select()),
+            Shown("root_or_hierarchy-ours", select()),
+            Shown("sampling", select(without=".*paper")),
+            Shown("sampling-ours", select(without=".*paper")),
+            Shown("coreset_size", select(without="2.5 %|10 %")),
+            Shown("bootstrap", select()),
+            Shown("long_videos-50000", select(without="TLD_06_car")),
+            Shown("long_videos", select(without="paper: (CAT, n = (5|10|15|20)00|TLD|TGPR) ")),
+            Shown("time_complexity", select(without="512|1024|2048|4096")),
         ),
     ),
     Section(
@@ -285,12 +285,12 @@ SECTIONS = (
         _SPEED,
         (
             Shown("speed", speeds),
-            Shown("startup", of()),
-            Shown("throughput", of(without=".* full ")),
-            Shown("kernels", of(without=".*(256|500|least-squares|one-class|shades|windows)")),
-            Shown("wire", of()),
-            Shown("subscribers", of(without="0 ")),
-            Shown("endurance", of()),
+            Shown("startup", select()),
+            Shown("throughput", select(without=".* full ")),
+            Shown("kernels", select(without=".*(256|500|least-squares|one-class|shades|windows)")),
+            Shown("wire", select()),
+            Shown("subscribers", select(without="0 ")),
+            Shown("endurance", select()),
         ),
     ),
     Section(
@@ -300,8 +300,8 @@ SECTIONS = (
             Shown("loadtest", load),
             Shown("loadtest-limit", limit),
             Shown("chaos", faults),
-            Shown("resume", of()),
-            Shown("soak", of(columns=_SOAK, without="(15|30|60|125|250|500)000 ")),
+            Shown("resume", select()),
+            Shown("soak", select(columns=_SOAK, without="(15|30|60|125|250|500)000 ")),
             Shown("fuzz", totals),
         ),
     ),

@@ -81,8 +81,8 @@ class Stream:
         gains = random.normal(1, GAIN, (4, 1)).astype(np.float32)
         pair = random.integers(len(self._extents), size=2)
         rows = np.stack([part[random.integers(len(part))] for part in (self._object, self._background)]) * gains[:2]
-        extents = TrainingRows.of(self._extents.rows[pair] * gains[2:], self._extents.labels[pair])
-        training = {APPEARANCE: TrainingRows.of(rows, [1, 0]), EXTENT: extents}
+        extents = TrainingRows.labelled(self._extents.rows[pair] * gains[2:], self._extents.labels[pair])
+        training = {APPEARANCE: TrainingRows.labelled(rows, [1, 0]), EXTENT: extents}
         return Features(seq, seq - 1, (seq - 1) / 25, self._box, training)
 
 

@@ -2,7 +2,7 @@
 
 A `Box` is what is reported: tight around the object, as the benchmarks write it. A `Window` is what is cut from the
 frame, searched and learned from: the box with some of its surroundings, `context` times as wide and high. They are two
-types, so that mypy finds where one stands for the other. `Window.of` and `Window.box` convert.
+types, so that mypy finds where one stands for the other. `Window.around` and `Window.box` convert.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class Window(_Rectangle):
 
     Examples
     --------
-    >>> window = Window.of(Box(10, 20, 40, 80), context=1.25)
+    >>> window = Window.around(Box(10, 20, 40, 80), context=1.25)
     >>> window
     Window(x=5.0, y=10.0, w=50.0, h=100.0)
     >>> window.box(context=1.25)
@@ -150,7 +150,7 @@ class Window(_Rectangle):
     __slots__ = ()
 
     @classmethod
-    def of(cls, box: Box, context: float) -> Self:
+    def around(cls, box: Box, context: float) -> Self:
         """The window of a box, `context` times as wide and high, with the same centre."""
         return cls(*box).scaled(context)
 

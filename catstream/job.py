@@ -40,7 +40,7 @@ class Results:
     save_model: Path | None = None
 
     @classmethod
-    def of(cls, facts: dict[str, Any]) -> Results:
+    def from_json(cls, facts: dict[str, Any]) -> Results:
         """The value that `asdict` and JSON made these facts of."""
         write = tuple(Path(file) for file in facts["write"])
         return cls(_path(facts["output"]), bool(facts["video"]), write, _path(facts["save_model"]))
@@ -183,9 +183,9 @@ _READERS: dict[str, Callable[[Any], object]] = {
     "box": lambda box: box and Box(*box),
     "model": _path,
     "part": lambda part: slice(*part),
-    "settings": Settings.of,
+    "settings": Settings.from_values,
     "size": lambda size: size and tuple(size),
     "record": _path,
     "state": _path,
-    "results": Results.of,
+    "results": Results.from_json,
 }

@@ -17,7 +17,7 @@ from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import Model, Sample
 from catstream.packing import pack, unpack
-from catstream.wire.checks import check
+from catstream.wire.checks import check_message
 
 __all__ = ["Learned"]
 
@@ -72,7 +72,7 @@ class Learned:
                 raise ValueError(f"it is of kind {facts.get('kind')!r}, not {_KIND!r}")
             learned = cls._of(arrays, facts)
             for message in (learned.model, learned.sample):
-                check(message)
+                check_message(message)
             x, y, w, h = learned.box
             if not (np.isfinite((x, y)).all() and 0 < w < np.inf and 0 < h < np.inf):
                 raise ValueError(f"its box is {learned.box}")

@@ -112,7 +112,7 @@ class TrainingRows:
     weights: Annotated[np.ndarray, Array("float32", ("k",), above=0)]
 
     @classmethod
-    def of(cls, rows: Sequence[np.ndarray], label: float | Sequence[float], weight: float = 1.0) -> Self:
+    def labelled(cls, rows: Sequence[np.ndarray], label: float | Sequence[float], weight: float = 1.0) -> Self:
         """Rows of one weight, with one label or each its own."""
         k = len(rows)
         return cls(np.array(rows, np.float32), np.full(k, label, np.float32), np.full(k, weight, np.float32))
@@ -356,7 +356,7 @@ class Run:
     settings: dict[str, str]
 
     @classmethod
-    def of(cls, settings: dict[str, str]) -> Run:
+    def from_settings(cls, settings: dict[str, str]) -> Run:
         """A run of this version of catstream, with what `Settings.portable` returned."""
         return cls(version("catstream"), settings)
 

@@ -38,7 +38,7 @@ from catstream.wire.readable import readable
 __all__ = ["Pipeline"]
 
 _CHECK_SECONDS = 0.1
-_FAREWELL_SECONDS = 12.0
+_EXIT_SECONDS = 12.0  # time for the detector to exit after the end of the stream was received
 _TURN_SECONDS = 0.01
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to follow the source again"
@@ -269,7 +269,7 @@ class Pipeline:
         while not self._over():
             if (track := self._take(_CHECK_SECONDS)) is not None:
                 yield track
-        for _ in self._farewell():
+        for _ in self._wait_for_exit():
             time.sleep(_TURN_SECONDS)
         self._raise_failure()
 
@@ -280,7 +280,7 @@ class Pipeline:
                 yield track
             elif self._end is None:
                 await readable([self._incoming], _CHECK_SECONDS)
-        for _ in self._farewell():
+        for _ in self._wait_for_exit():
             await asyncio.sleep(_TURN_SECONDS)
         self._raise_failure()
 
@@ -381,7 +381,7 @@ class Pipeline:
     def _watch(self) -> None:
         """Take in the health, restart processes that died, and log what the user should know."""
         self._receive_health()
-        self._children.check()
+        self._children.check_children()
         for line in self._children.news("detector"):
             if self.live or line == COMPILING:  # a live source is lost, or is back
                 _log.warning("%s", line)
@@ -396,14 +396,14 @@ class Pipeline:
                 _log.warning("%s: %s", health.process, health.trouble)
             self._health[health.process] = health
 
-    def _farewell(self) -> Iterator[None]:
+    def _wait_for_exit(self) -> Iterator[None]:
         """Turns until the detector has ended, which it does once it knows that its end was received."""
-        deadline = time.monotonic() + _FAREWELL_SECONDS
+        deadline = time.monotonic() + _EXIT_SECONDS
         while not self._children.finished and time.monotonic() < deadline:
             yield
             self._incoming.receive(0)
             self._receive_health()
-            self._children.check()
+            self._children.check_children()
         self._receive_health()
 
     @property
@@ -437,7 +437,7 @@ def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
     if job.settings.run.lockstep and is_live(job.source):
         raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
     if record is not None and record.exists() and is_new:
-        raise RecordingError(f"{record} is there already: give another name, or remove it")
+        raise RecordingError(f"{record} exists already: give another name, or remove it")
 
 
 @contextmanager

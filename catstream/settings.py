@@ -335,7 +335,7 @@ class Settings:
             For a name that does not exist (names the nearest), or a value that
             does not fit.
         """
-        return cls.of(cls.given(preset=preset, file=file, overrides=overrides, environment=environment))
+        return cls.from_values(cls.given(preset=preset, file=file, overrides=overrides, environment=environment))
 
     @staticmethod
     def given(
@@ -345,7 +345,7 @@ class Settings:
         overrides: Mapping[str, Any] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> dict[str, Any]:
-        """Names and values that are set in some source, as `of` and `but` check them.
+        """Names and values that are set in some source, as `from_values` and `but` check them.
 
         Parameters
         ----------
@@ -376,12 +376,12 @@ class Settings:
         return values | _named(overrides)
 
     @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Settings:
+    def from_values(cls, values: Mapping[str, Any]) -> Settings:
         """Check names and values, flat (`coreset.size`) or in groups; texts are read as their setting's type.
 
         Examples
         --------
-        >>> Settings.of({"coreset.share": ".5", "run": {"lockstep": True}}).changed()
+        >>> Settings.from_values({"coreset.share": ".5", "run": {"lockstep": True}}).changed()
         ['run.lockstep=true', 'coreset.share=0.5']
         """
         groups: dict[str, dict[str, Any]] = {}
@@ -422,7 +422,7 @@ class Settings:
         >>> Settings(run={"lockstep": True}).but(["coreset.size=32"]).changed()
         ['run.lockstep=true', 'coreset.size=32']
         """
-        return Settings.of(self.values() | _flat(_named(others)))
+        return Settings.from_values(self.values() | _flat(_named(others)))
 
     def values(self) -> dict[str, Any]:
         """All values, by full name."""

@@ -28,7 +28,7 @@ from catstream.packing import pack, unpack
 from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
-from catstream.wire.checks import check
+from catstream.wire.checks import check_message
 
 __all__ = ["Tracker"]
 
@@ -187,7 +187,7 @@ class Tracker:
 
     @classmethod
     def _of(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Self:
-        self = cls(Settings.of(facts["settings"]))
+        self = cls(Settings.from_values(facts["settings"]))
         self.compressor = Compressor.from_state(arrays, facts["compressor"], self.settings)
         self.trainer, self.detector = Trainer(self.settings), Detector(self.settings)
         model = unpack(Model, arrays, facts["model"], "model")
@@ -205,7 +205,7 @@ class Tracker:
         self._size = int(height), int(width)
         self._track = unpack(Track, arrays, facts["track"], "track")
         for message in (model, self._track):
-            check(message)
+            check_message(message)
         kalman.prepare()
         return self
 

@@ -23,7 +23,7 @@ from catstream.wire.newest import Publisher
 
 __all__ = ["main", "reading_seconds"]
 
-_FAREWELL_SECONDS = 5.0  # limit for the sender to end, if all processes were asked to end
+_SENDER_SECONDS = 5.0  # limit for the detector to send the end, once all processes were asked to end
 _END_SECONDS = 5.0  # limit for the end of the tracks, after that of the features
 _STORE_SECONDS = 60.0  # limit for a slow disk
 _READ_SECONDS = 1e-7  # limit for reading one byte
@@ -75,7 +75,7 @@ class CompressorLoop:
     @property
     def over(self) -> bool:
         """Whether the process was asked to end, and its sender, if there is one, did not end in time."""
-        return self._process.ended_for(_FAREWELL_SECONDS if self._features.has_sender else 0)
+        return self._process.ended_for(_SENDER_SECONDS if self._features.has_sender else 0)
 
     def receive(self) -> Features | End | None:
         """The next message, None if none arrives in a tenth of a second."""
@@ -137,7 +137,7 @@ class CompressorLoop:
     def _check(self, message: Features | End) -> None:
         """Raise ProtocolError for features of another stream."""
         if isinstance(message, Features):
-            self._compressor.check(message)
+            self._compressor.check_features(message)
 
     def _counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
@@ -156,7 +156,7 @@ def _compressor(job: Job, checkpoints: CheckpointStore | None) -> Compressor:
     """A compressor that goes on from the newest checkpoint, or from a saved model, or begins anew."""
     compressor = checkpoints.load(job.settings) if checkpoints is not None else Compressor(job.settings)
     if job.model is not None and not compressor.seq:
-        return Compressor.of(Learned.load(job.model).sample, job.settings)
+        return Compressor.from_sample(Learned.load(job.model).sample, job.settings)
     return compressor
 
 

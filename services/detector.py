@@ -1,7 +1,7 @@
 """Frames in; tracks and features out, with the newest model.
 
 `main` is the order of events, and `DetectorLoop` connects them to sockets. What is decided on the way is decided by
-`resume`, `pacing`, `farewell` and `commands`, which know no socket.
+`resume`, `pacing`, `delivery` and `commands`, which know no socket.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from catstream.learned import Learned
 from catstream.messages import End, Features, Model, Position, Track
 from catstream.services.commands import CommandHandler
 from catstream.services.control import CommandChannel
+from catstream.services.delivery import Step, next_step
 from catstream.services.desired import DesiredState
-from catstream.services.farewell import Step, next_step
 from catstream.services.loop import Process
 from catstream.services.outputs import Outputs
 from catstream.services.pacing import Awaited, awaited
@@ -38,8 +38,8 @@ __all__ = ["main", "opening_seconds"]
 Message = TypeVar("Message", bound=Track | Features | End)
 
 _FILE = "desired_state.json"  # in the folder of the state
-_FAREWELL_SECONDS = 10.0  # patience with the compressor, once the process was asked to end
-_OWNER_SECONDS = 0.5  # patience with the owner of the run, who may not listen any more
+_COMPRESSOR_SECONDS = 10.0  # time for the compressor to store the end, once the process was asked to end
+_OWNER_SECONDS = 0.5  # the same for the owner of the run, which may no longer receive
 _OPEN_SECONDS = 60.0  # limit for opening the source, and for learning the first frame
 _SKIP_SECONDS = 0.1  # limit for decoding a frame that is passed over
 _TURN_SECONDS = 0.02  # from one turn of a waiting loop to the next
@@ -265,7 +265,7 @@ class DetectorLoop:
         """Send the end of the stream, and wait until it is stored; not for long, if the process was asked to end."""
         self._control.end(reason)
         features, results, seq = self._outputs.features, self._outputs.results, self.detector.seq
-        self._deliver(features, End(seq + 1, reason, failed), _FAREWELL_SECONDS, stored=True)
+        self._deliver(features, End(seq + 1, reason, failed), _COMPRESSOR_SECONDS, stored=True)
         end = End(seq + 1, reason, failed, {"sent": float(seq), "stored": float(min(features.stored, seq))})
         if results is not None:
             self._deliver(results, end, _OWNER_SECONDS, stored=True)

@@ -83,7 +83,7 @@ class Process:
     @property
     def run(self) -> Run:
         """The settings of the pipeline, which a recording needs to repeat the learning."""
-        return Run.of(self.settings.portable())
+        return Run.from_settings(self.settings.portable())
 
     def ended_for(self, seconds: float) -> bool:
         """Whether a signal asked the process to end at least so long ago."""

@@ -83,6 +83,6 @@ def with_settings(command: _Command) -> _Command:
     @with_given
     @wraps(command)
     def wrapped(given: dict[str, Any], **options: Any) -> None:
-        command(settings=Settings.of(given), **options)
+        command(settings=Settings.from_values(given), **options)
 
     return cast(_Command, wrapped)

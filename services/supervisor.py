@@ -25,7 +25,7 @@ NAMES = ("detector", "compressor", "trainer")
 
 _RESTARTS, _PER_SECONDS = 5, 60.0
 _FIRST_PAUSE = 0.1
-_FAREWELL_SECONDS = 12.0
+_SHUTDOWN_SECONDS = 12.0  # time for all children to end before they are killed
 _APART_SECONDS = 3.0  # the most between the end of another process and that of the detector, if both end well
 
 _log = logging.getLogger(__name__)
@@ -34,8 +34,8 @@ _log = logging.getLogger(__name__)
 class Supervisor:
     """The children of one pipeline.
 
-    Call `check` ten times a second. It restarts a child that died or hangs, after a pause that doubles each time, and
-    at most five times a minute.
+    Call `check_children` ten times a second. It restarts a child that died or hangs, after a pause that doubles each
+    time, and at most five times a minute.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Supervisor:
         """The lines that a child logged since this was last called."""
         return self._children[name].news()
 
-    def check(self) -> None:
+    def check_children(self) -> None:
         """Restart the children that died, kill those that hang, and log it.
 
         Raises
@@ -126,7 +126,7 @@ class Supervisor:
 
     def stop(self) -> None:
         """End all children: each is asked to end, and killed if it does not."""
-        deadline = time.monotonic() + _FAREWELL_SECONDS
+        deadline = time.monotonic() + _SHUTDOWN_SECONDS
         try:
             for child in self._children.values():  # the detector first: its last messages need the others
                 child.terminate(max(0.1, deadline - time.monotonic()))
@@ -149,7 +149,7 @@ def main(job: Job) -> int:
         supervisor = Supervisor(replace(job, endpoint=str(endpoint)), folder)
         try:
             while not supervisor.finished and not ended.wait(0.05):
-                supervisor.check()
+                supervisor.check_children()
             if failure := supervisor.failure:
                 _log.error("%s", failure)
         finally:

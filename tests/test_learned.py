@@ -24,7 +24,7 @@ def features(rng, seq, begins=False):
     labels = np.repeat(np.float32([1, 0]), 4)
     rows = rng.normal(scale=0.2, size=(8, WIDTH)).astype(np.float32) + np.where(labels[:, None], 1, -1)
     box = Box(1.0, 2.0, 30.0, 40.0)
-    training = {APPEARANCE: TrainingRows.of(rows, labels), EXTENT: TrainingRows.of(rows[:4], 1)}
+    training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
     return Features(seq, seq - 1, seq / 25, box, training, None, begins)
 
 
@@ -81,7 +81,7 @@ def test_an_unwritable_file_is_an_error_and_leaves_nothing(learned, tmp_path):
 def test_a_tree_of_a_sample_stands_for_as_many_rows_with_the_same_mean(compressor, size):
     tree = compressor.trees["object"]
     summary = tree.sample()
-    other = CoresetTree.of(summary, size)
+    other = CoresetTree.from_summary(summary, size)
     assert summary.count / 2 < other.rows_seen <= summary.count
     np.testing.assert_allclose(other.sum / other.rows_seen, tree.sum / tree.rows_seen, rtol=1e-5)
     directions = np.linalg.qr(np.random.default_rng(3).normal(size=(WIDTH, 3)))[0]
@@ -95,7 +95,7 @@ def test_a_tree_of_a_sample_stands_for_as_many_rows_with_the_same_mean(compresso
 
 def test_a_compressor_goes_on_from_a_sample_with_its_version_and_its_weight(learned, rng, tmp_path):
     learned.save(tmp_path / "one")
-    compressor = Compressor.of(Learned.load(tmp_path / "one").sample, Settings(coreset={"size": SIZE}))
+    compressor = Compressor.from_sample(Learned.load(tmp_path / "one").sample, Settings(coreset={"size": SIZE}))
     assert compressor.sampled == learned.sample.version
     samples = [sample for seq in range(1, 30) if (sample := compressor.take(features(rng, seq)))]
     assert [sample.version for sample in samples] == [learned.sample.version + 1 + i for i in range(len(samples))]

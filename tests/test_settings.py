@@ -39,7 +39,7 @@ WAYS = {
     "Settings": grouped,
     "replace": replaced,
     "but": lambda name, value: Settings().but({name: value}),
-    "of": lambda name, value: Settings.of({name: value}),
+    "of": lambda name, value: Settings.from_values({name: value}),
     "set": lambda name, value: Settings.load(overrides=[f"{name}={value}"], environment={}),
     "environment": lambda name, value: Settings.load(
         environment={f"CATSTREAM_{name.upper().replace('.', '_')}": str(value)}
@@ -83,7 +83,7 @@ def test_a_name_that_does_not_exist_is_refused_with_the_nearest_ones(way):
 )
 def test_a_name_without_its_group_is_refused_with_the_full_name(name, nearest):
     with pytest.raises(SettingsError, match=f"there is no setting '{name}', did you mean '{re.escape(nearest)}'"):
-        Settings.of({name: 1})
+        Settings.from_values({name: 1})
 
 
 def test_a_name_that_is_similar_to_no_other_says_how_to_list_them():
@@ -118,7 +118,13 @@ def test_a_number_of_any_kind_is_stored_as_one_of_python():
 def test_groups_may_be_written_in_one_way_or_the_other():
     flat, nested = {"coreset.size": 32, "run.seed": 7}, {"coreset": {"size": 32}, "run": {"seed": 7}}
     groups = Settings(coreset=CoresetSettings(size=32), run=RunSettings(seed=7))
-    assert Settings.of(flat) == Settings.of(nested) == Settings().but(nested) == Settings(**nested) == groups
+    assert (
+        Settings.from_values(flat)
+        == Settings.from_values(nested)
+        == Settings().but(nested)
+        == Settings(**nested)
+        == groups
+    )
 
 
 @pytest.mark.parametrize(
@@ -140,5 +146,9 @@ def test_a_text_is_read_as_a_person_writes_it(pair, name, value):
 @pytest.mark.parametrize("preset", [None, *PRESETS])
 def test_settings_survive_texts_copies_and_pickles(preset):
     settings = Settings.load(preset=preset, environment={})
-    for other in (Settings.of(settings.texts()), copy.deepcopy(settings), pickle.loads(pickle.dumps(settings))):
+    for other in (
+        Settings.from_values(settings.texts()),
+        copy.deepcopy(settings),
+        pickle.loads(pickle.dumps(settings)),
+    ):
         assert other == settings

@@ -30,8 +30,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     for percent in sizes:
         share = {"coreset.share": percent / 100}
         copies = {"teaching.copies": int(25 // percent) - 1}
-        recipes[f"paper's, {percent} %"] = Recipe(Settings.of(PRESETS["one-class-paper"] | share | copies))
-        recipes[f"ours, {percent} %"] = Recipe(Settings.of(share))
+        recipes[f"paper's, {percent} %"] = Recipe(Settings.from_values(PRESETS["one-class-paper"] | share | copies))
+        recipes[f"ours, {percent} %"] = Recipe(Settings.from_values(share))
     runs = follow_all(options, found, recipes)
     rows = []
     for percent in sizes:

@@ -64,7 +64,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 def base_of(options: argparse.Namespace) -> Settings:
     """Return all settings except n."""
-    return Settings.of(PRESETS.get(options.preset, {}))
+    return Settings.from_values(PRESETS.get(options.preset, {}))
 
 
 def lengthened(sequence: Sequence, frames: int) -> tuple[Path, np.ndarray]:

@@ -39,7 +39,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     recipes = {}
     for source, tree in (("root", RootTree), ("hierarchy", CoresetTree)):
         if not options.ours:
-            recipes[f"paper's way, {source}"] = Recipe(Settings.of(PRESETS["one-class-paper"]), tree)
+            recipes[f"paper's way, {source}"] = Recipe(Settings.from_values(PRESETS["one-class-paper"]), tree)
         recipes[f"our settings, {source}"] = Recipe(Settings(), tree)
     runs = follow_all(options, videos(options), recipes)
     rows = [(name, *means(found), spread(found), *PAPER[name.split(", ")[1]]) for name, found in runs.items()]

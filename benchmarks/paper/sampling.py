@@ -108,7 +108,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 def base_of(options: argparse.Namespace) -> Settings:
     """Return all settings except n and the tree."""
-    return Settings() if options.ours else Settings.of(PRESETS["one-class-paper"])
+    return Settings() if options.ours else Settings.from_values(PRESETS["one-class-paper"])
 
 
 if __name__ == "__main__":

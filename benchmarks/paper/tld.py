@@ -32,7 +32,7 @@ PAPER = {
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    variants = {"defaults": Settings(), **{name: Settings.of(PRESETS[name]) for name in ("cat25", "cat10")}}
+    variants = {"defaults": Settings(), **{name: Settings.from_values(PRESETS[name]) for name in ("cat25", "cat10")}}
     found = videos(options, "TLD_")
     rows = []
     for name, runs in compared(options, found, variants).items():

@@ -114,7 +114,11 @@ def _learn(
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn())
     with ExitStack() as stack:
         progress = stack.enter_context(Progress(*columns, console=console, transient=True))
-        writer = stack.enter_context(RecordingWriter(output, Run.of(trials[newest].portable()))) if output else None
+        writer = (
+            stack.enter_context(RecordingWriter(output, Run.from_settings(trials[newest].portable())))
+            if output
+            else None
+        )
         for name, settings in trials.items():
             task = progress.add_task(name, total=total)
             result = learn(

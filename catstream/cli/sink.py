@@ -13,7 +13,7 @@ from catstream.cli.interrupts import Interrupts
 from catstream.messages import Run
 from catstream.services.options import with_part
 from catstream.settings import Settings
-from catstream.sinks.sink import check, open_sink
+from catstream.sinks.sink import check_writable, open_sink
 from catstream.subscription import subscribe
 from catstream.wire.channels import TRAINING
 from catstream.wire.endpoint import Endpoint
@@ -59,7 +59,7 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
       catstream sink walk.mp4 --source recorded/walk.avi --endpoint run
     """
     for path in files:
-        check(path)
+        check_writable(path)
     interrupts = Interrupts()
     interrupts.install()
     written, newest, max_repeats, reason = 0, -1, 0, ""

@@ -158,7 +158,7 @@ def track(
     if view is not None:
         require_extra("view")
     files = _files(pipeline, results, STDOUT in write)
-    files.check(
+    files.check_writable(
         overwrite=overwrite,
         resumable=state is not None or resume is not None,
         known=[*known.write, *([known.output] if known.output is not None else [])],
@@ -271,7 +271,7 @@ def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
 
 def _check_model(file: Path, overwrite: bool) -> None:
     if file.exists() and not overwrite:
-        raise ServiceError(f"{file} is there already: replace it with --overwrite, or give another name")
+        raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
     if file.is_dir() or not is_writable(file.parent):
         raise ServiceError(f"cannot write {file}: give a file in a folder that exists and that you may write to")
 

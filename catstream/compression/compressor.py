@@ -65,15 +65,15 @@ class Compressor:
         self._sampled_leaves = 0  # 0 before the first sample of an object
 
     @classmethod
-    def of(cls, sample: Sample, settings: Settings) -> Compressor:
+    def from_sample(cls, sample: Sample, settings: Settings) -> Compressor:
         """A compressor whose trees are made from a sample of an earlier stream, one node each; versions continue."""
         self = cls(settings)
         for name, summary in sample.trees.items():
-            self.trees[name] = CoresetTree.of(summary, settings.coreset.size)
+            self.trees[name] = CoresetTree.from_summary(summary, settings.coreset.size)
         self.last_sample, self.centres, self._sampled_leaves = sample, sample.centres, self.leaves
         return self
 
-    def check(self, features: Features) -> None:
+    def check_features(self, features: Features) -> None:
         """Raise ProtocolError if rows have another length than those before."""
         before = {self.trees[name].width - head.more_columns for name, head in HEADS.items() if self.trees[name].width}
         width = max(before, default=0)
@@ -106,7 +106,7 @@ class Compressor:
             )
         if features.begins:
             self._forget()
-        self.check(features)  # before the first tree takes its rows, so that all trees hold the same frames
+        self.check_features(features)  # before the first tree takes its rows, so that all trees hold the same frames
         for name, head in HEADS.items():
             if (training := features.training.get(head.group)) is not None:
                 self.trees[name].insert(_rows_of(head, training))

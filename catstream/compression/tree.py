@@ -52,7 +52,7 @@ class CoresetTree:
         self.pending = np.empty((0, 0), np.float32)
 
     @classmethod
-    def of(cls, summary: Summary, size: int) -> CoresetTree:
+    def from_summary(cls, summary: Summary, size: int) -> CoresetTree:
         """A tree of one node with the weight and the mean of everything that a sample of another tree summarises.
 
         The count is rounded down to n * 2**level. If it is less than a leaf, the rows of the sample are pending rows.

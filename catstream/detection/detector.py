@@ -75,7 +75,7 @@ class Detector:
         """
         frame, scm = Pyramid.of(image), None
         box = Box(*map(float, box)).validated(*frame.size)
-        window, rng = Window.of(box, self.settings.search.context), (self.settings.run.seed, self.seq)
+        window, rng = Window.around(box, self.settings.search.context), (self.settings.run.seed, self.seq)
         if self.settings.teaching.bootstrap == "scm":
             from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
@@ -105,7 +105,7 @@ class Detector:
                 f"the model has {len(model.weights)} weights, the features of a window are {row_length()}: "
                 "learn it anew with this catstream"
             )
-        window = Window.of(box, self.settings.search.context)
+        window = Window.around(box, self.settings.search.context)
         self.state = DetectorState(0, "lost", window, window, None)
         self.model, self.newest_version = model, model.version
 
@@ -118,7 +118,7 @@ class Detector:
         found = None
         if self._scm is not None:
             score, box = self._scm.follow(image)
-            found = Detection(score, Window.of(box, self.settings.search.context).with_centre_in(*frame.size))
+            found = Detection(score, Window.around(box, self.settings.search.context).with_centre_in(*frame.size))
         state = self.state
         self.state, track, training = step(state, frame, self.seq, time, self.model, self.settings, found)
         return self._messages(track, training)
@@ -134,7 +134,7 @@ class Detector:
         if self.state is None:
             raise BoxError("there is no box to follow yet: call init with a frame and a box first")
         frame = Pyramid.of(image)
-        window = Window.of(Box(*map(float, box)).validated(*frame.size), self.settings.search.context)
+        window = Window.around(Box(*map(float, box)).validated(*frame.size), self.settings.search.context)
         self.seq += 1
         self.state = motion.observed(
             replace(
@@ -186,8 +186,8 @@ class Detector:
     def state_at(self, box: Box, first: Box) -> DetectorState:
         """The state if nothing is known but the boxes of the object in the last frame and in its first one."""
         context = self.settings.search.context
-        window = Window.of(box, context)
-        return DetectorState(0, "confident", window, window, Window.of(first, context))
+        window = Window.around(box, context)
+        return DetectorState(0, "confident", window, window, Window.around(first, context))
 
     def scm_state(self) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
         """Arrays and facts of the paper's first tracker, for `resume_scm`; none if it is not in use."""

@@ -61,8 +61,8 @@ class SparseCollaborativeModel:
         grey = _grey(image)
         template = self._cuts(grey, self._state[None])
         positives = self._cuts(grey, self._beside(_POSITIVES, 0.0, 0.02))
-        self._discriminative = _Discriminative.of(positives, self._background(grey))
-        self._generative = _Generative.of(template[0], int(rng.integers(2**31)))
+        self._discriminative = _Discriminative.trained(positives, self._background(grey))
+        self._generative = _Generative.from_template(template[0], int(rng.integers(2**31)))
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Arrays and facts that `resumed` goes on from."""
@@ -112,7 +112,7 @@ class SparseCollaborativeModel:
         self._state = states[best]
         self._frames += 1
         if self._frames % _EVERY == 0:
-            self._discriminative = _Discriminative.of(self._discriminative.positives, self._background(grey))
+            self._discriminative = _Discriminative.trained(self._discriminative.positives, self._background(grey))
             self._generative.update(cuts[best])
         return confidence / (1 + confidence), self._box
 
@@ -164,7 +164,7 @@ class _Discriminative:
         self._templates = templates[:, selected]
 
     @classmethod
-    def of(cls, positives: np.ndarray, negatives: np.ndarray) -> _Discriminative:
+    def trained(cls, positives: np.ndarray, negatives: np.ndarray) -> _Discriminative:
         """Learn which pixels tell them apart."""
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.linear_model import Lasso  # two seconds to import: only who starts with this model pays
@@ -200,7 +200,7 @@ class _Generative:
         self.atoms, self.first, self.histogram = atoms, first, histogram
 
     @classmethod
-    def of(cls, template: np.ndarray, seed: int) -> _Generative:
+    def from_template(cls, template: np.ndarray, seed: int) -> _Generative:
         """Learn the object's patches."""
         from sklearn.cluster import KMeans
         from sklearn.exceptions import ConvergenceWarning

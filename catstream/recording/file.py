@@ -93,7 +93,7 @@ class RecordingWriter:
         try:
             self._file = self.path.open("r+b" if continued else "wb" if resume else "xb", buffering=0)
         except FileExistsError:
-            raise RecordingError(f"{path} is there already: give another name, or remove it") from None
+            raise RecordingError(f"{path} exists already: give another name, or remove it") from None
         except OSError as error:
             raise RecordingError(
                 f"cannot record to {str(path)!r} ({error.strerror}): give a path that you may write to"
@@ -225,7 +225,7 @@ class Recording:
         SettingsError
             If this version of catstream does not know one of them.
         """
-        return Settings.of(self.run.settings)
+        return Settings.from_values(self.run.settings)
 
     def messages(self) -> Iterator[tuple[float, Recorded]]:
         """Each message in the order of recording, with its time in seconds since 1970."""

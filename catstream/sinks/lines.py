@@ -25,7 +25,7 @@ class LineSink(ABC):
     Raises
     ------
     OSError
-        From the constructor, if a new file is there already, or the file cannot be written.
+        From the constructor, if a new file exists already, or the file cannot be written.
     """
 
     #: The first line of a file, with its line end.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.messages import Position, Track
-from catstream.sinks.sink import STDOUT, Sink, check, discard, is_closed, is_there, open_sink, reader
+from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, is_closed, is_there, open_sink, reader
 from catstream.storage import is_writable
 from catstream.video import results
 from catstream.video.frames import RATE
@@ -45,7 +45,7 @@ class RunFiles:
     files: Sequence[Path] = ()
     rate: float = RATE
 
-    def check(self, *, overwrite: bool, resumable: bool, known: Sequence[Path] = ()) -> None:
+    def check_writable(self, *, overwrite: bool, resumable: bool, known: Sequence[Path] = ()) -> None:
         """Raise VideoError if one of the files cannot be written; to be called before the run starts.
 
         Parameters
@@ -62,18 +62,18 @@ class RunFiles:
                     f"cannot write results to {str(self.output)!r}: give a folder that exists or can be made, "
                     "and that you may write to"
                 )
-        there = [file.name for file in self._results() if file.exists()]
-        if there and not overwrite and self.output not in known:
+        existing = [file.name for file in self._results() if file.exists()]
+        if existing and not overwrite and self.output not in known:
             raise VideoError(
-                f"results of {self.name!r} are in {str(self.output)!r} already ({', '.join(there)}): "
+                f"results of {self.name!r} are in {str(self.output)!r} already ({', '.join(existing)}): "
                 "replace them all with --overwrite, or give another folder"
             )
         for count, file in enumerate(self.files):
             if file in self.files[:count]:
                 raise VideoError(f"{file} is named twice: give each file once")
-            check(file, there=True)
+            check_writable(file, may_exist=True)
             if is_there(file) and not overwrite and file not in known:
-                raise VideoError(f"{file} is there already: replace it with --overwrite, or give another name")
+                raise VideoError(f"{file} exists already: replace it with --overwrite, or give another name")
         files = [file for file in self.files if file != STDOUT]
         if resumable and self.output is None and files and not any(map(reader, files)):
             raise VideoError(
@@ -92,7 +92,7 @@ class RunFiles:
         if self.output is None and not any(map(reader, self.files)):
             return None
         earlier = self._earlier()
-        frames = min((held for held, _ in earlier), default=0)
+        frames = min((count for count, _ in earlier), default=0)
         boxes = [track.box for track in self._tracks(earlier, frames) if track.box is not None]
         return Position(frames, max(frames - 1, 0), boxes[-1] if boxes else None)
 
@@ -110,7 +110,7 @@ class RunFiles:
             If a file cannot be written; also later, from the function and at the end.
         """
         earlier = self._earlier() if resume else []
-        keep = min((held for held, _ in earlier), default=0) if resume else None
+        keep = min((count for count, _ in earlier), default=0) if resume else None
         rows: list[ResultsWriter] = []
         sinks: list[Sink] = []
         restarted: list[Callable[[Track], None]] = []  # write to the files that start at the first frame again
@@ -155,8 +155,8 @@ class RunFiles:
         """Return the number of frames in each existing file that holds all tracks, and the function that reads them."""
         found: list[tuple[int, Callable[[], Iterator[Track]]]] = []
         if self.output is not None and (self.output / results.table_file(self.name)).exists():
-            held = results.complete_frames(self.output, self.name)
-            found.append((held, partial(results.read_tracks, self.output, self.name)))
+            count = results.complete_frames(self.output, self.name)
+            found.append((count, partial(results.read_tracks, self.output, self.name)))
         for file in self.files:
             read = reader(file)
             if read is not None and is_there(file):

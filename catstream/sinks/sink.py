@@ -28,7 +28,7 @@ from catstream.storage import is_writable
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 
-__all__ = ["STDOUT", "SUFFIXES", "Sink", "check", "discard", "is_closed", "is_there", "open_sink", "reader"]
+__all__ = ["STDOUT", "SUFFIXES", "Sink", "check_writable", "discard", "is_closed", "is_there", "open_sink", "reader"]
 
 #: Stands for standard output in place of a file.
 STDOUT = Path("-")
@@ -69,19 +69,19 @@ _FORMATS = {
 SUFFIXES = (*_FORMATS, ".mp4")
 
 
-def check(path: Path, *, there: bool = False) -> None:
+def check_writable(path: Path, *, may_exist: bool = False) -> None:
     """Raise VideoError if a sink cannot be opened.
 
     Parameters
     ----------
-    there : whether the file may exist already
+    may_exist : whether the file may exist already
     """
     if path == STDOUT:
         return
     if path.suffix not in SUFFIXES:
         raise VideoError(f"{path}: the name of a file for tracks ends with {', '.join(SUFFIXES)}, or is - for stdout")
-    if not there and is_there(path):
-        raise VideoError(f"{path} is there already: give another name, or remove it")
+    if not may_exist and is_there(path):
+        raise VideoError(f"{path} exists already: give another name, or remove it")
     if path.suffix == ".parquet":
         require_extra("parquet")
     if path.is_dir() or not is_writable(path.parent):
@@ -124,7 +124,7 @@ def open_sink(
     VideoError
         If a new file exists already or cannot be written, its suffix is unknown, or the source cannot be read.
     """
-    check(path, there=keep is not None)
+    check_writable(path, may_exist=keep is not None)
     if path == STDOUT:
         return StdoutSink(path)
     if path.suffix == ".mp4":

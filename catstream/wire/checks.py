@@ -16,7 +16,7 @@ from catstream.box import Box, Window
 from catstream.errors import ProtocolError
 from catstream.schema import LARGEST_INTEGER, Array, Bytes, Field, Named, OnlyWith, Whole, fields
 
-__all__ = ["check"]
+__all__ = ["check_message"]
 
 #: The length that each letter of a shape stands for, in one message.
 _Lengths = dict[str, int]
@@ -24,7 +24,7 @@ _Lengths = dict[str, int]
 _Check = Callable[[Any, _Lengths], object]
 
 
-def check(message: object) -> _Lengths:
+def check_message(message: object) -> _Lengths:
     """Check every field of a message.
 
     Types are not checked, except for dtypes: the codec checks them in messages from outside.
@@ -72,7 +72,7 @@ def _check_of(field: Field, where: str) -> _Check | None:
         whole = _whole(where, 0)
         return lambda values, lengths: [whole(value, lengths) for value in values]
     if field.is_message:
-        return lambda message, _: check(message)
+        return lambda message, _: check_message(message)
     if array := field.limit(Array):
         return _array(array, where)
     if limits := field.limit(Bytes):

@@ -37,7 +37,7 @@ from catstream.messages import (
     Track,
 )
 from catstream.schema import LONGEST_LIST, LONGEST_TEXT
-from catstream.wire.checks import check
+from catstream.wire.checks import check_message
 
 __all__ = ["KINDS", "VERSION", "decode", "decode_json", "encode", "encode_json", "opening"]
 
@@ -59,7 +59,7 @@ def encode(message: object) -> bytes:
     ProtocolError
         If it breaks its schema: it would be rejected on arrival.
     """
-    check(message)
+    check_message(message)
     return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
 
 
@@ -102,7 +102,7 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
         message: Any = msgspec.convert(fields, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
         raise ProtocolError(f"{name}: {error}", "type") from None
-    check(message)
+    check_message(message)
     return message
 
 
@@ -119,7 +119,7 @@ def encode_json(message: object) -> bytes:
     ProtocolError
         If a field is outside of its limits.
     """
-    check(message)
+    check_message(message)
     return msgspec.json.encode(message)
 
 
@@ -137,7 +137,7 @@ def decode_json(data: bytes, kind: type) -> Any:
         raise ProtocolError(
             f"expected {kind.__name__.lower()} in JSON, got {len(data)} bytes: {error}", "json"
         ) from None
-    check(message)
+    check_message(message)
     return message
 
 

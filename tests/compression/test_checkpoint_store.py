@@ -25,7 +25,7 @@ def grow(rng):
     def take(compressor, count=1):
         for seq in range(compressor.seq + 1, compressor.seq + count + 1):
             rows, labels = rng.normal(size=(4, 9)).astype(np.float32), np.float32([1, 0, 0, 0.5])
-            training = {group: TrainingRows.of(rows, labels) for group in GROUPS}
+            training = {group: TrainingRows.labelled(rows, labels) for group in GROUPS}
             compressor.take(Features(seq, seq - 1, 0.0, None, training))
         return compressor
 

@@ -37,7 +37,10 @@ def messages(rng) -> Iterator[Features]:
             labels = np.array([1, 1, 0, 0, 0, 0.5], np.float32)
             weights = np.array([4, 4, 1, 1, 1, 1], np.float32)
             box = Box(frame, 10, 20, 30) if frame % 5 else None
-            training = {APPEARANCE: TrainingRows(rows, labels, weights), EXTENT: TrainingRows.of(rows[:3], labels[:3])}
+            training = {
+                APPEARANCE: TrainingRows(rows, labels, weights),
+                EXTENT: TrainingRows.labelled(rows[:3], labels[:3]),
+            }
             yield Features(frame + 1, frame, frame / 25, box, training)
 
     return stream()
@@ -119,7 +122,9 @@ def test_rows_of_another_length_are_refused_and_nothing_is_stored(settings, mess
     compressor.take(first)
     before = compressor.counters()
     with pytest.raises(ProtocolError, match="same settings"):
-        compressor.take(dataclasses.replace(second, training={EXTENT: TrainingRows.of(np.ones((3, WIDTH - 1)), 1)}))
+        compressor.take(
+            dataclasses.replace(second, training={EXTENT: TrainingRows.labelled(np.ones((3, WIDTH - 1)), 1)})
+        )
     assert compressor.counters() == before
     compressor.take(second)
 
@@ -185,7 +190,7 @@ def test_the_last_sample_can_be_had_again_though_the_trees_have_grown(settings, 
 @pytest.mark.parametrize("moving", [False, True])
 def test_the_detector_state_of_the_last_message_is_kept_bit_for_bit(settings, messages, moving, rng, tmp_path):
     motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
-    detector = DetectorState(7, "lost", *(Window(*rng.random(4)) for _ in range(3)), False, rng.random())
+    detector = DetectorState(7, "lost", *(Window(*rng.random(4)) for _ in range(3)), False, 2)
     if moving:
         detector = dataclasses.replace(detector, motion=motion, centre=centre, colour_centroid=rng.random(6))
     compressor = Compressor(settings)

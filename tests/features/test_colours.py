@@ -8,7 +8,7 @@ from catstream.features import colours
 from catstream.features.colours import SHADES
 
 
-def of(image, row=0, column=0):
+def colour_features(image, row=0, column=0):
     features = np.empty(SHADES, np.float32)
     colours.histogram(colours.shades(image), row, column, features)
     return features
@@ -25,7 +25,7 @@ def test_a_shade_is_the_lab_colour_in_levels(rng):
 def test_a_histogram_is_the_root_of_shares_in_the_middle_6_by_6_cells():
     image = np.zeros((64, 64, 3), np.uint8)
     image[8:56, 8:20] = 255  # a quarter of the middle
-    features = of(image)
+    features = colour_features(image)
     assert sorted(features[features > 0]) == pytest.approx([3 * np.sqrt(0.25), 3 * np.sqrt(0.75)])
 
 
@@ -34,7 +34,7 @@ def test_where_a_colour_is_makes_no_difference_and_the_edge_none_at_all(rng):
     turned = image.copy()
     turned[8:56, 8:56] = np.rot90(image[8:56, 8:56])
     turned[:8] = 0
-    np.testing.assert_array_equal(of(image), of(turned))
+    np.testing.assert_array_equal(colour_features(image), colour_features(turned))
 
 
 @pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 255, 255)])
@@ -50,5 +50,5 @@ def test_scores_are_added_for_each_window(rng, writeable):
     weights.flags.writeable = writeable
     scores = np.full((5, 9), 7, np.float32)
     colours.add_scores(colours.shades(image), weights, scores)
-    expected = [[7 + of(image, row, column) @ weights for column in range(9)] for row in range(5)]
+    expected = [[7 + colour_features(image, row, column) @ weights for column in range(9)] for row in range(5)]
     np.testing.assert_allclose(scores, expected, atol=1e-4)

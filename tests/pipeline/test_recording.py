@@ -33,7 +33,7 @@ def test_no_features_are_missing_and_every_model_comes_out_again_whatever_dies(v
 def test_a_recording_that_is_there_is_not_written_over(video, tmp_path):
     path, boxes = video
     (tmp_path / "run.rec").write_text("dear to somebody")
-    with pytest.raises(RecordingError, match="is there already"):
+    with pytest.raises(RecordingError, match="exists already"):
         Pipeline(path, boxes[0], record=tmp_path / "run.rec")
 
 

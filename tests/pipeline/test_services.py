@@ -164,7 +164,7 @@ def check_for_a_minute(supervisor, turn=lambda: None):
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         turn()
-        supervisor.check()
+        supervisor.check_children()
         time.sleep(0.01)
 
 

@@ -39,7 +39,7 @@ def written(tmp_path):
     """Writes messages to a file, and says where that is."""
 
     def record(messages, settings=SETTINGS, **options):
-        with RecordingWriter(tmp_path / "run.rec", Run.of(settings.portable()), **options) as writer:
+        with RecordingWriter(tmp_path / "run.rec", Run.from_settings(settings.portable()), **options) as writer:
             for message in messages:
                 writer.write(message)
         return tmp_path / "run.rec"

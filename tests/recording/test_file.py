@@ -84,7 +84,7 @@ def test_a_file_that_was_cut_before_the_end_of_its_settings_is_no_recording(writ
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_changed_bit_invalidates_its_own_message_only(tmp_path_factory, share, bit):
     path = tmp_path_factory.mktemp("changed") / "run.rec"
-    with RecordingWriter(path, Run.of(Settings().portable())) as writer:
+    with RecordingWriter(path, Run.from_settings(Settings().portable())) as writer:
         for seq in range(1, 10):
             writer.write(track(seq))
     content, (run, *places) = bytearray(path.read_bytes()), [row[:2] for row in Recording(path).index]
@@ -192,7 +192,7 @@ def test_what_is_missing_is_counted_at_the_begin_between_and_at_the_end(written)
 
 def test_a_full_disk_is_an_error_and_leaves_the_file_whole(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with RecordingWriter(tmp_path / "full.rec", Run.of(Settings().portable())) as writer:
+    with RecordingWriter(tmp_path / "full.rec", Run.from_settings(Settings().portable())) as writer:
         size = writer.path.stat().st_size
         resource.setrlimit(resource.RLIMIT_FSIZE, (size + 100, hard))
         try:
@@ -206,7 +206,7 @@ def test_a_full_disk_is_an_error_and_leaves_the_file_whole(tmp_path):
 
 def test_a_file_that_is_there_is_kept(written):
     path = written([track(1)])
-    with pytest.raises(RecordingError, match="is there already"):
+    with pytest.raises(RecordingError, match="exists already"):
         written([])
     with pytest.raises(RecordingError, match="other settings"):
         written([], Settings(coreset={"size": 99}), resume=True)
@@ -235,4 +235,4 @@ def test_what_is_no_recording_is_refused(tmp_path):
     with pytest.raises(RecordingError, match="No such file"):
         Recording(tmp_path / "none.rec")
     with pytest.raises(RecordingError, match="give a path that you may write to"):
-        RecordingWriter(tmp_path / "none" / "run.rec", Run.of(Settings().portable()))
+        RecordingWriter(tmp_path / "none" / "run.rec", Run.from_settings(Settings().portable()))

@@ -29,12 +29,12 @@ def files(tmp_path):
     """The files of a run over a short video, in all formats."""
     source, _ = write(tmp_path, 12, (320, 240))
 
-    def of(folder, names=NAMES, output=True):
+    def make(folder, names=NAMES, output=True):
         (tmp_path / folder).mkdir(exist_ok=True)
         results = tmp_path / folder / "out" if output else None
         return RunFiles("demo", str(source), ALL_FRAMES, results, output, [tmp_path / folder / name for name in names])
 
-    return of
+    return make
 
 
 def fill(files, first, last, resume=False):
@@ -93,14 +93,14 @@ def test_results_that_are_there_are_refused_and_replaced_together_if_that_is_ask
         (files("run", ["t.csv"], False), "t.csv.*--over"),
     ):
         with pytest.raises(VideoError, match=words):
-            again.check(overwrite=False, resumable=False)
+            again.check_writable(overwrite=False, resumable=False)
     without_video = RunFiles("demo", earlier.source, ALL_FRAMES, earlier.output, False, earlier.files)
-    without_video.check(overwrite=True, resumable=False)
+    without_video.check_writable(overwrite=True, resumable=False)
     fill(without_video, 0, 3)
     assert len(earlier.files[0].read_text().splitlines()) == 4
     assert not (earlier.output / "demo.mp4").exists(), "a video of other results would lie beside them"
     other = RunFiles("street", earlier.source, ALL_FRAMES, earlier.output)
-    other.check(overwrite=False, resumable=False)
+    other.check_writable(overwrite=False, resumable=False)
     fill(other, 0, 5)
     assert len((tmp_path / "run" / "out" / "demo.csv").read_text().splitlines()) == 4, "each source has its own table"
 
@@ -116,20 +116,20 @@ def test_results_that_are_there_are_refused_and_replaced_together_if_that_is_ask
 )
 def test_what_cannot_be_written_is_refused_before_the_run(files, names, resumable, words):
     with pytest.raises(VideoError, match=words):
-        files("run", names, output=False).check(overwrite=False, resumable=resumable)
+        files("run", names, output=False).check_writable(overwrite=False, resumable=resumable)
 
 
 def test_a_file_of_somebody_else_is_not_gone_on_with(files):
     run = files("run", ["t.csv"], output=False)
     with closing(open_sink(run.files[0])) as other:
         other.write(track(0))
-    with pytest.raises(VideoError, match="there already"):
-        run.check(overwrite=False, resumable=True)
-    run.check(overwrite=False, resumable=True, known=run.files)
+    with pytest.raises(VideoError, match="exists already"):
+        run.check_writable(overwrite=False, resumable=True)
+    run.check_writable(overwrite=False, resumable=True, known=run.files)
 
 
 def test_standard_output_has_a_line_of_json_for_each_track(files, capsys):
     run = RunFiles("demo", files("run").source, ALL_FRAMES, files=[STDOUT])
-    run.check(overwrite=False, resumable=True)
+    run.check_writable(overwrite=False, resumable=True)
     fill(run, 0, 5)
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [track(k).to_dict() for k in range(5)]

@@ -171,7 +171,7 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
 def test_a_file_that_is_there_is_kept(tmp_path, suffix):
     path = tmp_path / f"tracks{suffix}"
     path.write_text("dear to somebody")
-    with pytest.raises(VideoError, match="is there already"):
+    with pytest.raises(VideoError, match="exists already"):
         open_sink(path, "0")
     assert path.read_text() == "dear to somebody"
 

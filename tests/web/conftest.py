@@ -31,7 +31,7 @@ class Facts:
     def features(frame, wrong):
         """Of one row, about which the model of above is so wrong."""
         rows = np.full((1, 2), 0.5 + wrong / 2, np.float32)
-        return Features(frame + 1, frame, frame / 10, None, {"appearance": TrainingRows.of(rows, 1)})
+        return Features(frame + 1, frame, frame / 10, None, {"appearance": TrainingRows.labelled(rows, 1)})
 
     @staticmethod
     def preview(frame):

@@ -38,7 +38,7 @@ PUBLISHED = [name for name, channel in CHANNELS.items() if not channel.acknowled
 
 
 def features(seq, width=5, rows=3):
-    return Features(seq, seq, 0.0, None, {"appearance": TrainingRows.of(np.ones((rows, width)), 1)})
+    return Features(seq, seq, 0.0, None, {"appearance": TrainingRows.labelled(np.ones((rows, width)), 1)})
 
 
 def changed(message, **fields):
@@ -101,7 +101,7 @@ def test_an_invalid_message_is_counted_by_its_reason_and_does_not_affect_the_leg
 ):
     compressor, before, taken = Compressor(Settings(coreset={"size": 2})), rejected(reason), []
     with (
-        Receiver(FEATURES, endpoint, Position(), WINDOW, check=compressor.check) as receiver,
+        Receiver(FEATURES, endpoint, Position(), WINDOW, check=compressor.check_features) as receiver,
         Sender(FEATURES, endpoint, WINDOW) as sender,
     ):
 

@@ -29,7 +29,7 @@ def model(version):
 
 def features(seq):
     rows = np.full((2, 5), seq, np.float32)
-    return Features(seq, seq - 1, 0.0, None, {"appearance": TrainingRows.of(rows, 0, seq)})
+    return Features(seq, seq - 1, 0.0, None, {"appearance": TrainingRows.labelled(rows, 0, seq)})
 
 
 @pytest.fixture

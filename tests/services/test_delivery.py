@@ -1,11 +1,11 @@
-"""Laws of the farewell: nothing is given up while nobody asked, and nothing is waited for in vain."""
+"""Laws of delivery: a message is given up only after the process was asked to end and its patience is over."""
 
 from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.services.farewell import Step, next_step
+from catstream.services.delivery import Step, next_step
 
 seconds = st.floats(0, 100)
 
