@@ -6,13 +6,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.box import Box
+from catstream.box import Box, Window
 from catstream.messages import DetectorState, Model, Position
 from catstream.services.desired import DesiredState
 from catstream.services.resume import agree, start
 
 BOX = Box(1.0, 2.0, 30.0, 40.0)
-STATE = DetectorState("present", BOX, BOX, BOX, 0.0, False)
+STATE = DetectorState(0, "confident", *3 * (Window(*BOX),))
 
 seqs = st.integers(0, 50)
 versions = st.integers(0, 9)
