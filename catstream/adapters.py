@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from catstream.extras import require_extra
 from catstream.messages import Track
 
+if TYPE_CHECKING:
+    from supervision import Detections
+
 __all__ = ["to_supervision"]
 
 
-def to_supervision(track: Track) -> Any:
+def to_supervision(track: Track) -> Detections:
     """Convert a track to `supervision.Detections`: one detection, or none if the object is absent.
 
     The detection has the corners of the box, the score, clipped to 0 to 1, as its confidence, class 0, tracker 1, and

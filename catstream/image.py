@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from catstream.errors import FrameError
@@ -15,7 +13,7 @@ _HALF_STEP = 0.5 / 255  # interpolation may exceed the range from 0 to 1 by this
 _EXPECTED = "a frame is a numpy array (h, w, 3), blue green red, or (h, w) grey, of uint8, uint16 or float from 0 to 1"
 
 
-def as_bgr(image: Any) -> np.ndarray:
+def as_bgr(image: object) -> np.ndarray:
     """Return an image as a writable, contiguous uint8 array (h, w, 3), blue green red; no copy is made if it is one.
 
     Parameters
@@ -40,7 +38,7 @@ def as_bgr(image: Any) -> np.ndarray:
     return np.require(pixels, requirements=["C", "W"])
 
 
-def _validated(image: Any) -> np.ndarray:
+def _validated(image: object) -> np.ndarray:
     if image is None:
         raise FrameError(
             f"{_EXPECTED}, got None: a read has failed, as at the end of a video; check what it returns first"

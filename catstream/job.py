@@ -15,6 +15,7 @@ from catstream import storage
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.settings import Settings
+from catstream.storage import Facts
 
 __all__ = ["Job", "Results"]
 
@@ -40,7 +41,7 @@ class Results:
     save_model: Path | None = None
 
     @classmethod
-    def from_json(cls, facts: dict[str, Any]) -> Results:
+    def from_json(cls, facts: Facts) -> Results:
         """The value that `asdict` and JSON made these facts of."""
         write = tuple(Path(file) for file in facts["write"])
         return cls(_path(facts["output"]), bool(facts["video"]), write, _path(facts["save_model"]))
@@ -123,7 +124,7 @@ class Job:
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
             raise ServiceError(f"no pipeline was kept in {str(path)!r}: start one with --state {path}")
-        facts: dict[str, Any] = storage.read(file)[1]
+        facts = storage.read(file)[1]
         try:
             read = {name: _READERS[name](facts[name]) for name in _READERS}
             return cls(**(facts | read))

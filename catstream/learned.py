@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import Model, Sample
 from catstream.packing import pack, unpack
+from catstream.storage import Arrays, Facts
 from catstream.wire.checks import check_message
 
 __all__ = ["Learned"]
@@ -47,7 +48,7 @@ class Learned:
         """
         sample_arrays, sample_facts = pack(self.sample, "sample")
         model_arrays, model_facts = pack(self.model, "model")
-        facts: dict[str, object] = {"kind": _KIND, "box": list(self.box), "sample": sample_facts, "model": model_facts}
+        facts: Facts = {"kind": _KIND, "box": list(self.box), "sample": sample_facts, "model": model_facts}
         try:
             storage.write(path, sample_arrays | model_arrays, facts)
         except OSError as error:
@@ -81,7 +82,7 @@ class Learned:
         return learned
 
     @classmethod
-    def _of(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Self:
+    def _of(cls, arrays: Arrays, facts: Facts) -> Self:
         sample = unpack(Sample, arrays, facts["sample"], "sample")
         model = unpack(Model, arrays, facts["model"], "model")
         return cls(replace(model, frame=0), replace(sample, frame=0), Box(*map(float, facts["box"])))

@@ -9,14 +9,14 @@ import numpy as np
 
 from catstream.box import Box, Window
 from catstream.schema import Array, Field, fields
+from catstream.storage import Arrays, Facts
 
 __all__ = ["pack", "unpack"]
 
 Message = TypeVar("Message")
-Arrays = dict[str, np.ndarray]
 
 
-def pack(message: object, name: str) -> tuple[Arrays, dict[str, Any]]:
+def pack(message: object, name: str) -> tuple[Arrays, Facts]:
     """Arrays, their names beginning with `name`, and facts for JSON.
 
     Examples
@@ -36,7 +36,7 @@ def pack(message: object, name: str) -> tuple[Arrays, dict[str, Any]]:
     return arrays, {name: fact for name, fact in facts.items() if fact is not None}
 
 
-def unpack(kind: type[Message], arrays: Arrays, facts: dict[str, Any], name: str) -> Message:
+def unpack(kind: type[Message], arrays: Arrays, facts: Facts, name: str) -> Message:
     """The message that `pack` took, bit for bit.
 
     Its limits are not checked: `catstream.wire.checks` does that.
@@ -52,7 +52,7 @@ def unpack(kind: type[Message], arrays: Arrays, facts: dict[str, Any], name: str
     return kind(**values)
 
 
-def _pack(value: Any, name: str, arrays: Arrays) -> Any:
+def _pack(value: object, name: str, arrays: Arrays) -> object:
     """The fact that stands for a value, None if there is none; its arrays are added to `arrays`."""
     if isinstance(value, np.ndarray):
         arrays[name] = value
@@ -66,7 +66,7 @@ def _pack(value: Any, name: str, arrays: Arrays) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _unpack(field: Field, fact: Any, name: str, arrays: Arrays) -> Any:
+def _unpack(field: Field, fact: Any, name: str, arrays: Arrays) -> object:
     if field.limit(Array) is not None:
         return arrays.get(name) if field.optional else arrays[name]
     if fact is None and field.optional:

@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
@@ -123,7 +123,7 @@ class Pipeline:
         self,
         source: str | None = None,
         box: str | Iterable[float] | None = None,
-        settings: Settings | Mapping[str, Any] | None = None,
+        settings: Settings | Mapping[str, object] | None = None,
         *,
         model: str | os.PathLike[str] | None = None,
         part: slice = ALL_FRAMES,

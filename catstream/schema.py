@@ -108,7 +108,7 @@ class Field:
     name: str
     type: Any
     optional: bool
-    limits: tuple[Any, ...]
+    limits: tuple[object, ...]
     values: Field | None = None
 
     @property
@@ -133,7 +133,7 @@ def _fields(kind: type) -> tuple[Field, ...]:
 
 
 def _field(name: str, hint: Any) -> Field:
-    limits: tuple[Any, ...] = ()
+    limits: tuple[object, ...] = ()
     optional = False
     while True:
         if get_origin(hint) is Annotated:

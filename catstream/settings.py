@@ -35,21 +35,26 @@ __all__ = [
     "SearchSettings",
     "Settings",
     "TeachingSettings",
+    "Value",
     "describe",
 ]
 
+#: The value of a setting.
+Value = str | int | float | bool
+
 
 def _about(description: str, **bounds: float) -> Meta:
-    meta: Meta = Meta(description=description, **bounds)  # type: ignore[call-overload]
+    meta: Meta = Meta(description=description, **bounds)  # type: ignore[call-overload]  # its overloads name the bounds
     return meta
 
 
+@dataclass(frozen=True, kw_only=True)
 class _Group:
     """A group of settings: it checks the names and the values that it is made of."""
 
     group: ClassVar[str]
 
-    def __new__(cls, *unnamed: Any, **values: Any) -> Self:
+    def __new__(cls, *unnamed: object, **values: object) -> Self:
         if unnamed:
             raise SettingsError(f"settings are given by name, got {unnamed[0]!r}: for example {cls.__name__}(name=1)")
         for name in values:
@@ -57,8 +62,8 @@ class _Group:
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:  # type: ignore[attr-defined]
-            object.__setattr__(self, name, _checked(f"{self.group}.{name}", getattr(self, name)))
+        for each in dataclasses.fields(self):
+            object.__setattr__(self, each.name, _checked(f"{self.group}.{each.name}", getattr(self, each.name)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,7 +302,7 @@ class Settings:
     teaching: TeachingSettings = field(default_factory=TeachingSettings)
     extent: ExtentSettings = field(default_factory=ExtentSettings)
 
-    def __new__(cls, *unnamed: Any, **groups: Any) -> Self:
+    def __new__(cls, *unnamed: object, **groups: object) -> Self:
         if unnamed:
             raise SettingsError(
                 f"settings are given by name, got {unnamed[0]!r}: for example Settings(coreset={{'size': 128}})"
@@ -324,7 +329,7 @@ class Settings:
         *,
         preset: str | None = None,
         file: str | os.PathLike[str] | None = None,
-        overrides: Mapping[str, Any] | Iterable[str] = (),
+        overrides: Mapping[str, object] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> Settings:
         """Collect settings from all their sources: those that `given` finds, the others by default.
@@ -342,9 +347,9 @@ class Settings:
         *,
         preset: str | None = None,
         file: str | os.PathLike[str] | None = None,
-        overrides: Mapping[str, Any] | Iterable[str] = (),
+        overrides: Mapping[str, object] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
-    ) -> dict[str, Any]:
+    ) -> dict[str, object]:
         """Names and values that are set in some source, as `from_values` and `but` check them.
 
         Parameters
@@ -363,7 +368,7 @@ class Settings:
         SettingsError
             For a preset that does not exist, or a file that cannot be read.
         """
-        values: dict[str, Any] = {}
+        values: dict[str, object] = {}
         if preset is not None:
             if preset not in PRESETS:
                 raise SettingsError(f"there is no preset {preset!r}: there are {', '.join(PRESETS)}")
@@ -376,7 +381,7 @@ class Settings:
         return values | _named(overrides)
 
     @classmethod
-    def from_values(cls, values: Mapping[str, Any]) -> Settings:
+    def from_values(cls, values: Mapping[str, object]) -> Settings:
         """Check names and values, flat (`coreset.size`) or in groups; texts are read as their setting's type.
 
         Examples
@@ -384,7 +389,7 @@ class Settings:
         >>> Settings.from_values({"coreset.share": ".5", "run": {"lockstep": True}}).changed()
         ['run.lockstep=true', 'coreset.share=0.5']
         """
-        groups: dict[str, dict[str, Any]] = {}
+        groups: dict[str, dict[str, object]] = {}
         for name, value in _flat(values).items():
             _check_name(name)
             group, _, short = name.partition(".")
@@ -414,7 +419,7 @@ class Settings:
             )
         return self.but({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
 
-    def but(self, others: Mapping[str, Any] | Iterable[str]) -> Settings:
+    def but(self, others: Mapping[str, object] | Iterable[str]) -> Settings:
         """A copy with some of them changed: names and values, or texts `group.name=value` as `--set` takes them.
 
         Examples
@@ -424,9 +429,10 @@ class Settings:
         """
         return Settings.from_values(self.values() | _flat(_named(others)))
 
-    def values(self) -> dict[str, Any]:
+    def values(self) -> dict[str, Value]:
         """All values, by full name."""
-        return _flat(dataclasses.asdict(self))
+        groups = dataclasses.asdict(self).items()
+        return {f"{group}.{name}": value for group, values in groups for name, value in values.items()}
 
     def changed(self) -> list[str]:
         """Those that differ from their default, as `load` takes them.
@@ -451,7 +457,7 @@ class Settings:
 
 _LOCAL = ("run.endpoint", "run.keys")
 
-_PAPER = {
+_PAPER: dict[str, Value] = {
     "teaching.classifier": "one-class",
     "search.mode": "full",
     "teaching.bootstrap": "scm",
@@ -465,14 +471,14 @@ _PAPER = {
 }
 
 #: Settings of the paper, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.
-PRESETS: dict[str, dict[str, Any]] = {
+PRESETS: dict[str, dict[str, Value]] = {
     "one-class-paper": _PAPER | {"teaching.copies": 4},
     "cat10": _PAPER | {"coreset.share": 0.10, "teaching.copies": 1},
     "cat25": _PAPER | {"coreset.share": 0.25, "teaching.copies": 0},
 }
 
 
-def describe() -> list[tuple[str, str, Any, str]]:
+def describe() -> list[tuple[str, str, Value, str]]:
     """Full name, type, default and meaning of every setting: for `--help` and the docs."""
     default = _defaults()
     return [(name, _takes(name), default[name], kind.__metadata__[0].description) for name, kind in _kinds().items()]
@@ -492,14 +498,14 @@ def _kinds() -> dict[str, Any]:
 
 
 @cache
-def _defaults() -> dict[str, Any]:
+def _defaults() -> dict[str, Value]:
     """Default of each setting, by its full name."""
     return Settings().values()
 
 
-def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+def _flat(values: Mapping[str, object]) -> dict[str, object]:
     """Values by full name, from values by full name or in groups."""
-    flat: dict[str, Any] = {}
+    flat: dict[str, object] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
             flat |= {f"{name}.{short}": each for short, each in value.items()}
@@ -534,10 +540,10 @@ def _nearest(name: str) -> list[str]:
     return similar or [full for full in _kinds() if full.partition(".")[2] == name]
 
 
-def _checked(name: str, value: Any) -> Any:
+def _checked(name: str, value: object) -> object:
     """The value of a setting, of its type; a number of numpy is one of Python."""
-    if isinstance(value, Number) and not isinstance(value, bool):
-        value = getattr(value, "item", lambda: value)()
+    if isinstance(value, Number) and hasattr(value, "item"):
+        value = value.item()
     try:
         checked = msgspec.convert(value, _kinds()[name])
     except msgspec.ValidationError:
@@ -547,7 +553,7 @@ def _checked(name: str, value: Any) -> Any:
     return checked
 
 
-def _read_text(name: str, text: str) -> Any:
+def _read_text(name: str, text: str) -> object:
     """The value that a text means, of the type of its setting."""
     kind = _kinds()[name].__origin__
     try:
@@ -558,11 +564,11 @@ def _read_text(name: str, text: str) -> Any:
         raise _misfit(name, text) from None
 
 
-def _misfit(name: str, value: Any) -> SettingsError:
+def _misfit(name: str, value: object) -> SettingsError:
     return SettingsError(f"setting {name} cannot be {reprlib.repr(value)}: it takes {_takes(name)}")
 
 
-def _named(given: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
+def _named(given: Mapping[str, object] | Iterable[str]) -> dict[str, object]:
     return dict(given if isinstance(given, Mapping) else map(_pair, given))
 
 
@@ -573,7 +579,7 @@ def _pair(text: str) -> tuple[str, str]:
     return name.strip(), value.strip()
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> dict[str, object]:
     try:
         with path.open("rb") as file:
             return tomllib.load(file)

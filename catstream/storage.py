@@ -10,12 +10,18 @@ import tempfile
 import time
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from catstream.errors import ProtocolError
 
-__all__ = ["is_locked", "is_writable", "lock", "read", "write", "write_atomically"]
+__all__ = ["Arrays", "Facts", "is_locked", "is_writable", "lock", "read", "write", "write_atomically"]
+
+#: Arrays by name.
+Arrays = dict[str, np.ndarray]
+#: JSON metadata by name. Code that reads a file checks the facts that it uses.
+Facts = dict[str, Any]
 
 _KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
 _VERSION = 1  # version of the metadata's format
@@ -86,9 +92,7 @@ def is_locked(handle: int) -> bool:
     return False
 
 
-def write(
-    path: str | os.PathLike[str], arrays: dict[str, np.ndarray], facts: dict[str, object], mode: int = 0o666
-) -> None:
+def write(path: str | os.PathLike[str], arrays: Arrays, facts: Facts, mode: int = 0o666) -> None:
     """Write arrays and JSON metadata (`facts`) to a file, atomically.
 
     Raises
@@ -103,7 +107,7 @@ def write(
     write_atomically(path, save(contiguous, metadata={_KEY: json.dumps(metadata, sort_keys=True)}), mode)
 
 
-def read(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+def read(path: str | os.PathLike[str]) -> tuple[Arrays, Facts]:
     """Return the arrays and the metadata of a file that `write` wrote.
 
     Raises
@@ -136,7 +140,7 @@ def _sync(folder: Path) -> None:
         os.close(handle)
 
 
-def _checksum(arrays: dict[str, np.ndarray], facts: dict[str, object]) -> int:
+def _checksum(arrays: Arrays, facts: Facts) -> int:
     """Return the CRC-32 of the metadata and of the arrays with their names, shapes and types."""
     check = zlib.crc32(json.dumps(facts, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):

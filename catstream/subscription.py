@@ -23,7 +23,7 @@ from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.newest import Subscriber
 from catstream.wire.readable import readable
 
-__all__ = ["GapCounter", "Subscription", "subscribe", "wait_until_running"]
+__all__ = ["AnyMessage", "GapCounter", "Subscription", "subscribe", "wait_until_running"]
 
 #: Seconds to wait for messages after the end was received; it arrives on a connection of its own and may overtake them.
 _DRAIN_SECONDS = 0.5
@@ -40,7 +40,9 @@ _SUBSCRIBABLE = {
     "features": "training",
 }
 
-Message = TypeVar("Message", bound=Track | Model | Health | Sample | Features | Preview)
+#: A message of any channel that can be subscribed to.
+AnyMessage = Track | Model | Health | Sample | Features | Preview
+Message = TypeVar("Message", bound=AnyMessage)
 
 
 class GapCounter:

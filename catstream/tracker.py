@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from catstream.image import as_bgr
 from catstream.messages import Features, Model, Track
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
+from catstream.storage import Arrays, Facts
 from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 from catstream.wire.checks import check_message
@@ -60,7 +61,7 @@ class Tracker:
     (True, True)
     """
 
-    def __init__(self, settings: Settings | Mapping[str, Any] | None = None) -> None:
+    def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
         self._track: Track | None = None
 
@@ -149,7 +150,7 @@ class Tracker:
         arrays, facts = self.compressor.state()
         model, model_facts = pack(self.detector.model, "model")
         start, start_facts = self.detector.scm_state()
-        told: dict[str, object] = {
+        told: Facts = {
             "kind": _KIND,
             "program": version("catstream"),
             "settings": self.settings.texts(),
@@ -186,7 +187,7 @@ class Tracker:
             raise ProtocolError(f"{path} is not a saved tracker ({error}): `Tracker.save` writes one") from None
 
     @classmethod
-    def _of(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> Self:
+    def _of(cls, arrays: Arrays, facts: Facts) -> Self:
         self = cls(Settings.from_values(facts["settings"]))
         self.compressor = Compressor.from_state(arrays, facts["compressor"], self.settings)
         self.trainer, self.detector = Trainer(self.settings), Detector(self.settings)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import click
 
@@ -30,7 +30,7 @@ def with_object(command: _Command) -> _Command:
     @click.option("--box", metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
     @with_model
     @wraps(command)
-    def wrapped(box: str | None, model: Path | None, **options: Any) -> None:
+    def wrapped(box: str | None, model: Path | None, **options: object) -> None:
         if box is not None and model is not None:
             raise click.UsageError("--box says where the object is, with --model it is searched for: give one of them")
         command(box=Box.parse(box) if box is not None else None, model=model, **options)
@@ -45,7 +45,7 @@ def with_part(command: _Command) -> _Command:
     @click.option("--end", type=click.IntRange(0), metavar="N", help="The frame to stop before.")
     @click.option("--stride", type=click.IntRange(1), metavar="N", help="Follow each N-th frame only.")
     @wraps(command)
-    def wrapped(start: int | None, end: int | None, stride: int | None, **options: Any) -> None:
+    def wrapped(start: int | None, end: int | None, stride: int | None, **options: object) -> None:
         command(part=slice(start, end, stride), **options)
 
     return cast(_Command, wrapped)
@@ -58,7 +58,7 @@ def with_given(command: _Command) -> _Command:
     @click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings.")
     @click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="One setting; may be repeated.")
     @wraps(command)
-    def wrapped(file: Path | None, preset: str | None, pairs: tuple[str, ...], **options: Any) -> None:
+    def wrapped(file: Path | None, preset: str | None, pairs: tuple[str, ...], **options: object) -> None:
         command(given=Settings.given(preset=preset, file=file, overrides=pairs), **options)
 
     return cast(_Command, wrapped)
@@ -70,7 +70,7 @@ def with_reading(command: _Command) -> _Command:
     @click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default.")
     @click.option("--skip-damaged", is_flag=True, help="Go on after a damaged place in a video file.")
     @wraps(command)
-    def wrapped(given: dict[str, Any], fps: float | None, skip_damaged: bool, **options: Any) -> None:
+    def wrapped(given: dict[str, object], fps: float | None, skip_damaged: bool, **options: object) -> None:
         rate = {} if fps is None else {"run.image_rate": fps}
         command(given=given | rate | ({"run.skip_damaged": True} if skip_damaged else {}), **options)
 
@@ -82,7 +82,7 @@ def with_settings(command: _Command) -> _Command:
 
     @with_given
     @wraps(command)
-    def wrapped(given: dict[str, Any], **options: Any) -> None:
+    def wrapped(given: dict[str, object], **options: object) -> None:
         command(settings=Settings.from_values(given), **options)
 
     return cast(_Command, wrapped)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import click
 from rich.console import Console
@@ -13,7 +13,7 @@ from catstream.wire.endpoint import Endpoint
 
 __all__ = ["wait_for_pipeline", "with_endpoint", "with_wait"]
 
-_Command = TypeVar("_Command", bound=Callable[..., Any])
+_Command = TypeVar("_Command", bound=Callable[..., object])
 
 _ENDPOINT = click.option(
     "--endpoint", default="", metavar="PLACE", help="Endpoint of the pipeline; not needed if only one runs."

@@ -6,8 +6,9 @@ import json
 import re
 import signal
 import sys
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
@@ -227,7 +228,7 @@ def _streams(result: Result) -> Table:
     from catstream.loadtest.latencies import PERCENTILES
 
     heads = ("stream", "frames/s", "skipped", *PERCENTILES, "model p50", "p99", "lag", "not stored", "success")
-    rows: list[tuple[Any, ...]] = []
+    rows: list[tuple[object, ...]] = []
     for number, measures in enumerate(result.streams):
         stored = "-" if measures.sent is None or measures.stored is None else measures.sent - measures.stored
         rows.append(
@@ -245,7 +246,7 @@ def _streams(result: Result) -> Table:
     return _table(heads, rows)
 
 
-def _table(heads: tuple[str, ...], rows: list[tuple[Any, ...]]) -> Table:
+def _table(heads: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     for number, head in enumerate(heads):
         table.add_column(head, justify="right" if number else "left")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import click
 
@@ -35,7 +35,7 @@ class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since c
 
     name = "[HOST:]PORT"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Address:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Address:
         host, _, port = str(value).rpartition(":")
         if not (port.isascii() and port.isdigit() and int(port) <= _LARGEST_PORT):
             self.fail(f"expected [HOST:]PORT, for example 8000 or 0.0.0.0:8000, got {value!r}", param, ctx)
@@ -64,7 +64,7 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
             help="File with this token.",
         )
         @functools.wraps(command)
-        def with_one(*args: Any, token: str | None, token_file: Path | None, **others: Any) -> None:
+        def with_one(*args: object, token: str | None, token_file: Path | None, **others: object) -> None:
             command(*args, token=token or (_read(token_file) if token_file else None), **others)
 
         return with_one

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -64,7 +63,7 @@ def _with_pipeline(command: Callable[..., None]) -> Callable[..., None]:
     )
     @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
     @wraps(command)
-    def wrapped(endpoint: str, source: str, keys: str, timeout: float, yes: bool, **options: Any) -> None:
+    def wrapped(endpoint: str, source: str, keys: str, timeout: float, yes: bool, **options: object) -> None:
         if endpoint and source:
             raise click.UsageError("--endpoint and --source both select the pipeline: give one of them")
         command(target=_Target(endpoint, source, keys, timeout, yes), **options)
@@ -77,7 +76,7 @@ def _with_control(command: Callable[..., str]) -> Callable[..., None]:
 
     @_with_pipeline
     @wraps(command)
-    def wrapped(target: _Target, **options: Any) -> None:
+    def wrapped(target: _Target, **options: object) -> None:
         with target.control() as pipeline:
             click.echo(command(pipeline, **options))
 

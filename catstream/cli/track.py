@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import click
 from rich.console import Console
@@ -58,7 +57,7 @@ _FOLDER = _FILE = click.Path(path_type=Path)
 @with_given
 @with_reading
 def track(
-    given: dict[str, Any],
+    given: dict[str, object],
     part: slice,
     source: str | None,
     box: Box | None,

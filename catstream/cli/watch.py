@@ -22,7 +22,7 @@ from catstream.box import Box
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.heads import APPEARANCE, GROUPS, HEADS
 from catstream.messages import Features, Health, Model, Preview, Sample, Track
-from catstream.subscription import Subscription, subscribe
+from catstream.subscription import AnyMessage, Subscription
 
 __all__ = ["watch"]
 
@@ -136,7 +136,7 @@ def watch(channel: str, endpoint: str, keys: str, wait: float, as_json: bool, co
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     seen = 0
-    with subscribe(endpoint, channel, keys=keys) as messages:  # type: ignore[call-overload]
+    with Subscription[AnyMessage](endpoint, channel, keys=keys) as messages:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(messages.endpoint, messages.keys, wait)
             if as_json:
@@ -154,11 +154,11 @@ def watch(channel: str, endpoint: str, keys: str, wait: float, as_json: bool, co
         click.echo(f"{seen} {channel}, {messages.losses()}{reason}", err=True)
 
 
-def _print_json(message: Any) -> None:
+def _print_json(message: object) -> None:
     click.echo(json.dumps(_plain(message)))
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """Return a message as a JSON value; an array or a picture is replaced by a description."""
     if isinstance(value, np.ndarray):
         norm = float(np.linalg.norm(np.nan_to_num(value)))
@@ -172,21 +172,21 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _print_line(channel: str, message: Any) -> None:
+def _print_line(channel: str, message: object) -> None:
     click.echo("  ".join(f"{name} {cell}" for name, cell in _CELLS[channel](message).items()))
 
 
 class _Screen:
     """A table of the newest messages, of health the newest of each process, drawn anew in a thread of its own."""
 
-    def __init__(self, channel: str, messages: Subscription[Any]) -> None:
+    def __init__(self, channel: str, messages: Subscription[AnyMessage]) -> None:
         self._cells, self._messages = _CELLS[channel], messages
         # Replaced, never changed: the thread reads them.
         self._rows: dict[object, dict[str, str]] = {}
         self._moments: tuple[float, ...] = ()
         self._live = Live(get_renderable=self._draw, refresh_per_second=_REFRESHES)
 
-    def add(self, message: Any) -> None:
+    def add(self, message: object) -> None:
         self._moments = (*self._recent(), time.monotonic())
         key = message.process if isinstance(message, Health) else object()
         rows = {**self._rows, key: self._cells(message)}

@@ -6,7 +6,6 @@ It is the only owner of the coreset trees: one for each head of `catstream.heads
 from __future__ import annotations
 
 import os
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from catstream.heads import HEADS, Head
 from catstream.messages import DetectorState, Features, Position, Sample, TrainingRows
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
+from catstream.storage import Arrays, Facts
 
 __all__ = ["Compressor"]
 
@@ -154,10 +154,10 @@ class Compressor:
         arrays, facts = self.state()
         storage.write(path, arrays, facts | {"kind": _KIND})
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def state(self) -> tuple[Arrays, Facts]:
         """Arrays and facts that `from_state` restores."""
-        arrays: dict[str, np.ndarray] = {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
-        facts: dict[str, Any] = {
+        arrays: Arrays = {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
+        facts: Facts = {
             "seq": self.seq,
             "frame": self.frame,
             "box": list(self.box) if self.box else None,
@@ -206,7 +206,7 @@ class Compressor:
         return self
 
     @classmethod
-    def from_state(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any], settings: Settings) -> Compressor:
+    def from_state(cls, arrays: Arrays, facts: Facts, settings: Settings) -> Compressor:
         """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
         self = cls(settings)
         self.seq, self.frame = int(facts["seq"]), int(facts["frame"])

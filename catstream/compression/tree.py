@@ -6,7 +6,7 @@ become a node one level up (paper, "Coreset Tree Implementation").
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from catstream.compression.node import Node
 from catstream.compression.reduce import energy, reduce
 from catstream.errors import ProtocolError
 from catstream.messages import Summary
+from catstream.storage import Arrays, Facts
 
 if TYPE_CHECKING:
     import os
@@ -170,7 +171,7 @@ class CoresetTree:
         """
         return cls.from_state(*storage.read(path))
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def state(self) -> tuple[Arrays, Facts]:
         """Arrays and facts that `from_state` restores."""
         arrays = {"pending": self.pending}
         for i, node in enumerate(self.nodes):
@@ -180,7 +181,7 @@ class CoresetTree:
         return arrays, {"size": self.size, "nodes": nodes}
 
     @classmethod
-    def from_state(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> CoresetTree:
+    def from_state(cls, arrays: Arrays, facts: Facts) -> CoresetTree:
         """The tree that `state` described; ProtocolError if it is something else."""
         try:
             tree = cls(int(facts["size"]))

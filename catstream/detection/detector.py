@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.messages import DetectorState, Features, Model, Track
 from catstream.settings import Settings
+from catstream.storage import Arrays, Facts
 
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel
@@ -189,11 +190,11 @@ class Detector:
         window = Window.around(box, context)
         return DetectorState(0, "confident", window, window, Window.around(first, context))
 
-    def scm_state(self) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
+    def scm_state(self) -> tuple[Arrays, Facts | None]:
         """Arrays and facts of the paper's first tracker, for `resume_scm`; none if it is not in use."""
         return ({}, None) if self._scm is None else self._scm.state()
 
-    def resume_scm(self, arrays: dict[str, np.ndarray], facts: dict[str, Any] | None) -> None:
+    def resume_scm(self, arrays: Arrays, facts: Facts | None) -> None:
         """Go on with the paper's first tracker, as another detector did; after `resume`."""
         if facts is not None:
             from catstream.paper.scm import SparseCollaborativeModel

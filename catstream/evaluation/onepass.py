@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,9 @@ __all__ = ["TRACKERS", "evaluate", "follow", "start_frames"]
 
 #: The trackers that can be evaluated.
 TRACKERS = ("catstream", *PEERS)
+
+#: A run that is to be made: tracker, settings, sequence and first frame.
+_Task = tuple[str, Settings, Sequence, int]
 
 
 def start_frames(sequence: Sequence, count: int) -> list[int]:
@@ -128,7 +130,7 @@ def evaluate(
     return [runs[name] for name in names if name in runs]
 
 
-def _run_all(tasks: list[Any], output: Path | None, jobs: int) -> Iterator[EvaluationRun | CatstreamError]:
+def _run_all(tasks: list[_Task], output: Path | None, jobs: int) -> Iterator[EvaluationRun | CatstreamError]:
     if jobs == 1:
         yield from (_follow_and_save(output, *task) for task in tasks)
         return

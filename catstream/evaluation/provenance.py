@@ -16,7 +16,6 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_info
 
@@ -29,7 +28,7 @@ _ROOT = Path(__file__).parents[2]
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
 
 
-def provenance(settings: Settings, words: Sequence[str] | None = None) -> dict[str, Any]:
+def provenance(settings: Settings, words: Sequence[str] | None = None) -> dict[str, object]:
     """Return the provenance of figures as a JSON object.
 
     Parameters
@@ -57,7 +56,7 @@ def provenance(settings: Settings, words: Sequence[str] | None = None) -> dict[s
     }
 
 
-def machine() -> dict[str, Any]:
+def machine() -> dict[str, object]:
     """Return the processor, the cores available to this process, the memory in GB, and versions of the libraries."""
     blas = {
         f"{pool['internal_api']} {pool['version']} {pool.get('architecture', '')}".strip()

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import fmean, pstdev
-from typing import Any
 
 from catstream.evaluation.provenance import provenance
 from catstream.evaluation.runs import EvaluationRun
@@ -62,7 +61,7 @@ def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
     }
 
 
-def to_json(rows: list[Row], settings: Settings) -> dict[str, Any]:
+def to_json(rows: list[Row], settings: Settings) -> dict[str, object]:
     """Return the JSON of `catstream evaluate --json`: rows, {tracker: {measure: mean}}, and provenance."""
     return {**provenance(settings), "sequences": [dataclasses.asdict(row) for row in rows], "mean": mean_of(rows)}
 

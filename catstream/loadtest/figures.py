@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from catstream.evaluation.provenance import provenance
 from catstream.loadtest.load_test import LoadTest
 from catstream.loadtest.measures import Measures
@@ -12,7 +10,7 @@ from catstream.loadtest.usage import summary
 __all__ = ["to_json"]
 
 
-def to_json(load_test: LoadTest) -> dict[str, Any]:
+def to_json(load_test: LoadTest) -> dict[str, object]:
     """Return the figures of the decisive run, those of the search steps, and the provenance.
 
     Units are seconds, bytes, and shares from 0 to 1.
@@ -67,7 +65,7 @@ def to_json(load_test: LoadTest) -> dict[str, Any]:
     }
 
 
-def _stream(measures: Measures, rate: float) -> dict[str, Any]:
+def _stream(measures: Measures, rate: float) -> dict[str, object]:
     return {
         "frames": measures.frames,
         "frames_per_second": measures.rate(rate),

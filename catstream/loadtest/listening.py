@@ -5,7 +5,7 @@ from __future__ import annotations
 import select
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from catstream.messages import End
 from catstream.wire.newest import Subscriber
@@ -15,11 +15,12 @@ __all__ = ["arrivals", "rounds"]
 _POLL_SECONDS = 0.1
 
 Key = TypeVar("Key")
+Message = TypeVar("Message")
 
 
 def arrivals(
-    readers: Mapping[Key, Subscriber[Any]], is_over: Callable[[], bool] = lambda: False
-) -> Iterator[tuple[Key, float, Any]]:
+    readers: Mapping[Key, Subscriber[Message]], is_over: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[Key, float, Message]]:
     """Yield (key of the subscriber, arrival time by `time.monotonic`, message) until `is_over` or all have ended."""
     poller, keys = select.poll(), {}
     for key, reader in readers.items():
@@ -36,7 +37,7 @@ def arrivals(
                     break
 
 
-def rounds(readers: Mapping[Key, Subscriber[Any]], pause: float, most: int) -> Iterator[tuple[Key, Any]]:
+def rounds(readers: Mapping[Key, Subscriber[Message]], pause: float, most: int) -> Iterator[tuple[Key, Message]]:
     """Yield (key of the subscriber, message): at most `most` messages of each, then a pause, until all have ended."""
     left = set(readers)
     while left:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import MutableSequence
 from time import monotonic
 from typing import Any, Self
 
@@ -102,7 +103,13 @@ class Subscribers:
 
 
 def _read_until_end(
-    endpoint: str, keys: str, numbers: range, pace: tuple[int, float], received: Any, missed: Any, parent: int
+    endpoint: str,
+    keys: str,
+    numbers: range,
+    pace: tuple[int, float],
+    received: MutableSequence[int],
+    missed: MutableSequence[int],
+    parent: int,
 ) -> None:
     """Run some of the subscribers until the pipeline ends."""
     die_with(parent)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +23,7 @@ from catstream.arrays import Float32, Float64
 from catstream.box import Box
 from catstream.features.compiled import kernel
 from catstream.features.pyramid import Pyramid
+from catstream.storage import Arrays, Facts
 
 __all__ = ["SparseCollaborativeModel", "prepare"]
 
@@ -64,7 +64,7 @@ class SparseCollaborativeModel:
         self._discriminative = _Discriminative.trained(positives, self._background(grey))
         self._generative = _Generative.from_template(template[0], int(rng.integers(2**31)))
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def state(self) -> tuple[Arrays, Facts]:
         """Arrays and facts that `resumed` goes on from."""
         judged, made = self._discriminative, self._generative
         arrays = {
@@ -80,7 +80,7 @@ class SparseCollaborativeModel:
         return arrays, {"box": self._first, "frames": self._frames, "particles": self._particles, "rng": chance}
 
     @classmethod
-    def resumed(cls, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> SparseCollaborativeModel:
+    def resumed(cls, arrays: Arrays, facts: Facts) -> SparseCollaborativeModel:
         """Go on where `state` was called, bit for bit; KeyError, TypeError or ValueError if these are none."""
         self = cls.__new__(cls)
         self._first, self._frames, self._particles = Box(*facts["box"]), int(facts["frames"]), int(facts["particles"])

@@ -18,7 +18,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from time import monotonic
-from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -178,7 +177,7 @@ def _command(body: bytes | None) -> tuple[str, list[float] | None, bool]:
     if body is None:
         raise ValueError("expected a command, got more than 4096 bytes")
     try:
-        command: Any = json.loads(
+        command: object = json.loads(
             body, parse_int=float
         )  # an integer that is too large becomes infinite, and is rejected
     except RecursionError:

@@ -31,7 +31,7 @@ class Connection(H11Protocol):
     _timer: asyncio.TimerHandle | None = None
     _closed = False
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         super().connection_made(transport)
         self._wait_for_client(_REQUEST_SECONDS)
         others = [cast(Connection, other) for other in self.connections]

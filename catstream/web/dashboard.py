@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
-from typing import Any, Literal
+from typing import Literal
 
 from catstream.heads import HEADS
 from catstream.messages import End, Features, Health, Model, Preview, Track
@@ -70,7 +70,7 @@ class Dashboard:
             self.endpoint = endpoint
             self._mark_changed("status")
 
-    def take(self, message: Any, now: float) -> None:
+    def take(self, message: object, now: float) -> None:
         """Process a message that arrived at the time `now`, in seconds of a monotonic clock."""
         if self._is_from_another_pipeline(message, now):
             self._reset()
@@ -123,7 +123,7 @@ class Dashboard:
         preview = next(reversed(self.pictures.values()), None)
         return None if preview is None else (preview, self._tracks.get(preview.frame))
 
-    def updates(self, seen: dict[str, int]) -> dict[str, Any]:
+    def updates(self, seen: dict[str, int]) -> dict[str, object]:
         """Return the parts that have changed since the last call for this page, as JSON values.
 
         Parameters
@@ -137,7 +137,7 @@ class Dashboard:
                 seen[name] = revision
         return parts
 
-    def _is_from_another_pipeline(self, message: Any, now: float) -> bool:
+    def _is_from_another_pipeline(self, message: object, now: float) -> bool:
         """Return whether a message shows that another pipeline runs than the one shown."""
         if not isinstance(message, Track | Health):
             return False
@@ -218,7 +218,7 @@ class Dashboard:
     def _mark_changed(self, *parts: str) -> None:
         self._revisions.update(parts)
 
-    def _status_part(self, _: int) -> dict[str, Any]:
+    def _status_part(self, _: int) -> dict[str, object]:
         return {
             "phase": self.phase,
             "reason": self.reason,
@@ -231,7 +231,7 @@ class Dashboard:
             "skipped": self.counter("detector", "skipped"),
         }
 
-    def _track_part(self, _: int) -> dict[str, Any] | None:
+    def _track_part(self, _: int) -> dict[str, object] | None:
         if (track := self.track) is None:
             return None
         return {"frame": track.frame, "time": track.time, "state": track.state, "version": track.model_version}
@@ -240,7 +240,7 @@ class Dashboard:
         """Return the number of pipelines shown so far; if it changes, all parts are sent again."""
         return self._revisions["pipeline"]
 
-    def _picture_part(self, _: int) -> dict[str, Any] | None:
+    def _picture_part(self, _: int) -> dict[str, object] | None:
         if self.newest is None:
             return None
         preview = self.newest[0]
@@ -249,7 +249,7 @@ class Dashboard:
     def _points_part(self, new: int) -> list[list[float | None]]:
         return [[value if value is None else round(value, 3) for value in point] for point in list(self._points)[-new:]]
 
-    def _trees_part(self, _: int) -> dict[str, Any]:
+    def _trees_part(self, _: int) -> dict[str, object]:
         counted = self._last["compressor"].counters if "compressor" in self._last else {}
         return {
             "trees": [
@@ -260,7 +260,7 @@ class Dashboard:
             "rows": counted.get("rows"),
         }
 
-    def _surprising_part(self, _: int) -> dict[str, Any]:
+    def _surprising_part(self, _: int) -> dict[str, object]:
         frames = [
             {"frame": one.frame, "time": one.time, "surprise": round(one.surprise, 3), "box": one.preview.box}
             | {"width": one.preview.width, "height": one.preview.height}

@@ -10,7 +10,7 @@ from time import monotonic
 
 from catstream.errors import CatstreamError
 from catstream.messages import End
-from catstream.subscription import subscribe
+from catstream.subscription import AnyMessage, Subscription
 from catstream.web.dashboard import SILENCE_SECONDS, Dashboard
 from catstream.wire.endpoint import find
 
@@ -108,7 +108,7 @@ class Feed:
                 await self._is_running.wait()
             if channel in _FOR_VIEWERS:
                 await self._has_viewers.wait()
-            with subscribe(self.attached_endpoint, channel, timeout=timeout, keys=self.keys) as messages:  # type: ignore[call-overload]
+            with Subscription[AnyMessage](self.attached_endpoint, channel, timeout=timeout, keys=self.keys) as messages:
                 async for message in messages:
                     self.dashboard.take(message, monotonic())
                     if self.dashboard.phase == "running":
@@ -116,5 +116,4 @@ class Feed:
                     if channel in _FOR_VIEWERS and not self.viewers:
                         break
                 else:
-                    end: End | None = messages.end
-                    return end
+                    return messages.end

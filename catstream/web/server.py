@@ -8,7 +8,6 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
-from typing import Any
 
 import uvicorn
 
@@ -102,7 +101,7 @@ class _Uvicorn(uvicorn.Server):
         super().__init__(config)
         self._feed = feed
 
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> Any:
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._feed.closed = True
         await super().shutdown(sockets)
 

@@ -88,7 +88,7 @@ def _map(field: Field, values: Field, where: str) -> _Check | None:
     if check_value is None:
         return None
 
-    def checked(entries: dict[str, Any], lengths: _Lengths) -> None:
+    def checked(entries: dict[str, object], lengths: _Lengths) -> None:
         found = {name: check_value(entry, lengths) for name, entry in entries.items()}
         if named is not None:
             _check_names(found, named, where)

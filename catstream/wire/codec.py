@@ -15,7 +15,7 @@ schema (`catstream.wire.checks`). A field that this version does not know is ign
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import msgpack
 import msgspec
@@ -40,6 +40,8 @@ from catstream.schema import LONGEST_LIST, LONGEST_TEXT
 from catstream.wire.checks import check_message
 
 __all__ = ["KINDS", "VERSION", "decode", "decode_json", "encode", "encode_json", "opening"]
+
+Message = TypeVar("Message")
 
 #: Version of the envelope and of the meaning of the fields.
 VERSION = 2
@@ -99,7 +101,7 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
     if kind not in kinds:
         raise ProtocolError(f"expected {expected}, got {_brief(name)}", "kind")
     try:
-        message: Any = msgspec.convert(fields, kind, dec_hook=_array)
+        message: object = msgspec.convert(fields, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
         raise ProtocolError(f"{name}: {error}", "type") from None
     check_message(message)
@@ -123,7 +125,7 @@ def encode_json(message: object) -> bytes:
     return msgspec.json.encode(message)
 
 
-def decode_json(data: bytes, kind: type) -> Any:
+def decode_json(data: bytes, kind: type[Message]) -> Message:
     """The message that `encode_json` wrote.
 
     Raises
@@ -132,7 +134,7 @@ def decode_json(data: bytes, kind: type) -> Any:
         If it is not JSON, or not the fields of a message of this kind within their limits.
     """
     try:
-        message: Any = msgspec.json.decode(data, type=kind)
+        message = msgspec.json.decode(data, type=kind)
     except msgspec.DecodeError as error:
         raise ProtocolError(
             f"expected {kind.__name__.lower()} in JSON, got {len(data)} bytes: {error}", "json"
@@ -141,12 +143,12 @@ def decode_json(data: bytes, kind: type) -> Any:
     return message
 
 
-def _brief(value: Any) -> str:
+def _brief(value: object) -> str:
     """A value for an error message; lists may be nested deeper than Python can print."""
     return f"{value!r:.40}" if isinstance(value, str | int) else f"a {type(value).__name__}"
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> dict[str, object]:
     """An array as the map that is sent."""
     if isinstance(value, np.ndarray):
         array = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
@@ -163,7 +165,7 @@ class _Array(msgspec.Struct, forbid_unknown_fields=True):
     data: bytes
 
 
-def _array(_: type, value: Any) -> np.ndarray:
+def _array(_: type, value: object) -> np.ndarray:
     """The array that `_plain` converted."""
     plain = msgspec.convert(value, _Array)
     if plain.dtype not in ("<f4", "<f8") or not 1 <= len(plain.shape) <= 2 or min(plain.shape) < 0:
@@ -174,7 +176,7 @@ def _array(_: type, value: Any) -> np.ndarray:
     return np.frombuffer(plain.data, dtype).reshape(plain.shape)
 
 
-def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+def _unique(pairs: list[tuple[object, object]]) -> dict[object, object]:
     fields = dict(pairs)
     if len(fields) < len(pairs):
         raise ValueError("a name is twice in a map")
