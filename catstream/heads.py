@@ -1,4 +1,7 @@
-"""The table of heads. A head is one coreset tree of the compressor and the regression that is trained on its sample.
+"""The table of heads. A head is one coreset tree of the compressor, and what the trainer computes from its sample.
+
+The loss tree and the extent tree have a ridge regression each. Object and background share one: least squares of the
+object's mean against the background's mean and covariance. Only the one-class classifier uses the object's rows.
 
 Compressor, trainer, checkpoint, codec, `catstream watch` and the page use this table: a new head is a new row.
 """
@@ -7,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["APPEARANCE", "BACKGROUND", "EXTENT", "GROUPS", "HEADS", "OBJECT", "Head"]
+__all__ = ["APPEARANCE", "BETWEEN_RIDGE", "EXTENT", "GROUPS", "HEADS", "Head"]
 
 #: Training rows of windows at and around the object: label 1 the object, 0 background, between them a near miss.
 APPEARANCE = "appearance"
@@ -24,9 +27,9 @@ class Head:
     label          if given, its tree takes the feature rows x with this label only. If None, it takes all rows of the
                    group with their label y, as [x, 1, y] * sqrt(weight). Then ||A [w; b; -1]||^2 is the squared error
                    of the linear model (w, b), which the trainer minimises by ridge regression
-    ridge          penalty of the regression; the least squares of `OBJECT` against `BACKGROUND` uses the background's
-    adds_to_score  if true, its direction is added to the score, and no sample is made before its tree has a leaf.
-                   Otherwise it is fitted to the residual of the score, and has its own vector in `Model.heads`
+    ridge          penalty of its ridge regression; None for object and background, see `BETWEEN_RIDGE`
+    adds_to_score  if true, its tree is used for the weights of the score, so that no sample is made before it has a
+                   leaf. Otherwise its regression is fitted to the residual of the score, in `Model.heads`
     title          title on the page
     meaning        description of its tree on the page
     """
@@ -34,7 +37,7 @@ class Head:
     name: str
     group: str
     label: float | None
-    ridge: float
+    ridge: float | None
     adds_to_score: bool
     title: str
     meaning: str
@@ -45,15 +48,15 @@ class Head:
         return 2 if self.label is None else 0
 
 
-OBJECT = Head("object", APPEARANCE, 1.0, 1.0, True, "Object", "what the object has looked like")
-BACKGROUND = Head("background", APPEARANCE, 0.0, 1.0, True, "Background", "what is around it")
+#: Penalty of the least squares of the object's mean against the background's mean and covariance.
+BETWEEN_RIDGE = 1.0
 
 #: All heads, by name.
 HEADS = {
     head.name: head
     for head in (
-        OBJECT,
-        BACKGROUND,
+        Head("object", APPEARANCE, 1.0, None, True, "Object", "what the object has looked like"),
+        Head("background", APPEARANCE, 0.0, None, True, "Background", "what is around it"),
         Head(
             "loss", APPEARANCE, None, 0.1, True, "Object or background",
             "both, with the score that each should get: the score is learned from these",

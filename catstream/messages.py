@@ -70,12 +70,13 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class DetectorState:
-    """All that a detector knows after a frame, besides the model: with both, another one goes on bit for bit.
+    """All that a detector knows after a frame, besides the model: with both, another one continues bit for bit.
 
     first_frame       the object's first; a model of frames before it is of another object
     level             of the belief that the object was found, see `catstream.detection.belief`
     window            where the object was; the next search begins there
-    confident_window  the same in the last frame in which the belief was confident
+    confident_window  the same in the last frame whose level was confident or redetected; while the object of a saved
+                      model is searched for, the best window of the last frame
     first_window      the same in the first frame; None while the object of a saved model has not been found
     trusted           false after the object was found again elsewhere in the frame, until its score is high
     sightings         frames in a row in which the object of a saved model was seen in one place
@@ -250,11 +251,12 @@ class Track:
     seq : int
         1, 2, 3 ...: a gap means that this subscriber missed messages.
     frame : int
-        Number of the frame.
+        Number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted.
     time : float
         Seconds since the start of the source, or of the run if the source is live.
     state : str
-        "bootstrapping" until the first model, then "present" or "absent".
+        "absent" if no box is reported. Otherwise "bootstrapping" while the model is that of the object's first frame
+        (version 0), then "present".
     box : Box or None
         Box of the object, in pixels of the frame; None while absent.
     score : float
@@ -383,7 +385,8 @@ class Command:
 
     id    unique for each command: a command that is received twice is executed once and answered twice
     verb  the action
-    box   for "set-box": box of the object in the newest frame, in pixels
+    box   for "set-box": box of the object in the next frame that is tracked, in pixels; during a pause of a file, in
+          the frame that is held
     keep  for "set-box": whether it is the same object, so that everything learned about it is kept
     """
 

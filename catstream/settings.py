@@ -157,7 +157,12 @@ class SearchSettings(_Group):
     context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
     area: Annotated[float, _about("Side of the local search area as a multiple of the window's.", ge=1.5, le=6)] = 2.5
     whole_interval: Annotated[
-        int, _about("Frames between two searches of the whole frame while the score is not confident.", ge=1)
+        int,
+        _about(
+            "Frames between two searches of the whole frame while the local score is between belief.weak_score and "
+            "belief.confident_score, or the object is not trusted. Below, each whole frame is searched.",
+            ge=1,
+        ),
     ] = 10
     motion_frames: Annotated[
         int,
@@ -173,13 +178,16 @@ class BeliefSettings(_Group):
 
     weak_score: Annotated[
         float,
-        _about("Score below which the object is lost: reported as absent, and searched for in each whole frame."),
+        _about(
+            "Score below which the object is lost: reported as absent. A frame with such a local score is searched as "
+            "a whole."
+        ),
     ] = 0.3
     confident_score: Annotated[
         float,
         _about(
-            "Score from which the detector is confident: it learns from the frame and adapts the size. A lost object "
-            "returns at this score."
+            "Score from which the detector is confident if the object is trusted: it learns from the frame and adapts "
+            "the size (that of a redetected object is adapted at any score). A lost object returns at this score."
         ),
     ] = 0.45
     trusted_score: Annotated[
@@ -216,8 +224,9 @@ class TeachingSettings(_Group):
     classifier: Annotated[
         Literal["joint", "least-squares", "one-class"],
         _about(
-            "How a model is learned: least squares of the object's and the background's trees, plus that of the loss "
-            "tree (joint), the former alone (least-squares), or the paper's one-class linear SVM (one-class)."
+            "How a model is learned: least squares of the object's mean against the background's mean and covariance, "
+            "plus the regression of the loss tree (joint); the former alone (least-squares); or the paper's one-class "
+            "linear SVM of the object's rows (one-class)."
         ),
     ] = "joint"
     colours: Annotated[bool, _about("Use the histogram of the window's colours as a feature.")] = True

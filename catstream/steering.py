@@ -57,10 +57,11 @@ class Control:
         self._commands = Requester(self._place)
 
     def set_box(self, box: str | Iterable[float], *, keep: bool = False) -> Answer:
-        """Set the box of the object in the newest frame: x, y, w, h in pixels.
+        """Set the box of the object in the next frame that is tracked: x, y, w, h in pixels.
 
-        By default it is a new object, and everything learned of the previous one is dropped. With `keep` it is the same
-        object, and its box is corrected. A paused pipeline processes this frame and stays paused.
+        During a pause of a file, it is the frame that is held; the pipeline tracks it and stays paused. By default it
+        is a new object, and everything learned of the previous one is dropped. With `keep` it is the same object, and
+        its box is corrected.
         """
         return self._ask("set-box", Box.parse(box), keep)
 

@@ -1,6 +1,7 @@
 """Decides what each command does to a detector; sends, receives and stores nothing itself.
 
-A command that needs no frame is carried out at once. A box waits for the next frame in hand.
+A command that needs no frame is carried out at once. A box waits for the next frame that is tracked; during a pause of
+a file, this is the frame that is held.
 """
 
 from __future__ import annotations

@@ -90,8 +90,8 @@ def _with_control(command: Callable[..., str]) -> Callable[..., None]:
 def set_box(pipeline: Control, box: str, keep: bool) -> str:
     """Set the box of the object in a running pipeline.
 
-    X,Y,W,H is the box in pixels in the newest frame, or in the next frame if
-    the pipeline is paused or waits for a box. By default it is a new object,
+    X,Y,W,H is the box in pixels in the next frame that is tracked; during a
+    pause of a file, in the frame that is held. By default it is a new object,
     and everything learned of the previous one is dropped.
 
     \b

@@ -1,13 +1,17 @@
 """Belief: how sure the detector is that a detection is the object, and what it does at each level.
 
-    lost        the score is below `belief.weak_score`: the object is reported as absent
-    redetected  found by a search of the whole frame, away from where it was expected, and not trusted yet
-    weak        found where it was expected, with a score below `belief.confident_score`
-    confident   found where it was expected, with a higher score
+The level combines two facts, the score of the frame and whether the object is trusted:
 
-`policies` is the table of what each level does. A redetected object is trusted, and so becomes weak or confident, once
-it scores `belief.trusted_score`: until then no model is trained with it. A lost object returns once it would be
-confident, which is hysteresis.
+    lost        the score is below `belief.weak_score`: the object is reported as absent
+    redetected  any score from there; the object is reported, but not trusted since it was found elsewhere
+    weak        trusted, with a score below `belief.confident_score`
+    confident   trusted, with a score from `belief.confident_score`
+
+Trust is lost if a search of the whole frame finds the object away from the expected place with a score below
+`belief.trusted_score`. It returns at the first score from there. Until then no model is trained with the object.
+
+A lost object returns at `belief.confident_score` only (as redetected, if it is not trusted), which is hysteresis.
+`policies` is the table of the actions at each level.
 """
 
 from __future__ import annotations
@@ -30,9 +34,10 @@ class Policy:
     report           the object counts as present
     resize           size and aspect ratio change
     recentre         the centroid of the colours is updated, and the window shifted to it
-    remember         the window is remembered as the last confident one
+    remember         the window becomes the `confident_window` of the state: searches of the whole frame use its size
     teach            training rows are cut from the frame, and now and then hard negatives from all of it
-    search_interval  frames from one search of the whole frame to the next, 0 for none
+    search_interval  frames from one search of the whole frame to the next, 0 for none; looked up by the level of the
+                     local score of this frame (`level_of`), without hysteresis, because the search precedes `updated`
     """
 
     report: bool
@@ -45,7 +50,11 @@ class Policy:
 
 @lru_cache(maxsize=8)
 def policies(interval: int) -> Mapping[Level, Policy]:
-    """The table: what the detector does at each level; `interval` is the setting `search.whole_interval`."""
+    """The table: what the detector does at each level; `interval` is the setting `search.whole_interval`.
+
+    The search interval applies to the level of this frame's local score, without hysteresis; all else to the level of
+    the state after the frame.
+    """
     no, yes = False, True
     return MappingProxyType(
         {  #                    report resize recentre remember teach search_interval
@@ -58,7 +67,7 @@ def policies(interval: int) -> Mapping[Level, Policy]:
 
 
 def level_of(score: float, trusted: bool, belief: BeliefSettings) -> Level:
-    """The level of a score."""
+    """The level of a score by itself, without the hysteresis of `updated`."""
     if score < belief.weak_score:
         return "lost"
     if not trusted:

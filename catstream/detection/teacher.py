@@ -22,7 +22,7 @@ from catstream.errors import BoxError
 from catstream.features.cells import COLOURS, Cells, row_length
 from catstream.features.hog import CELL, MARGIN, WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.heads import APPEARANCE, BACKGROUND, EXTENT
+from catstream.heads import APPEARANCE, BETWEEN_RIDGE, EXTENT
 from catstream.messages import Model, TrainingRows
 from catstream.settings import Settings, TeachingSettings
 
@@ -127,7 +127,7 @@ def hard_negatives(frame: Pyramid, window: Window, model: Model, teaching: Teach
 
 
 def initial_model(rows: TrainingRows) -> Model:
-    """A model of version 0, by ridge regression of the object's rows against the background's.
+    """A model of version 0, by least squares of the object's mean against the background's mean and covariance.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def initial_model(rows: TrainingRows) -> Model:
     """
     background = rows.rows[rows.labels == 0]
     mean, background_mean = rows.rows[rows.labels == 1].mean(axis=0), background.mean(axis=0)
-    weights = ridge.between(background, mean - background_mean, BACKGROUND.ridge)
+    weights = ridge.between(background, mean - background_mean, BETWEEN_RIDGE)
     contrast = float(weights @ (mean - background_mean))
     if not contrast > 0:
         raise BoxError("the object in the box looks like all that is around it: give another box, or another frame")

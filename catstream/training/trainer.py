@@ -1,4 +1,13 @@
-"""The trainer: takes a sample of the coreset trees, and returns a model."""
+"""The trainer: takes a sample of the coreset trees, and returns a model.
+
+What `teaching.classifier` uses of the trees for the weights of the score:
+
+    least-squares  the mean of the object; the mean and the rows of the background
+    joint          the same, and the rows of the loss tree
+    one-class      the rows of the object; the mean of the background
+
+The means of object and background also scale the score, and the rows of the extent tree are used in each case.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +17,7 @@ import numpy as np
 
 from catstream import ridge
 from catstream.errors import ProtocolError
-from catstream.heads import BACKGROUND, HEADS
+from catstream.heads import BETWEEN_RIDGE, HEADS
 from catstream.messages import Model, Motion, Sample
 from catstream.paper.one_class import one_class
 from catstream.settings import Settings
@@ -54,14 +63,23 @@ class Trainer:
             return [one_class(sample.trees["object"].rows, sample.trees["background"].mean)]
         if settings.teaching.classifier == "least-squares":
             return [_between(sample)]
-        fitted = [head for head in HEADS.values() if head.adds_to_score and head.label is None]
-        return [_between(sample), *(ridge.fit(sample.trees[head.name].rows, head.ridge) for head in fitted)]
+        return [
+            _between(sample),
+            *(
+                ridge.fit(sample.trees[name].rows, head.ridge)
+                for name, head in HEADS.items()
+                if head.adds_to_score and head.ridge is not None
+            ),
+        ]
 
 
 def _between(sample: Sample) -> np.ndarray:
-    """Least squares of the object's tree against the background's; its contrast is positive if the means differ."""
+    """Least squares of the object's mean against the background's mean and covariance.
+
+    Its contrast is positive if the means differ.
+    """
     background = sample.trees["background"]
-    return ridge.between(background.rows, sample.trees["object"].mean - background.mean, BACKGROUND.ridge)
+    return ridge.between(background.rows, sample.trees["object"].mean - background.mean, BETWEEN_RIDGE)
 
 
 def _residual_vectors(sample: Sample, weights: np.ndarray) -> dict[str, np.ndarray]:
@@ -71,7 +89,7 @@ def _residual_vectors(sample: Sample, weights: np.ndarray) -> dict[str, np.ndarr
     """
     vectors = {}
     for name, head in HEADS.items():
-        if not head.adds_to_score and name in sample.trees:
+        if head.ridge is not None and not head.adds_to_score and name in sample.trees:
             rows = sample.trees[name].rows.copy()
             rows[:, -1] -= rows[:, :-2] @ weights
             vectors[name] = ridge.fit(rows, head.ridge)

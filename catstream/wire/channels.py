@@ -1,14 +1,16 @@
 """The channels: what flows between the processes, from whom to whom, and what a slow reader misses.
 
-    features   every message arrives exactly once: acknowledged, and retransmitted to a restarted receiver
+    features   the training rows of each frame; every message is delivered exactly once: it is acknowledged, and
+               retransmitted to a restarted receiver
     samples    only the newest counts; a late joiner gets the last one at once
     models     as samples
     tracks     every message, to any number of subscribers; a slow one misses some, and sees by `seq` how many
-    results    the tracks again, acknowledged, for the process that started the pipeline
+    results    the tracks again, acknowledged, for the process that started the pipeline, its owner; the files that it
+               writes are `catstream.job.Results`
     health     the newest of each process
     previews   small pictures of the newest frame; none is made while nobody subscribes
     control    commands and their answers; a command without an answer is sent again, and carried out once
-    training   the features again, to any number of subscribers; nothing is sent while there is none
+    training   a copy of the messages of `features`, to any number of subscribers; nothing is sent while there is none
 
 The receiver of an acknowledged channel binds its address, and so does the sender of any other; the rest connect,
 in any order. `catstream.wire.endpoint` says what the addresses are. If the pipeline has keys (`catstream.wire.keys`),
