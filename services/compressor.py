@@ -108,7 +108,7 @@ class CompressorLoop:
             self._features.acknowledge(self._progress.acknowledgement(self._compressor.sampled, end))
 
     def _store(self, urgent: bool) -> None:
-        """Write a checkpoint, or count all messages as stored if there are none (started by hand, without `--state`)."""
+        """Write a checkpoint, or count all messages as stored if there are none (started by hand without --state)."""
         self._process.allow(_STORE_SECONDS)
         saved = self._checkpoints is None or self._checkpoints.save(self._compressor)
         self._progress = self._progress.after(self._compressor.position, time.monotonic(), saved=saved, urgent=urgent)
