@@ -46,7 +46,7 @@ function attach(endpoint, channel, options) {
 async function* messages(socket) {
   for await (const [data] of socket) {
     const [version, kind, fields] = decode(data);
-    if (version !== 1) throw new Error("this catstream speaks another protocol");
+    if (version !== 2) throw new Error("this catstream speaks another protocol");
     yield { kind, fields };
   }
 }

@@ -47,7 +47,7 @@ def attach(endpoint: str, channel: str, keys: str, *, newest: bool) -> zmq.Socke
 def receive(socket: zmq.Socket) -> tuple[str, dict]:
     """Receive the next message: its kind and its fields."""
     version, kind, fields = msgpack.unpackb(socket.recv())
-    if version != 1:
+    if version != 2:
         sys.exit("this catstream speaks another protocol")
     return kind, fields
 

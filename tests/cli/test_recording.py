@@ -86,6 +86,11 @@ def test_a_recording_is_watched_like_a_pipeline(recorded, catstream, tmp_path):
     assert ": the source came to its end" in errors
 
 
+def holds_tracks(path):
+    """Whether tracks were recorded so far."""
+    return path.exists() and path.stat().st_size > 0 and Recording(path).counts[Track] > 0
+
+
 def test_what_a_pipeline_says_is_recorded_from_outside(video, catstream, tmp_path):
     source, box = video
     settings, paths = (
@@ -97,7 +102,7 @@ def test_what_a_pipeline_says_is_recorded_from_outside(video, catstream, tmp_pat
         next(tracks)
         recorders = [catstream("record", "--output", path, "--endpoint", tmp_path) for path in paths]
         for track in tracks:
-            if paths[1].exists() and track.frame > 40 and recorders[1].poll() is None:
+            if recorders[1].poll() is None and track.frame > 40 and all(map(holds_tracks, paths)):
                 recorders[1].send_signal(signal.SIGINT)
                 recorders[1].wait(60)
         told = [recorder.communicate(timeout=60)[1] for recorder in recorders]
