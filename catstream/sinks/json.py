@@ -67,8 +67,8 @@ class StdoutSink(NdjsonSink):
 
     def write(self, track: Track) -> None:
         """Write a track and flush it."""
+        super().write(track)
         with self._translated_errors():
-            self._file.write(self.line(track) + "\n")
             self._file.flush()
 
     @contextmanager

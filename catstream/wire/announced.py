@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import secrets
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Self
 
-from catstream.storage import is_locked, lock
-from catstream.wire.endpoint import Endpoint, homes
+from catstream.storage import lock
+from catstream.wire.endpoint import Endpoint, homes, notes
 
 __all__ = ["Announcement", "readers_of"]
 
@@ -70,21 +69,14 @@ class Announcement:
 def readers_of(endpoint: Endpoint) -> dict[str, set[str]]:
     """Names of this user's subscribers that wait at an endpoint, by channel; removes the files of dead ones."""
     readers: dict[str, set[str]] = {}
-    for home in set(homes()):
-        for path in home.glob(f"{_PREFIX}*"):
-            with (
-                contextlib.suppress(OSError),
-                path.open() as file,
-            ):  # it may be removed by now, or belong to another user
-                if os.fstat(file.fileno()).st_uid != os.geteuid():
-                    continue
-                if not is_locked(file.fileno()):
-                    path.unlink()
-                    continue
-                place, *channels = file.read().split("\n")
-                if place == _place(endpoint):
-                    for channel in channels:
-                        readers.setdefault(channel, set()).add(path.name.removeprefix(_PREFIX))
+    for path, text in notes(set(homes()), f"{_PREFIX}*"):
+        if text is None:
+            path.unlink(missing_ok=True)
+            continue
+        place, *channels = text.split("\n")
+        if place == _place(endpoint):
+            for channel in channels:
+                readers.setdefault(channel, set()).add(path.name.removeprefix(_PREFIX))
     return readers
 
 

@@ -15,7 +15,7 @@ import re
 import shutil
 import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from catstream.storage import is_locked, lock
 from catstream.wire.channels import CHANNELS, Channel
 from catstream.wire.keys import Keys
 
-__all__ = ["Endpoint", "find", "homes", "meeting_place", "private_folder", "running"]
+__all__ = ["Endpoint", "find", "homes", "meeting_place", "notes", "private_folder", "running"]
 
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
@@ -185,13 +185,9 @@ def private_folder() -> Iterator[Path]:
 
 def _sweep(home: Path) -> None:
     """Remove the private folders whose owner was killed."""
-    for path in home.glob(f"{_PREFIX}*/{_OWNER}"):
-        with (
-            contextlib.suppress(OSError),
-            path.open("r+") as mark,
-        ):  # it may be removed by now, or belong to another user
-            if os.fstat(mark.fileno()).st_uid == os.geteuid() and not is_locked(mark.fileno()):
-                shutil.rmtree(path.parent, ignore_errors=True)
+    for path, text in notes([home], f"{_PREFIX}*/{_OWNER}"):
+        if text is None:
+            shutil.rmtree(path.parent, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -262,16 +258,10 @@ def _noted(endpoint: Endpoint, folder: Path, source: str) -> Iterator[None]:
 def running() -> list[Endpoint]:
     """Endpoints of this user's running pipelines, in no order."""
     endpoints = []
-    for home in set(homes()):
-        for path in home.glob(f"{_PREFIX}*/{_NOTE}"):
-            with (
-                contextlib.suppress(OSError),
-                path.open() as note,
-            ):  # it may be removed by now, or belong to another user
-                text = note.read()
-                if text and os.fstat(note.fileno()).st_uid == os.geteuid() and is_locked(note.fileno()):
-                    endpoint = Endpoint.parse(*text.split("\n"))
-                    endpoints.append(replace(endpoint, source=_read(path.with_name(_SOURCE))))
+    for path, text in notes(set(homes()), f"{_PREFIX}*/{_NOTE}"):
+        if text:  # empty until the pipeline has written it
+            endpoint = Endpoint.parse(*text.split("\n"))
+            endpoints.append(replace(endpoint, source=_read(path.with_name(_SOURCE))))
     return endpoints
 
 
@@ -331,6 +321,16 @@ def _source_at(endpoint: Endpoint) -> str:
 def _follows(endpoint: Endpoint, source: str) -> bool:
     """Whether a pipeline has this source: the same text, the same file, or a file of that name."""
     return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
+
+
+def notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | None]]:
+    """This user's files of a pattern: path and text of each, None as the text if the process that locked it is dead."""
+    for folder in folders:
+        for path in folder.glob(pattern):
+            # It may be removed by now, or belong to another user.
+            with contextlib.suppress(OSError), path.open() as file:
+                if os.fstat(file.fileno()).st_uid == os.geteuid():
+                    yield path, file.read() if is_locked(file.fileno()) else None
 
 
 def homes() -> list[Path]:
