@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import partial
 from os import getpid
 from time import monotonic
 
@@ -121,34 +120,7 @@ def run(plan: Plan, camera: Camera, report_status: Callable[[Status], None] = la
     camera.show_still()
     streams = [Stream(number, url, camera.box, plan.settings) for number, url in enumerate(camera.urls)]
     with ExitStack() as stack:
-        for stream in streams:
-            stack.callback(stream.stop)
-            stream.start()
-        stack.callback(_ask_to_stop, streams)
-        _wait_until(
-            lambda: all(stream.ready.is_set() for stream in streams), streams, "starting processes", report_status
-        )
-        observer = Observer([stream.endpoint for stream in streams], plan.settings.run.keys)
-        observer.start()
-        stack.callback(observer.end)
-        _wait_until(
-            lambda: all(observations.warmed_up for observations in observer.observations),
-            streams,
-            "learning the first models",
-            report_status,
-        )
-        connect = partial(
-            Subscribers,
-            readers=plan.subscribers,
-            slow=plan.slow - plan.frozen,
-            frozen=plan.frozen,
-            keys=plan.settings.run.keys,
-        )
-        groups = [stack.enter_context(connect(stream.endpoint)) for stream in streams]
-        _wait_until(lambda: all(group.connected for group in groups), streams, "attaching subscribers", report_status)
-        for group in groups:
-            group.freeze()
-
+        observer, groups = _started(plan, streams, stack, report_status)
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS, plan.rate, plan.frames))
         monitor = _Monitor(plan, camera, streams, groups, observer)
         interrupted = False
@@ -186,6 +158,29 @@ def run(plan: Plan, camera: Camera, report_status: Callable[[Status], None] = la
         errors=[f"stream {number}: {stream.error}" for number, stream in enumerate(streams) if stream.error],
         interrupted=interrupted,
     )
+
+
+def _started(
+    plan: Plan, streams: list[Stream], stack: ExitStack, report_status: Callable[[Status], None]
+) -> tuple[Observer, list[Subscribers]]:
+    """Start the pipelines, wait for their first models, then connect the subscribers; the stack ends all of them."""
+    for stream in streams:
+        stack.callback(stream.stop)
+        stream.start()
+    stack.callback(_ask_to_stop, streams)
+    _wait_until(lambda: all(stream.ready.is_set() for stream in streams), streams, "starting processes", report_status)
+    keys = plan.settings.run.keys
+    observer = Observer([stream.endpoint for stream in streams], keys)
+    observer.start()
+    stack.callback(observer.end)
+    seen = observer.observations
+    _wait_until(lambda: all(each.warmed_up for each in seen), streams, "learning the first models", report_status)
+    counts = {"readers": plan.subscribers, "slow": plan.slow - plan.frozen, "frozen": plan.frozen}
+    groups = [stack.enter_context(Subscribers(stream.endpoint, keys=keys, **counts)) for stream in streams]
+    _wait_until(lambda: all(group.connected for group in groups), streams, "attaching subscribers", report_status)
+    for group in groups:
+        group.freeze()
+    return observer, groups
 
 
 class _Monitor:
