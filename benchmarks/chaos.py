@@ -238,7 +238,9 @@ def boxes(tracks: list[Track]) -> np.ndarray:
 def fingerprint(compressor: Compressor) -> list[tuple[object, object]]:
     """Return the content of the trees as bytes."""
     states = [tree.state() for tree in compressor.trees.values()]
-    return [(facts, {name: (array.shape, array.tobytes()) for name, array in own.items()}) for own, facts in states]
+    return [
+        (metadata, {name: (array.shape, array.tobytes()) for name, array in own.items()}) for own, metadata in states
+    ]
 
 
 def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, float, float, float]]:

@@ -15,7 +15,7 @@ from catstream import storage
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.settings import Settings
-from catstream.storage import Facts
+from catstream.storage import Metadata
 
 __all__ = ["Job", "Results"]
 
@@ -41,10 +41,10 @@ class Results:
     save_model: Path | None = None
 
     @classmethod
-    def from_json(cls, facts: Facts) -> Results:
-        """The value that `asdict` and JSON made these facts of."""
-        write = tuple(Path(file) for file in facts["write"])
-        return cls(_path(facts["output"]), bool(facts["video"]), write, _path(facts["save_model"]))
+    def from_json(cls, metadata: Metadata) -> Results:
+        """Return the results that `asdict` and JSON converted to this metadata."""
+        write = tuple(Path(file) for file in metadata["write"])
+        return cls(_path(metadata["output"]), bool(metadata["video"]), write, _path(metadata["save_model"]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,8 @@ class Job:
             If the file cannot be written.
         """
         try:
-            facts = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
-            storage.write(folder / _NAME, {}, facts, mode=0o600)
+            metadata = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+            storage.write(folder / _NAME, {}, metadata, mode=0o600)
         except OSError as error:
             raise ServiceError(
                 f"cannot keep the state in {str(folder)!r} ({error.strerror}): give another folder"
@@ -124,10 +124,10 @@ class Job:
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
             raise ServiceError(f"no pipeline was kept in {str(path)!r}: start one with --state {path}")
-        facts = storage.read(file)[1]
+        metadata = storage.read(file)[1]
         try:
-            read = {name: _READERS[name](facts[name]) for name in _READERS}
-            return cls(**(facts | read))
+            read = {name: _READERS[name](metadata[name]) for name in _READERS}
+            return cls(**(metadata | read))
         except (KeyError, TypeError) as error:
             raise ProtocolError(f"{file} does not say how the pipeline was started ({error!r})") from None
 

@@ -17,7 +17,7 @@ from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import Model, Sample
 from catstream.packing import pack, unpack
-from catstream.storage import Arrays, Facts
+from catstream.storage import Arrays, Metadata
 from catstream.wire.checks import check_message
 
 __all__ = ["Learned"]
@@ -46,11 +46,11 @@ class Learned:
         ServiceError
             If it cannot be written.
         """
-        sample_arrays, sample_facts = pack(self.sample, "sample")
-        model_arrays, model_facts = pack(self.model, "model")
-        facts: Facts = {"kind": _KIND, "box": list(self.box), "sample": sample_facts, "model": model_facts}
+        sample_arrays, sample_metadata = pack(self.sample, "sample")
+        model_arrays, model_metadata = pack(self.model, "model")
+        metadata: Metadata = {"kind": _KIND, "box": list(self.box), "sample": sample_metadata, "model": model_metadata}
         try:
-            storage.write(path, sample_arrays | model_arrays, facts)
+            storage.write(path, sample_arrays | model_arrays, metadata)
         except OSError as error:
             raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another file") from None
 
@@ -67,11 +67,11 @@ class Learned:
         """
         if not Path(path).is_file():
             raise ServiceError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
-        arrays, facts = storage.read(path)
+        arrays, metadata = storage.read(path)
         try:
-            if facts.get("kind") != _KIND:
-                raise ValueError(f"it is of kind {facts.get('kind')!r}, not {_KIND!r}")
-            learned = cls._of(arrays, facts)
+            if metadata.get("kind") != _KIND:
+                raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")
+            learned = cls._of(arrays, metadata)
             for message in (learned.model, learned.sample):
                 check_message(message)
             x, y, w, h = learned.box
@@ -82,7 +82,7 @@ class Learned:
         return learned
 
     @classmethod
-    def _of(cls, arrays: Arrays, facts: Facts) -> Self:
-        sample = unpack(Sample, arrays, facts["sample"], "sample")
-        model = unpack(Model, arrays, facts["model"], "model")
-        return cls(replace(model, frame=0), replace(sample, frame=0), Box(*map(float, facts["box"])))
+    def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
+        sample = unpack(Sample, arrays, metadata["sample"], "sample")
+        model = unpack(Model, arrays, metadata["model"], "model")
+        return cls(replace(model, frame=0), replace(sample, frame=0), Box(*map(float, metadata["box"])))

@@ -1,4 +1,4 @@
-"""A message as arrays and facts, as `catstream.storage` keeps them, and back: derived from its schema."""
+"""A message as arrays and metadata, as `catstream.storage` keeps them, and back: derived from its schema."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ import numpy as np
 
 from catstream.box import Box, Window
 from catstream.schema import Array, Field, fields
-from catstream.storage import Arrays, Facts
+from catstream.storage import Arrays, Metadata
 
 __all__ = ["pack", "unpack"]
 
 Message = TypeVar("Message")
 
 
-def pack(message: object, name: str) -> tuple[Arrays, Facts]:
-    """Arrays, their names beginning with `name`, and facts for JSON.
+def pack(message: object, name: str) -> tuple[Arrays, Metadata]:
+    """Arrays, their names beginning with `name`, and metadata for JSON.
 
     Examples
     --------
     >>> from catstream.messages import Motion
-    >>> arrays, facts = pack(Motion(np.eye(4), np.eye(2)), "motion")
-    >>> list(arrays), facts
+    >>> arrays, metadata = pack(Motion(np.eye(4), np.eye(2)), "motion")
+    >>> list(arrays), metadata
     (['motion.process', 'motion.observation'], {})
-    >>> unpack(Motion, arrays, facts, "motion").observation.tolist()
+    >>> unpack(Motion, arrays, metadata, "motion").observation.tolist()
     [[1.0, 0.0], [0.0, 1.0]]
     """
     arrays: Arrays = {}
-    facts = {
+    metadata = {
         field.name: _pack(getattr(message, field.name), f"{name}.{field.name}", arrays)
         for field in fields(type(message))
     }
-    return arrays, {name: fact for name, fact in facts.items() if fact is not None}
+    return arrays, {name: entry for name, entry in metadata.items() if entry is not None}
 
 
-def unpack(kind: type[Message], arrays: Arrays, facts: Facts, name: str) -> Message:
+def unpack(kind: type[Message], arrays: Arrays, metadata: Metadata, name: str) -> Message:
     """The message that `pack` took, bit for bit.
 
     Its limits are not checked: `catstream.wire.checks` does that.
@@ -44,43 +44,43 @@ def unpack(kind: type[Message], arrays: Arrays, facts: Facts, name: str) -> Mess
     Raises
     ------
     AttributeError, KeyError, TypeError, ValueError
-        If the arrays and facts are not those of a message of this kind.
+        If the arrays and metadata are not those of a message of this kind.
     """
     values = {
-        field.name: _unpack(field, facts.get(field.name), f"{name}.{field.name}", arrays) for field in fields(kind)
+        field.name: _unpack(field, metadata.get(field.name), f"{name}.{field.name}", arrays) for field in fields(kind)
     }
     return kind(**values)
 
 
 def _pack(value: object, name: str, arrays: Arrays) -> object:
-    """The fact that stands for a value, None if there is none; its arrays are added to `arrays`."""
+    """The entry that stands for a value, None if there is none; its arrays are added to `arrays`."""
     if isinstance(value, np.ndarray):
         arrays[name] = value
         return None
     if isinstance(value, dict):
         return {key: _pack(entry, f"{name}.{key}", arrays) for key, entry in value.items()}
     if dataclasses.is_dataclass(value):
-        parts, facts = pack(value, name)
+        parts, metadata = pack(value, name)
         arrays.update(parts)
-        return facts
+        return metadata
     return list(value) if isinstance(value, tuple) else value
 
 
-def _unpack(field: Field, fact: Any, name: str, arrays: Arrays) -> object:
+def _unpack(field: Field, entry: Any, name: str, arrays: Arrays) -> object:
     if field.limit(Array) is not None:
         return arrays.get(name) if field.optional else arrays[name]
-    if fact is None and field.optional:
+    if entry is None and field.optional:
         return None
     if field.values is not None:
-        return {key: _unpack(field.values, entry, f"{name}.{key}", arrays) for key, entry in fact.items()}
+        return {key: _unpack(field.values, value, f"{name}.{key}", arrays) for key, value in entry.items()}
     if field.is_message:
-        return unpack(field.type, arrays, fact, name)
+        return unpack(field.type, arrays, entry, name)
     if field.type in (Box, Window):
-        return field.type(*map(float, fact))
+        return field.type(*map(float, entry))
     if get_origin(field.type) is tuple:
-        return tuple(map(int, fact))
+        return tuple(map(int, entry))
     if get_origin(field.type) is Literal:
-        if fact not in get_args(field.type):
-            raise ValueError(f"{name} is {fact!r:.40}, not one of {', '.join(get_args(field.type))}")
-        return fact
-    return field.type(fact)
+        if entry not in get_args(field.type):
+            raise ValueError(f"{name} is {entry!r:.40}, not one of {', '.join(get_args(field.type))}")
+        return entry
+    return field.type(entry)

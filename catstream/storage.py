@@ -16,12 +16,12 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 
-__all__ = ["Arrays", "Facts", "is_locked", "is_writable", "lock", "read", "write", "write_atomically"]
+__all__ = ["Arrays", "Metadata", "is_locked", "is_writable", "lock", "read", "write", "write_atomically"]
 
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
-#: JSON metadata by name. Code that reads a file checks the facts that it uses.
-Facts = dict[str, Any]
+#: JSON metadata by name. Code that reads a file checks the entries that it uses.
+Metadata = dict[str, Any]
 
 _KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
 _VERSION = 1  # version of the metadata's format
@@ -92,8 +92,8 @@ def is_locked(handle: int) -> bool:
     return False
 
 
-def write(path: str | os.PathLike[str], arrays: Arrays, facts: Facts, mode: int = 0o666) -> None:
-    """Write arrays and JSON metadata (`facts`) to a file, atomically.
+def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode: int = 0o666) -> None:
+    """Write arrays and JSON metadata to a file, atomically.
 
     Raises
     ------
@@ -103,11 +103,11 @@ def write(path: str | os.PathLike[str], arrays: Arrays, facts: Facts, mode: int 
     from safetensors.numpy import save
 
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    metadata = {"version": _VERSION, "facts": facts, "checksum": _checksum(contiguous, facts)}
-    write_atomically(path, save(contiguous, metadata={_KEY: json.dumps(metadata, sort_keys=True)}), mode)
+    header = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
+    write_atomically(path, save(contiguous, metadata={_KEY: json.dumps(header, sort_keys=True)}), mode)
 
 
-def read(path: str | os.PathLike[str]) -> tuple[Arrays, Facts]:
+def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
     """Return the arrays and the metadata of a file that `write` wrote.
 
     Raises
@@ -119,16 +119,16 @@ def read(path: str | os.PathLike[str]) -> tuple[Arrays, Facts]:
 
     try:
         with safe_open(path, framework="numpy") as file:
-            metadata = json.loads((file.metadata() or {})[_KEY])
+            header = json.loads((file.metadata() or {})[_KEY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        facts = metadata["facts"]
-        if metadata["version"] != _VERSION:
-            raise ValueError(f"it is of version {metadata['version']}, this catstream reads {_VERSION}")
-        if metadata["checksum"] != _checksum(arrays, facts):
+        metadata = header["facts"]
+        if header["version"] != _VERSION:
+            raise ValueError(f"it is of version {header['version']}, this catstream reads {_VERSION}")
+        if header["checksum"] != _checksum(arrays, metadata):
             raise ValueError("its checksum does not match")
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ProtocolError(f"{path} is not an undamaged file of catstream ({error}): use an older copy") from None
-    return arrays, facts
+    return arrays, metadata
 
 
 def _sync(folder: Path) -> None:
@@ -140,9 +140,9 @@ def _sync(folder: Path) -> None:
         os.close(handle)
 
 
-def _checksum(arrays: Arrays, facts: Facts) -> int:
+def _checksum(arrays: Arrays, metadata: Metadata) -> int:
     """Return the CRC-32 of the metadata and of the arrays with their names, shapes and types."""
-    check = zlib.crc32(json.dumps(facts, sort_keys=True).encode())
+    check = zlib.crc32(json.dumps(metadata, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):
         check = zlib.crc32(f"{name} {array.dtype} {array.shape}".encode(), check)
         check = zlib.crc32(array.data, check)

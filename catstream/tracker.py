@@ -26,7 +26,7 @@ from catstream.image import as_bgr
 from catstream.messages import Features, Model, Track
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
-from catstream.storage import Arrays, Facts
+from catstream.storage import Arrays, Metadata
 from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 from catstream.wire.checks import check_message
@@ -147,21 +147,21 @@ class Tracker:
             If it cannot be written.
         """
         track = self.track
-        arrays, facts = self.compressor.state()
-        model, model_facts = pack(self.detector.model, "model")
-        start, start_facts = self.detector.scm_state()
-        told: Facts = {
+        arrays, metadata = self.compressor.state()
+        model, model_metadata = pack(self.detector.model, "model")
+        start, start_metadata = self.detector.scm_state()
+        whole: Metadata = {
             "kind": _KIND,
             "program": version("catstream"),
             "settings": self.settings.texts(),
             "size": list(self._size),
             "track": pack(track, "track")[1],
-            "compressor": facts,
-            "model": model_facts,
-            "bootstrap": start_facts,
+            "compressor": metadata,
+            "model": model_metadata,
+            "bootstrap": start_metadata,
         }
         try:
-            storage.write(path, arrays | model | start, told)
+            storage.write(path, arrays | model | start, whole)
         except OSError as error:
             raise ServiceError(f"cannot write {str(path)!r} ({error}): give another file") from None
 
@@ -178,33 +178,33 @@ class Tracker:
         """
         if not Path(path).is_file():
             raise ServiceError(f"there is no saved tracker {str(path)!r}: `Tracker.save` writes one")
-        arrays, facts = storage.read(path)
+        arrays, metadata = storage.read(path)
         try:
-            if facts.get("kind") != _KIND:
-                raise ValueError(f"it is of kind {facts.get('kind')!r}, not {_KIND!r}")
-            return cls._of(arrays, facts)
+            if metadata.get("kind") != _KIND:
+                raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")
+            return cls._of(arrays, metadata)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a saved tracker ({error}): `Tracker.save` writes one") from None
 
     @classmethod
-    def _of(cls, arrays: Arrays, facts: Facts) -> Self:
-        self = cls(Settings.from_values(facts["settings"]))
-        self.compressor = Compressor.from_state(arrays, facts["compressor"], self.settings)
+    def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
+        self = cls(Settings.from_values(metadata["settings"]))
+        self.compressor = Compressor.from_state(arrays, metadata["compressor"], self.settings)
         self.trainer, self.detector = Trainer(self.settings), Detector(self.settings)
-        model = unpack(Model, arrays, facts["model"], "model")
+        model = unpack(Model, arrays, metadata["model"], "model")
         if len(model.weights) != row_length():
             raise ValueError(
                 f"its model has {len(model.weights)} weights, the features of this catstream are {row_length()}: "
-                f"catstream {facts['program']} wrote it"
+                f"catstream {metadata['program']} wrote it"
             )
         seq, state = self.compressor.seq, self.compressor.detector
         if state is None:
             raise ValueError("it does not say where the object was")
         self.detector.resume(seq, state, model)
-        self.detector.resume_scm(arrays, facts["bootstrap"])
-        height, width = facts["size"]
+        self.detector.resume_scm(arrays, metadata["bootstrap"])
+        height, width = metadata["size"]
         self._size = int(height), int(width)
-        self._track = unpack(Track, arrays, facts["track"], "track")
+        self._track = unpack(Track, arrays, metadata["track"], "track")
         for message in (model, self._track):
             check_message(message)
         kalman.prepare()

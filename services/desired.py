@@ -55,8 +55,8 @@ class DesiredState:
             If the file cannot be read.
         """
         try:
-            facts = json.loads(path.read_text())
-            return cls(**{**facts, "box": facts["box"] and Box(*facts["box"])})
+            read = json.loads(path.read_text())
+            return cls(**{**read, "box": read["box"] and Box(*read["box"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ProtocolError(
                 f"what was commanded cannot be read from {path} ({error!r}): what the run was started with holds, "

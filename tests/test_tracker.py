@@ -221,8 +221,8 @@ def test_a_tracker_of_other_features_is_refused(video, tmp_path):
     tracker = Tracker()
     tracker.init(video[0][0], video[1][0])
     tracker.save(tmp_path / "kept")
-    arrays, facts = storage.read(tmp_path / "kept")
-    storage.write(tmp_path / "kept", arrays | {"model.weights": arrays["model.weights"][:-1].copy()}, facts)
+    arrays, metadata = storage.read(tmp_path / "kept")
+    storage.write(tmp_path / "kept", arrays | {"model.weights": arrays["model.weights"][:-1].copy()}, metadata)
     with pytest.raises(ProtocolError, match="its model has 2463 weights, the features of this catstream are 2464"):
         Tracker.load(tmp_path / "kept")
 

@@ -18,7 +18,7 @@ from catstream.heads import HEADS, Head
 from catstream.messages import DetectorState, Features, Position, Sample, TrainingRows
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
-from catstream.storage import Arrays, Facts
+from catstream.storage import Arrays, Metadata
 
 __all__ = ["Compressor"]
 
@@ -151,13 +151,13 @@ class Compressor:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one file, atomically."""
-        arrays, facts = self.state()
-        storage.write(path, arrays, facts | {"kind": _KIND})
+        arrays, metadata = self.state()
+        storage.write(path, arrays, metadata | {"kind": _KIND})
 
-    def state(self) -> tuple[Arrays, Facts]:
-        """Arrays and facts that `from_state` restores."""
+    def state(self) -> tuple[Arrays, Metadata]:
+        """Arrays and metadata that `from_state` restores."""
         arrays: Arrays = {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
-        facts: Facts = {
+        metadata: Metadata = {
             "seq": self.seq,
             "frame": self.frame,
             "box": list(self.box) if self.box else None,
@@ -168,12 +168,12 @@ class Compressor:
         # model again that the detector uses.
         for name, message in (("sample", self.last_sample), ("detector", self.detector)):
             if message is not None:
-                own, facts[name] = pack(message, name)
+                own, metadata[name] = pack(message, name)
                 arrays |= own
         for name, tree in self.trees.items():
-            own, facts["trees"][name] = tree.state()
+            own, metadata["trees"][name] = tree.state()
             arrays |= {f"{name}.{key}": array for key, array in own.items()}
-        return arrays, facts
+        return arrays, metadata
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], settings: Settings) -> Compressor:
@@ -188,14 +188,14 @@ class Compressor:
         SettingsError
             If it was made with another coreset size.
         """
-        arrays, facts = storage.read(path)
-        if (kind := facts.get("kind")) != _KIND:
+        arrays, metadata = storage.read(path)
+        if (kind := metadata.get("kind")) != _KIND:
             raise ServiceError(
                 f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: go on with the catstream that wrote it, "
                 "or begin anew in another folder"
             )
         try:
-            self = cls.from_state(arrays, facts, settings)
+            self = cls.from_state(arrays, metadata, settings)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
         if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset.size}:
@@ -206,20 +206,20 @@ class Compressor:
         return self
 
     @classmethod
-    def from_state(cls, arrays: Arrays, facts: Facts, settings: Settings) -> Compressor:
+    def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings) -> Compressor:
         """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
         self = cls(settings)
-        self.seq, self.frame = int(facts["seq"]), int(facts["frame"])
-        self.box = Box(*facts["box"]) if facts["box"] else None
-        if "detector" in facts:
-            self.detector = unpack(DetectorState, arrays, facts["detector"], "detector")
-        if "sample" in facts:
-            self.last_sample = unpack(Sample, arrays, facts["sample"], "sample")
-        self._sampled_leaves = int(facts["sampled_leaves"])
+        self.seq, self.frame = int(metadata["seq"]), int(metadata["frame"])
+        self.box = Box(*metadata["box"]) if metadata["box"] else None
+        if "detector" in metadata:
+            self.detector = unpack(DetectorState, arrays, metadata["detector"], "detector")
+        if "sample" in metadata:
+            self.last_sample = unpack(Sample, arrays, metadata["sample"], "sample")
+        self._sampled_leaves = int(metadata["sampled_leaves"])
         self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]
-        for name, tree_facts in facts["trees"].items():
+        for name, tree_metadata in metadata["trees"].items():
             own = {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
-            self.trees[name] = CoresetTree.from_state(own, tree_facts)
+            self.trees[name] = CoresetTree.from_state(own, tree_metadata)
         return self
 
     def _leaves(self) -> dict[str, int]:

@@ -17,7 +17,7 @@ from catstream.compression.node import Node
 from catstream.compression.reduce import energy, reduce
 from catstream.errors import ProtocolError
 from catstream.messages import Summary
-from catstream.storage import Arrays, Facts
+from catstream.storage import Arrays, Metadata
 
 if TYPE_CHECKING:
     import os
@@ -171,8 +171,8 @@ class CoresetTree:
         """
         return cls.from_state(*storage.read(path))
 
-    def state(self) -> tuple[Arrays, Facts]:
-        """Arrays and facts that `from_state` restores."""
+    def state(self) -> tuple[Arrays, Metadata]:
+        """Arrays and metadata that `from_state` restores."""
         arrays = {"pending": self.pending}
         for i, node in enumerate(self.nodes):
             arrays[f"rows.{i}"] = node.rows
@@ -181,11 +181,11 @@ class CoresetTree:
         return arrays, {"size": self.size, "nodes": nodes}
 
     @classmethod
-    def from_state(cls, arrays: Arrays, facts: Facts) -> CoresetTree:
+    def from_state(cls, arrays: Arrays, metadata: Metadata) -> CoresetTree:
         """The tree that `state` described; ProtocolError if it is something else."""
         try:
-            tree = cls(int(facts["size"]))
-            for i, node in enumerate(facts["nodes"]):
+            tree = cls(int(metadata["size"]))
+            for i, node in enumerate(metadata["nodes"]):
                 rows, total, whole = arrays[f"rows.{i}"], arrays[f"sum.{i}"], float.fromhex(node["energy"])
                 tree.nodes.append(Node(int(node["level"]), rows, int(node["count"]), total, whole))
             tree.pending = arrays["pending"]

@@ -18,7 +18,7 @@ from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.messages import DetectorState, Features, Model, Track
 from catstream.settings import Settings
-from catstream.storage import Arrays, Facts
+from catstream.storage import Arrays, Metadata
 
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel
@@ -190,16 +190,16 @@ class Detector:
         window = Window.around(box, context)
         return DetectorState(0, "confident", window, window, Window.around(first, context))
 
-    def scm_state(self) -> tuple[Arrays, Facts | None]:
-        """Arrays and facts of the paper's first tracker, for `resume_scm`; none if it is not in use."""
+    def scm_state(self) -> tuple[Arrays, Metadata | None]:
+        """Arrays and metadata of the paper's first tracker, for `resume_scm`; none if it is not in use."""
         return ({}, None) if self._scm is None else self._scm.state()
 
-    def resume_scm(self, arrays: Arrays, facts: Facts | None) -> None:
+    def resume_scm(self, arrays: Arrays, metadata: Metadata | None) -> None:
         """Go on with the paper's first tracker, as another detector did; after `resume`."""
-        if facts is not None:
+        if metadata is not None:
             from catstream.paper.scm import SparseCollaborativeModel
 
-            self._scm = SparseCollaborativeModel.resumed(arrays, facts)
+            self._scm = SparseCollaborativeModel.resumed(arrays, metadata)
 
     def _messages(self, track: Track, training: Training, *, begins: bool = False) -> tuple[Track, Features]:
         return track, Features(track.seq, track.frame, track.time, track.box, training, self.state, begins)

@@ -23,7 +23,7 @@ from catstream.arrays import Float32, Float64
 from catstream.box import Box
 from catstream.features.compiled import kernel
 from catstream.features.pyramid import Pyramid
-from catstream.storage import Arrays, Facts
+from catstream.storage import Arrays, Metadata
 
 __all__ = ["SparseCollaborativeModel", "prepare"]
 
@@ -64,8 +64,8 @@ class SparseCollaborativeModel:
         self._discriminative = _Discriminative.trained(positives, self._background(grey))
         self._generative = _Generative.from_template(template[0], int(rng.integers(2**31)))
 
-    def state(self) -> tuple[Arrays, Facts]:
-        """Arrays and facts that `resumed` goes on from."""
+    def state(self) -> tuple[Arrays, Metadata]:
+        """Arrays and metadata that `resumed` goes on from."""
         judged, made = self._discriminative, self._generative
         arrays = {
             "scm.state": self._state,
@@ -80,12 +80,16 @@ class SparseCollaborativeModel:
         return arrays, {"box": self._first, "frames": self._frames, "particles": self._particles, "rng": chance}
 
     @classmethod
-    def resumed(cls, arrays: Arrays, facts: Facts) -> SparseCollaborativeModel:
+    def resumed(cls, arrays: Arrays, metadata: Metadata) -> SparseCollaborativeModel:
         """Go on where `state` was called, bit for bit; KeyError, TypeError or ValueError if these are none."""
         self = cls.__new__(cls)
-        self._first, self._frames, self._particles = Box(*facts["box"]), int(facts["frames"]), int(facts["particles"])
+        self._first, self._frames, self._particles = (
+            Box(*metadata["box"]),
+            int(metadata["frames"]),
+            int(metadata["particles"]),
+        )
         self._rng = np.random.default_rng()
-        self._rng.bit_generator.state = facts["rng"]
+        self._rng.bit_generator.state = metadata["rng"]
         self._state = arrays["scm.state"]
         self._discriminative = _Discriminative(
             *(arrays[f"scm.{name}"] for name in ("positives", "templates", "selected"))

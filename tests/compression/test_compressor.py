@@ -225,9 +225,9 @@ def test_a_forged_state_is_refused(energy, level, settings, messages, tmp_path):
     compressor, path = Compressor(settings), tmp_path / "state"
     take(compressor, messages, 37)
     compressor.save(path)
-    arrays, facts = storage.read(path)
-    facts["trees"]["object"]["nodes"][0] |= {"level": level, "energy": energy}
-    storage.write(path, arrays, facts)
+    arrays, metadata = storage.read(path)
+    metadata["trees"]["object"]["nodes"][0] |= {"level": level, "energy": energy}
+    storage.write(path, arrays, metadata)
     with pytest.raises(ProtocolError, match="use an older copy"):
         Compressor.load(path, settings)
 
@@ -241,8 +241,8 @@ def test_a_tree_is_no_compressor(settings, tmp_path):
 def test_a_checkpoint_of_another_version_is_refused_with_one_line(settings, messages, tmp_path):
     compressor, path = Compressor(settings), tmp_path / "000000000001.safetensors"
     take(compressor, messages, 37)
-    arrays, facts = compressor.state()
-    storage.write(path, arrays, facts | {"kind": "compressor 1"})
+    arrays, metadata = compressor.state()
+    storage.write(path, arrays, metadata | {"kind": "compressor 1"})
     with pytest.raises(ServiceError, match="is of kind 'compressor 1', this catstream reads 'compressor 2'") as error:
         CheckpointStore(tmp_path).load(settings)
     assert "\n" not in str(error.value)

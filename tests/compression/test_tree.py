@@ -47,8 +47,8 @@ def summary(tree: CoresetTree) -> np.ndarray:
 
 
 def bits(tree: CoresetTree) -> dict[str, bytes]:
-    arrays, facts = tree.state()
-    return {"facts": repr(facts).encode()} | {name: array.tobytes() for name, array in arrays.items()}
+    arrays, metadata = tree.state()
+    return {"metadata": repr(metadata).encode()} | {name: array.tobytes() for name, array in arrays.items()}
 
 
 def assert_within_the_bound(tree, rows, subspaces, squared_distance):
