@@ -6,8 +6,9 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
@@ -18,6 +19,9 @@ from catstream.cli import INTERRUPTED, interruptible
 from catstream.errors import CatstreamError
 from catstream.services.options import with_settings
 from catstream.settings import Settings
+
+if TYPE_CHECKING:
+    from catstream.evaluation.summary import Row
 
 __all__ = ["evaluate"]
 
@@ -77,7 +81,7 @@ def evaluate(
         from catstream.evaluation.onepass import evaluate as run_all
         from catstream.evaluation.report import write_report
         from catstream.evaluation.runs import EvaluationRun
-        from catstream.evaluation.summary import rows_of, to_json
+        from catstream.evaluation.summary import mean_of, rows_of, to_json
 
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
@@ -114,11 +118,10 @@ def evaluate(
     if not runs:
         raise CatstreamError("all runs have failed: see above")
     rows = rows_of(runs)
-    numbers = to_json(rows, settings)
-    console.print(_table(numbers))
+    console.print(_table(rows, mean_of(rows)))
     if json_file is not None:
         try:
-            json_file.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+            json_file.write_text(json.dumps(to_json(rows, settings), indent=1) + "\n", encoding="utf-8")
         except OSError as error:
             raise CatstreamError(f"cannot write {str(json_file)!r}: {error.strerror}") from None
     if output is not None:
@@ -140,22 +143,22 @@ def _reporting_interrupt(output: Path | None) -> Iterator[None]:
         sys.exit(INTERRUPTED)
 
 
-def _table(numbers: dict[str, Any]) -> Table:
+def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
     """Return a table of the sequences and the means."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("sequence")
     table.add_column("tracker")
     for heading in ("frames", "AUC", "success", "precision", "norm.", "F", "frames/s"):
         table.add_column(heading, justify="right")
-    for row in numbers["sequences"]:
-        table.add_row(row["name"], row["tracker"], str(row["frames"]), *_cells(row))
+    for row in rows:
+        table.add_row(row.name, row.tracker, str(row.frames), *_cells(asdict(row)))
     table.add_section()
-    for tracker, mean in numbers["mean"].items():
+    for tracker, mean in means.items():
         table.add_row("mean", tracker, "", *_cells(mean), style="bold")
     return table
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
+def _cells(row: dict[str, float | None]) -> list[str]:
     def share(measure: str) -> str:
         value, spread = row[measure], row.get(f"{measure}_spread")
         if value is None:

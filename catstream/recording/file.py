@@ -12,9 +12,9 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, Self, TypeVar
+from typing import BinaryIO, Self, TypeVar
 
 from catstream.errors import ProtocolError, RecordingError
 from catstream.messages import End, Features, Health, Model, Run, Track
@@ -54,9 +54,6 @@ TOPICS: dict[type, Topic] = {
 _TOPICS = list(TOPICS.values())
 _NUMBERS = {kind: number for number, kind in enumerate(TOPICS, 1)}
 _KINDS = {number: kind for kind, number in _NUMBERS.items()}
-
-_ENCODERS: dict[str, Callable[[Any], bytes]] = {"json": encode_json, "msgpack": encode}
-_DECODERS: dict[str, Callable[[bytes, type], Any]] = {"json": decode_json, "msgpack": decode}
 
 _NOUNS = {Features: "features", Model: "models", Track: "tracks", Health: "reports of health"}
 
@@ -134,7 +131,8 @@ class RecordingWriter:
     def _add(self, message: Recorded, before: bytes = b"") -> None:
         number, now = _NUMBERS[type(message)], time.time_ns()
         sequence = getattr(message, "seq", getattr(message, "version", 0))
-        entry = pack(number, sequence, now, _ENCODERS[TOPICS[type(message)].encoding](message))
+        data = encode_json(message) if TOPICS[type(message)].encoding == "json" else encode(message)
+        entry = pack(number, sequence, now, data)
         place = self._size + len(before)
         self._append(before + entry)
         self._index.add(place, len(entry), number, now)
@@ -254,8 +252,7 @@ class Recording:
 
     def _decode(self, entry: Entry, kind: type[_Kind]) -> _Kind:
         try:
-            message: _Kind = _DECODERS[TOPICS[kind].encoding](entry.data, kind)
-            return message
+            return decode_json(entry.data, kind) if TOPICS[kind].encoding == "json" else decode(entry.data, kind)
         except ProtocolError as error:
             raise RecordingError(
                 f"{self.path} holds a message at byte {entry.place} that this version of catstream cannot read: {error}"

@@ -15,7 +15,7 @@ schema (`catstream.wire.checks`). A field that this version does not know is ign
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgpack
 import msgspec
@@ -65,7 +65,7 @@ def encode(message: object) -> bytes:
     return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
 
 
-def decode(data: bytes | memoryview, *kinds: type) -> Any:
+def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
     """The message in `data`, one of `kinds`. Its arrays are read-only.
 
     Raises
@@ -101,7 +101,7 @@ def decode(data: bytes | memoryview, *kinds: type) -> Any:
     if kind not in kinds:
         raise ProtocolError(f"expected {expected}, got {_brief(name)}", "kind")
     try:
-        message: object = msgspec.convert(fields, kind, dec_hook=_array)
+        message: Message = msgspec.convert(fields, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
         raise ProtocolError(f"{name}: {error}", "type") from None
     check_message(message)

@@ -142,7 +142,7 @@ class ChannelSocket(Generic[Message]):
     ) -> Kind | None:
         """The message in `data`, None if it is rejected."""
         try:
-            message: Kind = decode(data, *kinds)
+            message = decode(data, *kinds)
             if check is not None:
                 check(message)
         except ProtocolError as error:
