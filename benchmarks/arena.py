@@ -23,7 +23,7 @@ from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.job import Job
 from catstream.messages import End, Position, Track
-from catstream.services.loop import REFUSED
+from catstream.services.loop import PERMANENT_FAILURE
 from catstream.services.start import service_command
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
@@ -208,7 +208,7 @@ class Arena:
             )
         for name, process in self._processes.items():
             code = process.poll()
-            if code == REFUSED:
+            if code == PERMANENT_FAILURE:
                 raise ServiceError(f"the {name} gave up: {self.words()}")
             if code and self.end is None:
                 self.deaths += 1

@@ -1,7 +1,7 @@
-"""`python -P -m catstream.services NAME`: THE LIST of processes, a command each.
+"""`python -P -m catstream.services NAME`: runs one process of a pipeline.
 
-Each process can be started by hand, in any order; `catstream track` starts them all. What a process works on is its
-`catstream.job.Job`: the options of a command build one, and a parent process gives its children the file of one.
+Each process can be started by hand, in any order; `catstream track` starts them all. A process works on a
+`catstream.job.Job`: the options of a command define it, or the parent process passes a file that contains it.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _PATH = click.Path(path_type=Path)
 def main() -> None:
     """The processes of a catstream pipeline.
 
-    They meet at an endpoint: a folder that holds their sockets, or tcp://127.0.0.1:PORT. All need
-    the same settings. With -P, no file in the current folder is imported.
+    They connect at an endpoint: a folder for their sockets, or tcp://127.0.0.1:PORT. All need the
+    same settings. With -P, Python imports no file from the current folder.
 
     \b
       mkdir -m 700 run
@@ -43,23 +43,23 @@ def main() -> None:
 
 
 _source = click.argument("source")
-_state = click.option("--state", type=_PATH, help="Folder of the checkpoints and of what was commanded.")
-_record = click.option("--record", type=_PATH, help="File that the compressor records to; it goes on with one.")
+_state = click.option("--state", type=_PATH, help="Folder for the checkpoints and the desired state.")
+_record = click.option("--record", type=_PATH, help="Recording that the compressor writes or continues.")
 
 
 @main.command()
 @_source
-@click.option("--resume", is_flag=True, help="Go on where a detector before this one stopped.")
-@click.option("--owned", is_flag=True, help="Another process receives every track from the channel `results`.")
+@click.option("--resume", is_flag=True, help="Continue after the last message that a previous detector sent.")
+@click.option("--owned", is_flag=True, help="Send the tracks to another process too, which must acknowledge them.")
 @_record
 @_state
 @with_object
 @with_part
 @with_settings
 def detector(**options: Any) -> None:
-    """Frames in; tracks and features out, with the newest model.
+    """Track the object in the frames of SOURCE; send tracks and features.
 
-    With --record it waits until the compressor listens to the tracks.
+    With --record, it waits until the compressor has subscribed to the tracks.
     """
     _run("detector", Job(**options))
 
@@ -70,14 +70,14 @@ def detector(**options: Any) -> None:
 @with_model
 @with_settings
 def compressor(**options: Any) -> None:
-    """Features in, samples out; owns the coreset trees."""
+    """Compress the features in coreset trees; send samples."""
     _run("compressor", Job(**options))
 
 
 @main.command()
 @with_settings
 def trainer(**options: Any) -> None:
-    """Samples in, models out."""
+    """Train models on the samples; send models."""
     _run("trainer", Job(**options))
 
 
@@ -87,7 +87,7 @@ def trainer(**options: Any) -> None:
 @with_part
 @with_settings
 def supervisor(**options: Any) -> None:
-    """Start the other three on a source, and keep them running."""
+    """Start the other three processes for SOURCE, and restart any that dies."""
     from catstream.services import supervisor
 
     _log_as("supervisor")
@@ -97,9 +97,9 @@ def supervisor(**options: Any) -> None:
 @main.command(hidden=True)
 @click.argument("name", type=click.Choice(["detector", "compressor", "trainer"]))
 @click.argument("file", type=_PATH)
-@click.option("--parent", type=int, required=True, help="Process id of the parent, with which the process ends.")
-@click.option("--watchdog", type=int, help="File descriptor of the memory that the parent watches.")
-@click.option("--restarted", is_flag=True, help="Go on where the process before this one stopped.")
+@click.option("--parent", type=int, required=True, help="Process id of the parent; this process ends with it.")
+@click.option("--watchdog", type=int, help="File descriptor of the watchdog's shared memory.")
+@click.option("--restarted", is_flag=True, help="Continue the work of a process that died.")
 def child(name: str, file: Path, parent: int, watchdog: int | None, restarted: bool) -> None:
     """Run one process of the job in a file."""
     job = Job.load(file)
@@ -118,7 +118,7 @@ def _run(name: str, job: Job, parent: Parent | None = None) -> NoReturn:
 
 
 def _log_as(name: str) -> None:
-    """Begin each line of the log with the name of the process, by which the supervisor finds them."""
+    """Begin each line of the log with the name of the process; the supervisor selects the lines by it."""
     logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
 
 

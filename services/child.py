@@ -10,26 +10,26 @@ import time
 from collections import deque
 from pathlib import Path
 
-from catstream.services.loop import BROKEN
+from catstream.services.loop import SOURCE_FAILED
 from catstream.services.start import environment, service_command
 from catstream.services.watchdog import Watchdog
 
 __all__ = ["Child"]
 
-_STEP_SECONDS = 0.5  # the most that counts between two calls of `hangs`: a parent that slept longer has seen nothing
-_STOPPED_SECONDS = 2.0  # a process that SIGSTOP has stopped for so long hangs, whatever it was doing
+_STEP_SECONDS = 0.5  # the most that counts between two calls of `hangs`, as the parent itself may have been suspended
+_STOPPED_SECONDS = 2.0  # a process that SIGSTOP has stopped for so long counts as hung
 _LAST_LINE = 2000  # bytes at the end of the log in which the last line is searched for
 _LOG_STEP = 65536  # bytes of the log that are read at once
 
 
 class Child:
-    """A process of the job in a file, which may be started again and again.
+    """One process of a job, which can be restarted.
 
     Parameters
     ----------
-    name : of the process
-    job : file of the job
-    folder : for the log
+    name : name of the process
+    job : file that contains the job
+    folder : folder for the log
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Child:
         self.killed = False
         self.restarts: deque[float] = deque()
         self.silent = 0.0  #: seconds since the count of turns last changed
-        self._stopped = 0.0  # of which it was stopped by a signal
+        self._stopped = 0.0  # seconds of these in which it was stopped by a signal
         self._turns = 0.0
         self._watchdog = Watchdog()
         self._process: subprocess.Popen[bytes] | None = None
@@ -70,7 +70,7 @@ class Child:
         )
 
     def schedule(self, due: float) -> None:
-        """Have a process that ended started again at a moment."""
+        """Set the moment at which a process that ended is restarted."""
         self._process, self.due = None, due
 
     @property
@@ -90,11 +90,11 @@ class Child:
 
     @property
     def finished(self) -> bool:
-        """Whether the process has done its work."""
-        return self.code in (0, BROKEN)
+        """Whether the process ended normally, or because the source broke."""
+        return self.code in (0, SOURCE_FAILED)
 
     def hangs(self, seconds: float) -> bool:
-        """Whether the loop of the process has stood still for too long, `seconds` after this was last asked."""
+        """Whether the loop of the process has been stuck for too long; the last call was `seconds` ago."""
         if (turns := self._watchdog.turns) != self._turns:
             self._turns, self.silent, self._stopped = turns, 0.0, 0.0
             return False
@@ -109,7 +109,7 @@ class Child:
         return False
 
     def terminate(self, seconds: float) -> None:
-        """Ask the process to end, and wait at most so long."""
+        """Ask the process to end, and wait at most `seconds` for it."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -129,7 +129,7 @@ class Child:
         self._watchdog.close()
 
     def news(self) -> list[str]:
-        """The lines that the process logged since this was last called, without those of Python itself."""
+        """The lines that the process logged since the last call, without the output of Python itself."""
         # The child writes at the position of the file, which `pread` leaves alone.
         whole, end, _ = os.pread(self._log.fileno(), _LOG_STEP, self._read).rpartition(b"\n")
         self._read += len(whole) + len(end)

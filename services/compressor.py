@@ -1,4 +1,4 @@
-"""Features in, samples out; owns the coreset trees, and stores them on disk as they grow."""
+"""The process that compresses features in coreset trees, stores the trees on disk, and sends samples."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ def main(process: Process) -> None:
     with ExitStack() as stack:
         loop = CompressorLoop(process, stack)
         end: End | None = None
-        while end is None and not loop.over:
+        while end is None and not loop.must_stop:
             message = loop.receive()
             if isinstance(message, End):
                 end = message
             elif message is not None:
-                loop.take(message)
+                loop.insert(message)
             loop.store_and_acknowledge(message)
             loop.publish_health(last=end is not None)
         if end is not None:
-            process.broken = end.failed
+            process.source_failed = end.failed
             loop.end(end)
         else:
-            loop.leave()
+            loop.stop()
 
 
 class CompressorLoop:
@@ -73,9 +73,9 @@ class CompressorLoop:
             self._samples.send(self._compressor.last_sample)
 
     @property
-    def over(self) -> bool:
-        """Whether the process was asked to end, and its sender, if there is one, did not end in time."""
-        return self._process.ended_for(_SENDER_SECONDS if self._features.has_sender else 0)
+    def must_stop(self) -> bool:
+        """Whether the process was asked to end, and a connected detector did not send its end in time."""
+        return self._process.stop_requested_for(_SENDER_SECONDS if self._features.has_sender else 0)
 
     def receive(self) -> Features | End | None:
         """The next message, None if none arrives in a tenth of a second."""
@@ -86,16 +86,16 @@ class CompressorLoop:
             self._recorder.receive()
         return message
 
-    def take(self, features: Features) -> None:
+    def insert(self, features: Features) -> None:
         """Insert features into the trees, and send the sample if there is a new one."""
-        if self._recorder is not None:  # before a checkpoint: the recording misses nothing that a checkpoint holds
+        if self._recorder is not None:  # before a checkpoint: the recording then contains all of its features
             self._recorder.write(features)
         sample = self._compressor.take(features)
         if sample is not None:
             self._samples.send(sample)
 
     def store_and_acknowledge(self, message: Features | End | None) -> None:
-        """Write a checkpoint if one is due, then answer and acknowledge what was received."""
+        """Write a checkpoint if one is due, then answer position requests and acknowledge the message."""
         before, seq, run = self._progress, self._compressor.seq, self._process.settings.run
         end = message if isinstance(message, End) else None
         urgent = self._checkpoints is None or end is not None or before.is_urgent(seq, run.unstored_frames)
@@ -128,8 +128,8 @@ class CompressorLoop:
             self._recorder.receive()
             self._process.beat(self._counters)
 
-    def leave(self) -> None:
-        """Store what was received: the sender goes on with another compressor."""
+    def stop(self) -> None:
+        """Store all received messages; the sender continues with the next compressor."""
         if self._compressor.seq > self._progress.stored:
             self._store(urgent=False)
             self._features.acknowledge(self._progress.position)
@@ -148,12 +148,12 @@ class CompressorLoop:
 
 
 def _checkpoints(job: Job, stack: ExitStack) -> CheckpointStore | None:
-    """The checkpoints of a run, locked for this process; None if nothing is kept."""
+    """The checkpoints of a run, locked for this process; None if the run has no state folder."""
     return None if job.state is None else CheckpointStore(stack.enter_context(locked(job.state / TREES, _LOCK_SECONDS)))
 
 
 def _compressor(job: Job, checkpoints: CheckpointStore | None) -> Compressor:
-    """A compressor that goes on from the newest checkpoint, or from a saved model, or begins anew."""
+    """A compressor that continues from the newest checkpoint or from a saved model, or a new one."""
     compressor = checkpoints.load(job.settings) if checkpoints is not None else Compressor(job.settings)
     if job.model is not None and not compressor.seq:
         return Compressor.from_sample(Learned.load(job.model).sample, job.settings)

@@ -21,12 +21,12 @@ _log = logging.getLogger(__name__)
 class CommandChannel(Responder):
     """Connects a `CommandHandler` to its socket and to its file.
 
-    A desired state is on disk before the command that asked for it is answered. A full disk is logged, and stops
-    nothing.
+    The desired state is written to disk before a command is answered. If the disk is full, this is logged, and the
+    command is carried out nevertheless.
 
     Parameters
     ----------
-    file : for the desired state, None if it is not kept
+    file : file for the desired state; None if it is not stored
     """
 
     def __init__(self, endpoint: Endpoint, handler: CommandHandler, file: Path | None) -> None:
@@ -38,11 +38,11 @@ class CommandChannel(Responder):
     def carry_out(self) -> bool:
         """Carry out the commands that have arrived; return whether there were any."""
         commands = self.receive_all()
-        self._conclude(self._handler.take(commands))
+        self._conclude(self._handler.carry_out(commands))
         return bool(commands)
 
     def begin(self, frame: Frame) -> tuple[Track, Features] | None:
-        """The first track and features, if a command asked to begin with a box in the next frame."""
+        """Return the first track and features, if a command has set a box for this frame."""
         found, answers = self._handler.begin(frame)
         self._conclude(answers)
         return found
@@ -52,21 +52,21 @@ class CommandChannel(Responder):
         self._conclude(self._handler.reject_boxes(reason))
 
     def end(self, reason: str) -> None:
-        """Reject every command from now on but `save`."""
+        """Mark the end of the stream: from now on, every command except `save` is rejected."""
         self._conclude(self._handler.end(reason))
 
-    def release(self) -> None:
-        """Everything is done: a detector that is resumed one day is not stopped."""
-        self._handler.release()
+    def clear_stop(self) -> None:
+        """Clear the command `stop` at the end of the run, so that a resumed detector does not stop at once."""
+        self._handler.clear_stop()
         self._conclude([])
 
     def _conclude(self, answers: Iterable[Answer]) -> None:
-        """Keep the desired state if it has changed, then send the answers."""
+        """Store the desired state if it has changed, then send the answers."""
         if self._file is not None and self._handler.desired != self._kept:
             self._kept = self._handler.desired
             try:
                 self._kept.save(self._file)
             except OSError as error:
-                _log.warning("what was commanded cannot be kept in %s (%s)", self._file, error.strerror)
+                _log.warning("the desired state cannot be written to %s (%s)", self._file, error.strerror)
         for answer in answers:
             self.answer(answer)

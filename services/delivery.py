@@ -1,4 +1,4 @@
-"""The last messages of a process: what is done while a receiver has not stored them, and when it is given up."""
+"""Delivery of one message on an acknowledged channel: a pure decision whether to send, wait or give up."""
 
 from __future__ import annotations
 
@@ -8,36 +8,36 @@ __all__ = ["Step", "next_step"]
 
 
 class Step(Enum):
-    """What to do about one message of an acknowledged channel."""
+    """The next step in the delivery of a message."""
 
-    SEND = "hand the message to the socket: its window was full"
+    SEND = "try to send the message again: the window was full"
     WAIT = "wait until the receiver has stored it"
     DONE = "the message is stored"
-    GIVE_UP = "the receiver is gone"
+    GIVE_UP = "the time-out is over"
 
 
-def next_step(*, sent: bool, stored: bool, asked_seconds: float, patience_seconds: float) -> Step:
-    """What to do about a message next.
+def next_step(*, sent: bool, stored: bool, seconds_since_stop: float, patience_seconds: float) -> Step:
+    """Return the next step in the delivery of a message.
 
-    While nobody has asked the process to end, it waits for as long as a receiver takes: a receiver that died is
-    restarted. A process that was asked to end has limited patience.
+    A process waits for a receiver without a time-out, as a receiver that died is restarted. Only after the process was
+    asked to end, there is a time-out.
 
     Parameters
     ----------
-    sent : whether the window has taken the message
+    sent : whether the message was sent, so that it is in the window
     stored : whether the receiver has stored it
-    asked_seconds : time since the process was asked to end, negative if it was not
-    patience_seconds : how long to wait after that
+    seconds_since_stop : time since the process was asked to end, negative if it was not
+    patience_seconds : time-out, from that moment
 
     Examples
     --------
-    >>> next_step(sent=True, stored=False, asked_seconds=-1, patience_seconds=0).name
+    >>> next_step(sent=True, stored=False, seconds_since_stop=-1, patience_seconds=0).name
     'WAIT'
-    >>> next_step(sent=True, stored=False, asked_seconds=2.5, patience_seconds=0.5).name
+    >>> next_step(sent=True, stored=False, seconds_since_stop=2.5, patience_seconds=0.5).name
     'GIVE_UP'
     """
     if sent and stored:
         return Step.DONE
-    if asked_seconds >= patience_seconds:
+    if seconds_since_stop >= patience_seconds:
         return Step.GIVE_UP
     return Step.WAIT if sent else Step.SEND

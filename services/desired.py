@@ -1,4 +1,4 @@
-"""The desired state of a detector: what its commands ask for, kept on disk for a detector that is started again."""
+"""The desired state of a detector, as set by commands; it is stored on disk for a restarted detector."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["DesiredState"]
 
 @dataclass(frozen=True, slots=True)
 class DesiredState:
-    """The state that holds until a command asks for another one.
+    """The state that a detector keeps until a command changes it.
 
-    box      the object in its first frame; about its size if it is searched for; None while a box is waited for
+    box      the object in its first frame; of about its size if a saved model searches for it; None before a box is set
     begins   seq of the message of that first frame, 0 if the object is found by a saved model
-    paused   whether no frame is followed
-    stopped  whether the stream ends at once
+    paused   whether tracking is paused
+    stopped  whether the stream is to end
     """
 
     box: Box | None = None
@@ -31,11 +31,11 @@ class DesiredState:
 
     @property
     def holds(self) -> bool:
-        """Whether no frame is followed now: the run is paused, or waits for a box."""
+        """Whether no frames are tracked: the run is paused, or waits for a box."""
         return self.paused or self.box is None
 
     def save(self, path: Path) -> None:
-        """Write it to a file atomically.
+        """Write the state to a file atomically.
 
         Raises
         ------
@@ -59,6 +59,6 @@ class DesiredState:
             return cls(**{**read, "box": read["box"] and Box(*read["box"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ProtocolError(
-                f"what was commanded cannot be read from {path} ({error!r}): what the run was started with holds, "
-                "command the rest again"
+                f"the desired state cannot be read from {path} ({error!r}): the run starts with its original box, "
+                "repeat later commands"
             ) from None

@@ -1,7 +1,7 @@
-"""Frames in; tracks and features out, with the newest model.
+"""The process that tracks the object in each frame with the newest model, and sends tracks and features.
 
-`main` is the order of events, and `DetectorLoop` connects them to sockets. What is decided on the way is decided by
-`resume`, `pacing`, `delivery` and `commands`, which know no socket.
+`main` shows the order of events, and `DetectorLoop` connects them to sockets. The decisions are pure functions in
+`resume`, `pacing`, `delivery` and `commands`.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ Message = TypeVar("Message", bound=Track | Features | End)
 _FILE = "desired_state.json"  # in the folder of the state
 _COMPRESSOR_SECONDS = 10.0  # time for the compressor to store the end, once the process was asked to end
 _OWNER_SECONDS = 0.5  # the same for the owner of the run, which may no longer receive
-_OPEN_SECONDS = 60.0  # limit for opening the source, and for learning the first frame
-_SKIP_SECONDS = 0.1  # limit for decoding a frame that is passed over
+_OPEN_SECONDS = 60.0  # limit for opening the source, and for the first frame
+_SKIP_SECONDS = 0.1  # limit for decoding a skipped frame
 _TURN_SECONDS = 0.02  # from one turn of a waiting loop to the next
-_SUBSCRIBERS_SECONDS = 5.0  # limit for the subscribers that wait for this pipeline to connect
+_SUBSCRIBERS_SECONDS = 5.0  # limit for announced subscribers to connect
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
 _log = logging.getLogger(__name__)
 
 
 def main(process: Process) -> None:
-    """Follow the object of the job to the last frame of its source."""
+    """Track the object of the job to the last frame of its source."""
     process.source = _shown(process.job.source)
     learned = Learned.load(process.job.model) if process.job.model is not None else None
     reason, failed = "the source came to its end", False
@@ -64,17 +64,17 @@ def main(process: Process) -> None:
         frames = loop.open(stack)
         try:
             for frame in frames:
-                found = loop.follow(frame)
-                if found is not None:
-                    loop.send(frame, *found)
+                result = loop.track(frame)
+                if result is not None:
+                    loop.send(frame, *result)
                     loop.wait_for_model()
-                if loop.over:
+                if loop.end_reason:
                     break
-            reason = loop.over or reason
+            reason = loop.end_reason or reason
         except VideoError as error:
             reason, failed = str(error), True
         loop.end(reason, failed)
-        process.broken = failed
+        process.source_failed = failed
         if failed:
             _log.error("%s", reason)
 
@@ -95,40 +95,40 @@ class DetectorLoop:
         self._outputs = stack.enter_context(Outputs(process))
         self._models = stack.enter_context(Subscriber(MODELS, process.endpoint))
         self._source: Source | None = None
-        self._skipped = 0  # frames that were passed over because the run is paused or waits for a box
+        self._skipped = 0  # frames that were skipped while the run was paused or waited for a box
         self._version = 0  # of the model of the last track
 
     @property
-    def over(self) -> str:
-        """Why no frame is followed any more, empty before that."""
-        return "it was stopped" if self._process.ended else self._commands.over
+    def end_reason(self) -> str:
+        """Reason for which no more frames are tracked; empty while frames are tracked."""
+        return "it was stopped" if self._process.stop_requested else self._commands.end_reason
 
     def turn(self, sender: Sender[Any] | None = None) -> None:
-        """One turn of a waiting loop: take in acknowledgements, then `attend`.
+        """One turn of a waiting loop: process acknowledgements and commands, and publish the health.
 
-        It waits a short time for the acknowledgements of a sender, if one is given.
+        If a sender is given, wait a short time for its acknowledgements.
         """
         self._outputs.poll(sender)
-        self.attend()
+        self._serve()
 
-    def attend(self) -> None:
+    def _serve(self) -> None:
         """Serve late joiners, carry out the commands that have arrived, and publish the health."""
         self._outputs.serve_late_joiners()
         commanded = self._control.carry_out()
         self._process.beat(self._counters, now=commanded)
 
     def wait_for_subscribers(self) -> None:
-        """Wait for the recorder, as long as it takes, and for announced subscribers, for a few seconds."""
+        """Wait for the recorder without a time-out, and for announced subscribers for a few seconds."""
         recorded = self._process.job.record is not None
         deadline = time.monotonic() + _SUBSCRIBERS_SECONDS
         while (recorded and not self._outputs.has_subscribers) or (
             not self._outputs.all_connected and time.monotonic() < deadline
         ):
             self._outputs.poll(self._outputs.features)
-            self._attend_or_exit()
+            self._serve_or_exit()
 
     def resume(self, learned: Learned | None) -> None:
-        """Go on after the last message that all receivers have stored."""
+        """Continue after the last message that all receivers have stored."""
         kalman.prepare()  # while the others answer
         model: Model | None = None
         positions = [self._position(sender) for sender in self._outputs.senders]
@@ -147,19 +147,19 @@ class DetectorLoop:
             sender.resume(begin.seq, position.seq)
 
     def _position(self, sender: Sender[Any]) -> Position:
-        """The answer of a receiver, however long it takes."""
-        while (position := sender.ask_position()) is None:  # no `poll`, which would take the answer
-            self._attend_or_exit()
+        """The position that a receiver reports; there is no time-out."""
+        while (position := sender.ask_position()) is None:  # without `poll`, which would consume the answer
+            self._serve_or_exit()
         return position
 
-    def _attend_or_exit(self) -> None:
-        """One turn before the first frame: nothing was sent yet, so the process may end at once."""
-        self.attend()
-        if self._process.ended:
+    def _serve_or_exit(self) -> None:
+        """One turn before the first frame: no message was sent yet, so the process may exit at once."""
+        self._serve()
+        if self._process.stop_requested:
             raise SystemExit(0)
 
     def open(self, stack: ExitStack) -> Iterator[Frame]:
-        """Open the source. The frame before the first one wanted is read too: there may be none after it."""
+        """Open the source at the frame before the next one, which always exists."""
         job, settings = self._process.job, self._process.settings
         first = max(self.detector.seq - 1, 0)
         once, each = opening_seconds(job.part, first)
@@ -179,97 +179,99 @@ class DetectorLoop:
         return self._source if self._source.live else stack.enter_context(closing(read_ahead(self._source)))
 
     def _idle(self) -> bool:
-        """One turn while a live source gives no frame; returns whether to wait no longer."""
+        """One turn while a live source provides no frame; returns whether to stop waiting."""
         self.turn()
         if self._source is not None and self._source.counters.get("lost_seconds"):
-            self._control.reject_boxes("the source is lost, so there is no frame for a box: ask again once it is back")
-        return bool(self.over)
+            self._control.reject_boxes("the source is lost, so there is no frame for a box: try again once it is back")
+        return bool(self.end_reason)
 
-    def follow(self, frame: Frame) -> tuple[Track, Features] | None:
-        """The track and the features of a frame; None if it is passed over."""
+    def track(self, frame: Frame) -> tuple[Track, Features] | None:
+        """The track and the features of a frame; None if it is skipped."""
         if frame.number < self.detector.seq:
             return None
         self.turn()
-        found = self._begin(frame) or self._hold(frame)
-        if found is not None or self.over:
-            return found
+        result = self._begin(frame) or self._hold(frame)
+        if result is not None or self.end_reason:
+            return result
         if self._commands.desired.holds:
             self._skipped += 1
             return None
         return self._step(frame)
 
     def _hold(self, frame: Frame) -> tuple[Track, Features] | None:
-        """Wait with a frame in hand while the run is paused or has no box; one of a live source is not held."""
+        """Keep a frame while the run is paused or has no box; frames of a live source are not kept."""
         if self._commands.desired.holds:
             self._outputs.show(self.detector.seq, frame.image, None)
         live = self._source is not None and self._source.live
-        while self._commands.desired.holds and not self.over and not live:
+        while self._commands.desired.holds and not self.end_reason and not live:
             time.sleep(_TURN_SECONDS)
             self.turn()
-            if (found := self._begin(frame)) is not None:
-                return found
+            if (result := self._begin(frame)) is not None:
+                return result
         return None
 
     def _begin(self, frame: Frame) -> tuple[Track, Features] | None:
-        """The track and the features of a frame in which a command gave the box."""
+        """The track and the features of a frame for which a command has set the box."""
         if self._commands.has_box:
             self._process.allow(_OPEN_SECONDS)
         return self._control.begin(frame)
 
     def _step(self, frame: Frame) -> tuple[Track, Features]:
-        """The track and the features of a frame that is followed for the first time, or once more after a restart."""
+        """The track and the features of a frame, which may be repeated after a restart."""
         detector, desired, seq = self.detector, self._commands.desired, self.detector.seq + 1
         for model in self._models.receive_all():
             detector.adopt(model)
         if seq <= max(desired.begins, 1):
             self._process.allow(_OPEN_SECONDS)
-        if seq < desired.begins:  # a frame of the object before, which is forgotten: only the owner lacks its track
+        if seq < desired.begins:  # a frame of the previous object: only its track is missing, at the owner
             return detector.miss(frame.time)
         if seq == desired.begins and desired.box is not None:
             return detector.init(frame.image, desired.box, frame.time)
         return detector.step(frame.image, frame.time)
 
     def send(self, frame: Frame, track: Track, features: Features) -> None:
-        """Send what one frame gave; wait while a window is full."""
+        """Send the track and the features of a frame; wait while a window is full."""
         track = replace(track, pts=frame.pts)
         self._version = track.model_version
         self._outputs.publish_track(track)
         if (results := self._outputs.results) is not None:
             self._deliver(results, track)
-            # In lockstep the owner is never behind: after a crash, all go on after the same message.
-            while self._process.settings.run.lockstep and results.taken < track.seq and not self._process.ended:
+            # In lockstep the owner is never behind: after a crash, all continue after the same message.
+            while (
+                self._process.settings.run.lockstep and results.taken < track.seq and not self._process.stop_requested
+            ):
                 self.turn(results)
         self._outputs.publish_features(features)
         self._deliver(self._outputs.features, features)
         self._outputs.show(track.frame, frame.image, track)
         if track.frame >= self._process.settings.search.motion_frames // 2:
-            kalman.prepare()  # after as many frames more, a model brings the motion
+            kalman.prepare()  # a model contains the motion after twice as many frames
 
     def wait_for_model(self) -> None:
-        """Wait until learning is no further behind than it may be: see `catstream.services.pacing`."""
+        """Wait until the model is recent enough: see `catstream.services.pacing`."""
         settings, features = self._process.settings, self._outputs.features
         due = features.sent - (0 if settings.run.lockstep else settings.run.lag_frames)
         live = self._source is not None and self._source.live
-        while not live and not self.over:
+        while not live and not self.end_reason:
             match awaited(due, features.taken, features.sample_of(due), self.detector.newest_version):
                 case Awaited.NOTHING:
                     return
                 case Awaited.TAKEN:
                     self.turn(features)
-                case Awaited.MODEL:  # a compressor that died with the sample needs the features again: hence the turn
+                case Awaited.MODEL:  # `turn` retransmits features to a restarted compressor
                     if (model := self._models.receive(_TURN_SECONDS)) is not None:
                         self.detector.adopt(model)
                     self.turn()
 
     def end(self, reason: str, failed: bool) -> None:
-        """Send the end of the stream, and wait until it is stored; not for long, if the process was asked to end."""
+        """Send the end of the stream, and wait until it is stored; with a time-out if the process was asked to end."""
         self._control.end(reason)
         features, results, seq = self._outputs.features, self._outputs.results, self.detector.seq
         self._deliver(features, End(seq + 1, reason, failed), _COMPRESSOR_SECONDS, stored=True)
         end = End(seq + 1, reason, failed, {"sent": float(seq), "stored": float(min(features.stored, seq))})
         if results is not None:
             self._deliver(results, end, _OWNER_SECONDS, stored=True)
-        self._control.release()
+        self._control.clear_stop()
         self._outputs.publish_track(end)
         self._outputs.publish_features(end)
         self._process.beat(self._counters, now=True)
@@ -277,13 +279,13 @@ class DetectorLoop:
     def _deliver(
         self, sender: Sender[Message], message: Message, patience: float = 0.0, *, stored: bool = False
     ) -> None:
-        """Send a message on an acknowledged channel, and wait until its window takes it, or until it is stored."""
+        """Send a message on an acknowledged channel; wait for room in its window, or until it is `stored`."""
         sent = sender.send(message)
         while True:
             step = next_step(
                 sent=sent,
                 stored=not stored or sender.acknowledged >= message.seq,
-                asked_seconds=self._process.asked_seconds,
+                seconds_since_stop=self._process.seconds_since_stop,
                 patience_seconds=patience,
             )
             match step:
@@ -291,8 +293,8 @@ class DetectorLoop:
                     return
                 case Step.GIVE_UP:
                     if not sent:
-                        gone = "message %d of %s could not be sent: its receiver is gone"
-                        _log.warning(gone, message.seq, sender.channel.name)
+                        lost = "message %d of %s was not sent: its receiver did not answer in time"
+                        _log.warning(lost, message.seq, sender.channel.name)
                     return
                 case Step.WAIT:
                     self.turn(sender)
@@ -316,18 +318,18 @@ class DetectorLoop:
 
 
 def opening_seconds(part: slice, first: int) -> tuple[float, float]:
-    """Limits for opening a source at frame `first` of a part, and for what each frame takes more than usual."""
+    """Time limits: for opening a source at frame `first` of a part, and the additional time for each frame."""
     step = part.step or 1
     return _OPEN_SECONDS + ((part.start or 0) + first * step) * _SKIP_SECONDS, (step - 1) * _SKIP_SECONDS
 
 
 def _desired(process: Process, learned: Learned | None) -> DesiredState:
-    """The desired state at the start: the one that was kept, if the run goes on, otherwise that of the job."""
+    """The desired state at the start: the stored one if the run is resumed, otherwise that of the job."""
     job = process.job
     if job.resume and job.state is not None and (job.state / _FILE).exists():
         try:
             return DesiredState.load(job.state / _FILE)
-        except ProtocolError as error:  # everything that was learned is whole, and is gone on with
+        except ProtocolError as error:  # the checkpoints are not affected, so the run continues
             process.trouble = str(error)
             _log.warning("%s", error)
     if job.box is not None:
@@ -336,7 +338,7 @@ def _desired(process: Process, learned: Learned | None) -> DesiredState:
 
 
 def _shown(source: str) -> str:
-    """A source as anybody may read it: an address loses user, password, and the query, which may contain them too.
+    """A source without secrets: an address without user, password and query, which may contain them too.
 
     >>> _shown("http://me:secret@10.0.0.7/video.mjpg?pwd=secret")
     'http://10.0.0.7/video.mjpg'

@@ -1,4 +1,4 @@
-"""What every process of the pipeline has: signals, health, a watchdog, exit codes, and an end with its parent."""
+"""The frame of every process of the pipeline: signals, health, watchdog, exit codes, and its end with the parent."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 from catstream.wire.rejects import rejects
 
-__all__ = ["BROKEN", "REFUSED", "Parent", "Process", "die_with", "run"]
+__all__ = ["PERMANENT_FAILURE", "SOURCE_FAILED", "Parent", "Process", "die_with", "run"]
 
-#: Exit code of a process that would fail in the same way again: it is not restarted.
-REFUSED = 2
+#: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
+PERMANENT_FAILURE = 2
 
-#: Exit code of a process that did its work on a source that broke: it is not restarted either.
-BROKEN = 3
+#: Exit code after the source failed, for example a damaged file: the process is not restarted either.
+SOURCE_FAILED = 3
 
 _HEALTH_SECONDS = 1.0
 _CLOSE_SECONDS = 30.0  # limit for closing all sockets after the last turn
@@ -35,10 +35,10 @@ _log = logging.getLogger(__name__)
 
 
 class Parent(NamedTuple):
-    """The process that started this one, and that this one must not outlive.
+    """The parent process; this process ends with it.
 
     pid       its process id
-    watchdog  file descriptor of the memory that it watches, None if it watches none
+    watchdog  file descriptor of the watchdog's shared memory; None if the parent has no watchdog
     """
 
     pid: int
@@ -50,49 +50,49 @@ class Process:
 
     Attributes
     ----------
-    job : what the run is
-    settings, endpoint : of the job
-    trouble, source : what is wrong now, for a person, and the source; both are published with the health
-    broken : whether the source broke, as the `End` of the stream reports
+    job : the job of the run
+    settings, endpoint : settings and endpoint of the job
+    trouble, source : description of a current problem, and the source; both are published with the health
+    source_failed : whether the stream ended because the source failed
     """
 
     def __init__(self, name: str, job: Job, watchdog: int | None = None) -> None:
         self.name, self.job, self.settings = name, job, job.settings
         self.endpoint = Endpoint.parse(job.endpoint or job.settings.run.endpoint, job.settings.run.keys)
         self.trouble = self.source = ""
-        self.broken = False
+        self.source_failed = False
         # One turn of the compressor or the trainer takes a time that grows with the coreset size.
         factor = 1.0 if name == "detector" else max(1.0, (job.settings.coreset.size / _QUICK_SIZE) ** 2)
         self._watchdog = Watchdog(watchdog, PATIENCE * factor)
-        self._asked = float("inf")  # when a signal asked the process to end
+        self._stop_moment = float("inf")  # at which a signal asked the process to end
         self._health = Publisher(HEALTH, self.endpoint, sender=name)
         self._reported = 0.0
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._end)
 
     @property
-    def ended(self) -> bool:
+    def stop_requested(self) -> bool:
         """Whether a signal has asked the process to end."""
-        return self.asked_seconds >= 0
+        return self.seconds_since_stop >= 0
 
     @property
-    def asked_seconds(self) -> float:
+    def seconds_since_stop(self) -> float:
         """Seconds since a signal asked the process to end; negative if none has."""
-        return time.monotonic() - self._asked
+        return time.monotonic() - self._stop_moment
 
     @property
     def run(self) -> Run:
         """The settings of the pipeline, which a recording needs to repeat the learning."""
         return Run.from_settings(self.settings.portable())
 
-    def ended_for(self, seconds: float) -> bool:
-        """Whether a signal asked the process to end at least so long ago."""
-        return self.asked_seconds >= seconds
+    def stop_requested_for(self, seconds: float) -> bool:
+        """Whether a signal asked the process to end at least `seconds` ago."""
+        return self.seconds_since_stop >= seconds
 
     def beat(self, counters: Callable[[], dict[str, float]], now: bool = False) -> None:
         """Reset the watchdog, and publish the health once a second or `now`; call it in each turn of a loop."""
         self._watchdog.beat()
-        if now:  # this may be the last turn, and sockets take their time to close
+        if now:  # this may be the last turn, and closing the sockets may take long
             self._watchdog.allow(_CLOSE_SECONDS)
         if now or time.monotonic() - self._reported >= _HEALTH_SECONDS:
             self._reported = time.monotonic()
@@ -113,14 +113,14 @@ class Process:
         self._health.close()
 
     def _end(self, *_: object) -> None:
-        self._asked = min(self._asked, time.monotonic())
+        self._stop_moment = min(self._stop_moment, time.monotonic())
 
 
 def run(name: str, main: Callable[[Process], None], job: Job, parent: Parent | None) -> int:
     """Run a service; return its exit code.
 
-    The code is 0 at the end of the stream or after SIGTERM, `BROKEN` if the source broke, and `REFUSED` for an error
-    that would happen again.
+    The code is 0 at the end of the stream or after SIGTERM, `SOURCE_FAILED` if the source failed, and
+    `PERMANENT_FAILURE` for an error that would occur again.
 
     Parameters
     ----------
@@ -139,12 +139,12 @@ def run(name: str, main: Callable[[Process], None], job: Job, parent: Parent | N
         return 1
     except CatstreamError as error:
         _log.error("%s", error)
-        return REFUSED
-    return BROKEN if process.broken else 0
+        return PERMANENT_FAILURE
+    return SOURCE_FAILED if process.source_failed else 0
 
 
 def die_with(parent: int) -> None:
     """Let the kernel kill this process when its parent ends, so that no orphan is left."""
     ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # it ended before the kernel was told
+    if os.getppid() != parent:  # the parent ended before the call of prctl
         raise SystemExit(0)

@@ -20,7 +20,7 @@ __all__ = ["with_given", "with_model", "with_object", "with_part", "with_reading
 _Command = TypeVar("_Command", bound=Callable[..., None])
 
 with_model = click.option(
-    "--model", type=click.Path(path_type=Path), metavar="FILE", help="What `catstream save` wrote of the object."
+    "--model", type=click.Path(path_type=Path), metavar="FILE", help="Model of the object, written by `catstream save`."
 )
 
 
@@ -32,7 +32,9 @@ def with_object(command: _Command) -> _Command:
     @wraps(command)
     def wrapped(box: str | None, model: Path | None, **options: object) -> None:
         if box is not None and model is not None:
-            raise click.UsageError("--box says where the object is, with --model it is searched for: give one of them")
+            raise click.UsageError(
+                "--box gives the position of the object, and --model searches for it: give one of them"
+            )
         command(box=Box.parse(box) if box is not None else None, model=model, **options)
 
     return cast(_Command, wrapped)
@@ -41,9 +43,9 @@ def with_object(command: _Command) -> _Command:
 def with_part(command: _Command) -> _Command:
     """Add `--start`, `--end` and `--stride`, as the argument `part`, a slice."""
 
-    @click.option("--start", type=click.IntRange(0), metavar="N", help="The first frame, of a file or folder.")
-    @click.option("--end", type=click.IntRange(0), metavar="N", help="The frame to stop before.")
-    @click.option("--stride", type=click.IntRange(1), metavar="N", help="Follow each N-th frame only.")
+    @click.option("--start", type=click.IntRange(0), metavar="N", help="First frame, for a file or folder.")
+    @click.option("--end", type=click.IntRange(0), metavar="N", help="Frame before which to stop.")
+    @click.option("--stride", type=click.IntRange(1), metavar="N", help="Track only every N-th frame.")
     @wraps(command)
     def wrapped(start: int | None, end: int | None, stride: int | None, **options: object) -> None:
         command(part=slice(start, end, stride), **options)
@@ -65,10 +67,10 @@ def with_given(command: _Command) -> _Command:
 
 
 def with_reading(command: _Command) -> _Command:
-    """Add `--fps` and `--skip-damaged`, two settings of how a file is read, to the argument `given`."""
+    """Add `--fps` and `--skip-damaged`, two settings for reading a file, to the argument `given`."""
 
     @click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default.")
-    @click.option("--skip-damaged", is_flag=True, help="Go on after a damaged place in a video file.")
+    @click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video file.")
     @wraps(command)
     def wrapped(given: dict[str, object], fps: float | None, skip_damaged: bool, **options: object) -> None:
         rate = {} if fps is None else {"run.image_rate": fps}

@@ -25,9 +25,9 @@ class Outputs:
 
     Attributes
     ----------
-    features : to the compressor
-    results : the tracks once more, to the owner of the run; None if it has no owner
-    senders : those of the two that exist, the features first
+    features : sender of the features to the compressor
+    results : sender of the tracks to the owner of the run; None if it has no owner
+    senders : both senders, `features` first; without `results` if it is None
     """
 
     def __init__(self, process: Process) -> None:
@@ -51,7 +51,7 @@ class Outputs:
 
     @property
     def has_subscribers(self) -> bool:
-        """Whether anybody receives the tracks."""
+        """Whether the tracks have a subscriber."""
         return self._tracks.has_subscribers
 
     @property
@@ -60,26 +60,26 @@ class Outputs:
         return all(publisher.all_connected for publisher in self._publishers.values())
 
     def poll(self, awaited: Sender[Any] | None = None) -> None:
-        """Take in acknowledgements, waiting a short time for one of the sender that is awaited."""
+        """Process acknowledgements; wait a short time for one to the sender `awaited`."""
         for sender in self.senders:
             sender.poll(_TURN_SECONDS if sender is awaited else 0)
 
     def serve_late_joiners(self) -> None:
-        """Take in who has subscribed, and send the greeting or the newest picture to those who have just come."""
+        """Send the greeting or the newest preview to new subscribers."""
         for publisher in self._publishers.values():
             publisher.serve_late_joiners()
         self._previews.turn()
 
     def publish_track(self, track: Track | End) -> None:
-        """Send a track, or the end, to all who subscribe."""
+        """Send a track, or the end, to all subscribers."""
         self._tracks.send(track)
 
     def publish_features(self, features: Features | End) -> None:
-        """Send features, or the end, to all who subscribe."""
+        """Send features, or the end, to all subscribers."""
         self._training.send(features)
 
     def show(self, frame: int, image: np.ndarray, track: Track | None) -> None:
-        """Have a picture of a frame sent, with the box of its track."""
+        """Send a preview of a frame, with the box of its track, if one is due."""
         self._previews.show(frame, image, track.box if track is not None else None)
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""How far the detector may be ahead of learning: pure decisions over the progress of the other processes."""
+"""Limits the lag of training behind the detector: a pure decision from the progress of the other processes."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ __all__ = ["Awaited", "awaited"]
 
 
 class Awaited(Enum):
-    """The event that the detector waits for before it takes its next frame."""
+    """The event that the detector waits for before its next frame."""
 
     TAKEN = "the compressor receives the features of a frame"
     MODEL = "a model arrives that was learned from that frame"
-    NOTHING = "the next frame may be taken"
+    NOTHING = "no event: the next frame may be processed"
 
 
 def awaited(due: int, taken: int, sample: int, newest: int) -> Awaited:
-    """What the detector waits for.
+    """Return the event that the detector waits for.
 
     Parameters
     ----------
-    due : seq of the newest features that have to be learned from by now, 0 or less if there are none yet
-    taken : seq of the newest features that the compressor has taken
-    sample : version of the newest sample that the features up to `due` led to, as far as it is known
-    newest : version of the newest model that arrived
+    due : seq of the newest features that the model must include by now; 0 or less if there are none yet
+    taken : seq of the newest features that the compressor has received
+    sample : version of the newest sample of the features up to `due`, as far as it is known
+    newest : version of the newest model that was received
 
     Examples
     --------

@@ -39,7 +39,7 @@ class Previews(Publisher[Preview]):
         self.turn()
 
     def turn(self) -> None:
-        """Send the picture that is due; call it in every turn, also while no frame arrives: subscribers may join."""
+        """Send a preview if one is due; call it in every turn, even if no frame arrives, as subscribers may join."""
         self.serve_late_joiners()
         if self._waiting is None or not self.has_subscribers or monotonic() - self._shown < _PERIOD:
             return

@@ -1,4 +1,4 @@
-"""How far a stream is stored, and when a checkpoint is due: pure decisions; nothing is written here."""
+"""The stored part of a stream, and when a checkpoint is due: pure decisions without I/O."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["Progress"]
 class Progress:
     """The progress of a receiver that stores what it receives.
 
-    position  the answer to a sender: it need not repeat what comes before
+    position  the answer to a sender: messages up to it need not be retransmitted
     stored    seq of the newest message that is in a checkpoint
-    tried     moment at which the last checkpoint was tried
+    tried     moment of the last attempt to write a checkpoint
     """
 
     position: Position
@@ -23,21 +23,21 @@ class Progress:
     tried: float
 
     def is_urgent(self, seq: int, window: int) -> bool:
-        """Whether half of the sender's window waits to be stored: a full window would stop the sender."""
+        """Whether half of the sender's window is not stored yet: a full window would block the sender."""
         return 2 * (seq - self.position.seq) >= window
 
     def is_due(self, seq: int, now: float, interval: float) -> bool:
-        """Whether there are messages that are not stored, and the interval between checkpoints is over."""
+        """Whether some messages are not stored, and the interval between checkpoints is over."""
         return seq > self.stored and now - self.tried >= interval
 
     def after(self, position: Position, now: float, *, saved: bool, urgent: bool) -> Progress:
-        """The progress after a checkpoint was tried.
+        """The progress after an attempt to write a checkpoint.
 
-        If the disk takes nothing, an urgent checkpoint counts although it is in memory only: learning goes on.
+        If the disk is full, an urgent checkpoint is acknowledged although it is only in memory: training continues.
 
         Parameters
         ----------
-        position : of the newest message that was received
+        position : position of the newest received message
         saved : whether the checkpoint was written
         urgent : whether the sender waits for it
         """
@@ -49,12 +49,12 @@ class Progress:
     def acknowledgement(self, version: int, end: End | None) -> Position:
         """The position to acknowledge.
 
-        A sample needs no checkpoint: in lockstep the detector waits for its model. The end of a stream holds no
-        features, so it is stored with the messages before it.
+        A sample is acknowledged without a checkpoint, because in lockstep the detector waits for its model. The end of
+        a stream contains no features, so it counts as stored with the messages before it.
 
         Parameters
         ----------
-        version : of the newest sample
+        version : version of the newest sample
         end : the end of the stream, if it was received
         """
         position = replace(self.position, version=version)

@@ -1,4 +1,4 @@
-"""Records a pipeline: subscribes to tracks, models and health, and is given the features."""
+"""Records a pipeline: subscribes to tracks, models and health; the caller adds the features."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Recorder:
 
     Parameters
     ----------
-    writer : of the recording; the caller closes it
-    endpoint : of the pipeline
+    writer : writer of the recording; the caller closes it
+    endpoint : endpoint of the pipeline
     reader : name under which the subscription to the tracks was announced; empty if it was not
 
     Attributes
     ----------
-    end : the pipeline's `End`, None before it
-    failed : why writing has ended; empty before
+    end : the pipeline's `End`, None before it was received
+    failed : error that has ended the writing; empty if there was none
     """
 
     def __init__(self, writer: RecordingWriter, endpoint: Endpoint, reader: str = "") -> None:

@@ -1,4 +1,4 @@
-"""From where a detector goes on that takes the place of another one: pure decisions over what the others answer."""
+"""The position at which a restarted detector continues: pure decisions from the answers of the other processes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ __all__ = ["Start", "agree", "start"]
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """The point of a stream from which a detector goes on.
+    """The point of a stream after which a detector continues.
 
     seq       the last message that every receiver has stored
-    detector  state of the detector after that message, None if the object begins anew
-    model     the model that belongs to that state, None if the object begins anew
+    detector  state of the detector after that message; None if tracking starts anew
+    model     the model that belongs to that state; None if tracking starts anew
     """
 
     seq: int
@@ -27,14 +27,14 @@ class Start:
 
 
 def agree(features: Position, model: Model | None) -> bool:
-    """Whether the compressor and the trainer are at the same sample, so that the detector can go on.
+    """Whether the compressor and the trainer are at the same sample, so that the detector can continue.
 
-    Either of them may have died too, and repeats then what it has done.
+    Either of them may have been restarted too, and then repeats its last steps.
 
     Parameters
     ----------
-    features : what the compressor answered
-    model : the newest model that arrived, None before the first
+    features : answer of the compressor
+    model : the newest model that was received, None before the first
     """
     return not features.version or (model is not None and model.version == features.version)
 
@@ -45,16 +45,16 @@ def start(
     desired: DesiredState,
     state_at: Callable[[Box, Box], DetectorState],
 ) -> Start:
-    """From where the detector goes on: after the last message that every receiver has stored.
+    """Return the start of the detector: after the last message that every receiver has stored.
 
-    If nothing was learned of the present object yet, it goes on from the first frame of that object.
+    If nothing was learned of the current object yet, it starts at the first frame of that object.
 
     Parameters
     ----------
-    positions : what the receivers answered, the compressor first
-    model : the newest model, for which `agree` holds
+    positions : answers of the receivers, that of the compressor first
+    model : the newest model, for which `agree` is true
     desired : the object and its first message
-    state_at : state of a detector of which only the last and the first box are known
+    state_at : returns the state of a detector from only its last and its first box
     """
     begins = max(desired.begins, 1)
     last = min(positions, key=lambda position: position.seq)

@@ -13,7 +13,7 @@ from pathlib import Path
 from catstream.errors import ServiceError
 from catstream.job import Job
 from catstream.services.child import Child
-from catstream.services.loop import BROKEN, REFUSED
+from catstream.services.loop import PERMANENT_FAILURE, SOURCE_FAILED
 from catstream.video.frames import without_password
 from catstream.video.source import is_live
 from catstream.wire.endpoint import meeting_place, private_folder
@@ -39,12 +39,12 @@ class Supervisor:
 
     Parameters
     ----------
-    job : what to run; if it names no state folder, the state is kept in `folder`
-    folder : for the file of the job, and for the logs
+    job : the job of the run; without a state folder, the state is stored in `folder`
+    folder : folder for the file of the job, and for the logs
     """
 
     def __init__(self, job: Job, folder: Path) -> None:
-        # A restarted detector goes on with the times of a live source.
+        # A restarted detector continues the timestamps of a live source.
         since = time.monotonic() if job.since is None else job.since
         file = replace(job, state=job.state or folder, since=since).save(folder)
         self._checked = time.monotonic()
@@ -54,7 +54,7 @@ class Supervisor:
 
     @property
     def pids(self) -> dict[str, int]:
-        """Process id by name, of the processes that run."""
+        """Process ids of the running processes, by name."""
         return {name: child.pid for name, child in self._children.items() if child.pid is not None}
 
     @property
@@ -64,26 +64,26 @@ class Supervisor:
 
     @property
     def finished(self) -> bool:
-        """Whether the detector has ended well, which it does once everything that it sent is stored."""
+        """Whether the detector has ended normally; it does so once all of its messages are stored."""
         return self._children["detector"].finished
 
     @property
     def failure(self) -> str:
-        """Why the source broke, once all is done; empty if it did not."""
+        """Error of the source, once the detector has ended; empty if the source did not fail."""
         detector = self._children["detector"]
-        return detector.last_line() if detector.code == BROKEN else ""
+        return detector.last_line() if detector.code == SOURCE_FAILED else ""
 
     def news(self, name: str) -> list[str]:
-        """The lines that a child logged since this was last called."""
+        """The lines that a child has logged since the last call."""
         return self._children[name].news()
 
     def check_children(self) -> None:
-        """Restart the children that died, kill those that hang, and log it.
+        """Restart the children that died, and kill those that hang; both are logged.
 
         Raises
         ------
         ServiceError
-            If a child would only die again; says why.
+            If a restart is useless; contains the error of the child.
         """
         if self.finished:
             return
@@ -97,7 +97,7 @@ class Supervisor:
                 child.seen = now
                 self._check_hanging(child, self._checked - before)
             elif child.finished:
-                # It was asked to end, and the detector was not; or the detector died after its end, and repeats it.
+                # Only this child was asked to end, or the detector died after it sent its end and has to repeat it.
                 if now - child.seen > _APART_SECONDS:
                     child.start()
             else:
@@ -112,7 +112,7 @@ class Supervisor:
 
     def _restart(self, child: Child, code: int, now: float) -> None:
         """Schedule the restart of a child that died with an exit code."""
-        if code == REFUSED:
+        if code == PERMANENT_FAILURE:
             raise ServiceError(child.last_line())
         child.restarts.append(now)
         recent = sum(now - moment < _PER_SECONDS for moment in child.restarts)
@@ -136,9 +136,9 @@ class Supervisor:
 
 
 def main(job: Job) -> int:
-    """Run a pipeline for its subscribers until the source ends or a signal comes; return the exit code.
+    """Run a pipeline for its subscribers until the source ends or a signal arrives; return the exit code.
 
-    The code is `BROKEN` if the source broke, otherwise 0.
+    The code is `SOURCE_FAILED` if the source failed, otherwise 0.
     """
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -154,7 +154,7 @@ def main(job: Job) -> int:
                 _log.error("%s", failure)
         finally:
             supervisor.stop()
-    return BROKEN if failure else 0
+    return SOURCE_FAILED if failure else 0
 
 
 def _ending(code: int) -> str:

@@ -1,4 +1,4 @@
-"""Samples in, models out; always from the newest sample, as older ones are stale."""
+"""The process that trains models; always on the newest sample, as older ones are stale."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ def main(process: Process) -> None:
     trainer = Trainer(process.settings)
     counters = {"version": 0.0, "trained": 0.0}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:
-        while not process.ended:
+        while not process.stop_requested:
             message = samples.receive(0.1)
             if isinstance(message, End):
-                process.broken = message.failed
+                process.source_failed = message.failed
                 process.beat(counters.copy, now=True)
                 return
-            # An older version is of a compressor that lost the newer one: it is made again, and a detector may need it.
+            # An older version comes from a restarted compressor that lost the newer one; a detector may need its model.
             if message is not None and message.version != counters["version"]:
                 process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
                 if message.frame >= process.settings.search.motion_frames // 2:
-                    kalman.prepare()  # after as many frames more, a sample contains the centres
+                    kalman.prepare()  # a sample contains the centres after twice as many frames
                 counters = {"version": float(message.version), "trained": counters["trained"] + 1}
             models.serve_late_joiners()
             process.beat(counters.copy)

@@ -1,7 +1,7 @@
 """The watchdog of a process: a count of the turns of its loop, in memory that its parent can read.
 
-Parent and child share a few bytes of memory. Nothing is sent, so nothing can be late, full or lost: a parent that slept
-reads the newest count at once, and the count stops as soon as the loop does, whatever other threads go on.
+Parent and child share a few bytes of memory. No messages are involved, which could be late or lost: a parent that was
+suspended reads the newest count at once, and the count stops with the loop, even if other threads continue.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import time
 
 __all__ = ["PATIENCE", "Watchdog"]
 
-#: Seconds without a turn after which a loop whose turns are short counts as stuck.
+#: Seconds without a turn after which a loop with short turns counts as stuck.
 PATIENCE = 2.5
 
 _SIZE = 16  # two float64: turns, and patience
 _START_SECONDS = 120.0  # for imports and compiling kernels
-_LONGEST_SECONDS = 60.0  # the most patience that slow turns alone lead to
+_LONGEST_SECONDS = 60.0  # upper limit of the patience that follows from slow turns
 _TURNS_LONG = 5.0  # patience as a multiple of the slowest recent turn
 _FADES = 0.99  # factor by which the slowest recent turn is forgotten with each turn
 
@@ -68,7 +68,7 @@ class Watchdog:
         self._cells[0] += 1
 
     def allow_each(self, seconds: float) -> None:
-        """Add to the time that each turn from now on may take."""
+        """Add to the time that each later turn may take."""
         self._least += seconds
 
     def close(self) -> None:

@@ -54,7 +54,7 @@ def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, stee
     assert state() == "paused"
     code, answer = steer("save", tmp_path / "one")
     assert (code, "nothing was learned of the object yet" in answer) == (1, True), answer
-    assert steer("resume") == (0, "it goes on after frame 0")
+    assert steer("resume") == (0, "resumed after frame 0")
     errors = run.communicate(timeout=120)[1]
     assert run.returncode == 0, errors
     (hint,) = (line for line in errors.splitlines() if line.startswith("it waits for a box: "))

@@ -171,7 +171,7 @@ def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
 @pytest.mark.parametrize("torn", ["", "{", "null", '{"box": [1, 2]}'], ids=repr)
 def test_commands_that_a_power_cut_tore_are_an_error(tmp_path, torn):
     (tmp_path / "desired_state.json").write_text(torn)
-    with pytest.raises(ProtocolError, match="what was commanded cannot be read"):
+    with pytest.raises(ProtocolError, match="the desired state cannot be read"):
         DesiredState.load(tmp_path / "desired_state.json")
 
 
@@ -182,7 +182,7 @@ def test_commands_that_a_power_cut_tore_are_said_and_the_run_goes_on(video, tmp_
     (tmp_path / "kept" / "desired_state.json").write_text("{")
     with Pipeline(resume=tmp_path / "kept", settings=SETTINGS) as pipeline:
         tracks = list(pipeline)
-    assert "what was commanded cannot be read" in pipeline.trouble["detector"]
+    assert "the desired state cannot be read" in pipeline.trouble["detector"]
     assert pipeline.restarts == 0
     assert 0 < tracks[0].frame <= before.frame + SETTINGS.run.unstored_frames
     assert tracks[0].model_version > 0, "what was learned is whole"

@@ -34,7 +34,7 @@ class Steering(RuleBasedStateMachine):
     def give(self, verb, box=None, keep=False):
         command = Command(next(self.ids), verb, box, keep)
         self.open.add(command.id)
-        return self.answered(self.handler.take([command]))
+        return self.answered(self.handler.carry_out([command]))
 
     def answered(self, answers):
         for answer in answers:
@@ -86,7 +86,7 @@ class Steering(RuleBasedStateMachine):
     def the_desired_state_is_what_was_asked_for_last(self):
         desired = self.handler.desired
         assert (desired.paused, desired.stopped, desired.box) == (self.paused, self.stopped, self.box)
-        assert self.handler.over == (STOPPED if self.stopped else "")
+        assert self.handler.end_reason == (STOPPED if self.stopped else "")
         assert len(self.open) == 0 or self.handler.has_box
 
 
@@ -96,8 +96,8 @@ TestSteering.settings = settings(max_examples=30, stateful_step_count=12, deadli
 
 def test_a_handler_that_is_released_forgets_that_it_was_stopped():
     handler = CommandHandler(Detector(Settings()), DesiredState(BOXES[0], begins=1))
-    handler.take([Command("1", "stop")])
+    handler.carry_out([Command("1", "stop")])
     assert handler.desired.stopped
-    handler.release()
+    handler.clear_stop()
     assert handler.desired == DesiredState(BOXES[0], begins=1)
-    assert handler.over == STOPPED
+    assert handler.end_reason == STOPPED
