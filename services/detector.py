@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from catstream import kalman
 from catstream.detection.detector import Detector
@@ -23,7 +23,7 @@ from catstream.services.control import CommandChannel
 from catstream.services.delivery import Step, next_step
 from catstream.services.desired import DesiredState
 from catstream.services.loop import Process
-from catstream.services.outputs import Outputs
+from catstream.services.outputs import DataSender, Outputs
 from catstream.services.pacing import Awaited, awaited
 from catstream.services.resume import agree, start
 from catstream.video.ahead import read_ahead
@@ -35,7 +35,7 @@ from catstream.wire.newest import Subscriber
 
 __all__ = ["main", "opening_seconds"]
 
-Message = TypeVar("Message", bound=Track | Features | End)
+Message = TypeVar("Message", Features | End, Track | End)
 
 _FILE = "desired_state.json"  # in the folder of the state
 _COMPRESSOR_SECONDS = 10.0  # time for the compressor to store the end, once the process was asked to end
@@ -103,7 +103,7 @@ class DetectorLoop:
         """Reason for which no more frames are tracked; empty while frames are tracked."""
         return "it was stopped" if self._process.stop_requested else self._commands.end_reason
 
-    def turn(self, sender: Sender[Any] | None = None) -> None:
+    def turn(self, sender: DataSender | None = None) -> None:
         """One turn of a waiting loop: process acknowledgements and commands, and publish the health.
 
         If a sender is given, wait a short time for its acknowledgements.
@@ -146,7 +146,7 @@ class DetectorLoop:
         for sender, position in zip(self._outputs.senders, positions, strict=True):
             sender.resume(begin.seq, position.seq)
 
-    def _position(self, sender: Sender[Any]) -> Position:
+    def _position(self, sender: DataSender) -> Position:
         """The position that a receiver reports; there is no time-out."""
         while (position := sender.ask_position()) is None:  # without `poll`, which would consume the answer
             self._serve_or_exit()

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
-from catstream.messages import End, Features, Track
+from catstream.messages import End, Features, Run, Track
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
 from catstream.wire.acknowledged import Sender
@@ -15,7 +15,10 @@ from catstream.wire.announced import readers_of
 from catstream.wire.channels import FEATURES, RESULTS, TRACKS, TRAINING
 from catstream.wire.newest import Publisher
 
-__all__ = ["Outputs"]
+__all__ = ["DataSender", "Outputs"]
+
+#: Sends one of the two streams that are received without a loss.
+DataSender = Sender[Features | End] | Sender[Track | End]
 
 _TURN_SECONDS = 0.02  # the longest wait for an acknowledgement in one turn of a loop
 
@@ -40,13 +43,13 @@ class Outputs:
             self._training = stack.enter_context(Publisher(TRAINING, endpoint, greeting=process.run))
             self._previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
-        self.senders: list[Sender[Any]] = [self.features] + ([self.results] if self.results is not None else [])
+        self.senders: list[DataSender] = [self.features, *([self.results] if self.results is not None else [])]
         for channel, readers in readers_of(endpoint).items():
             if (publisher := self._publishers.get(channel)) is not None:
                 publisher.expect(readers)
 
     @property
-    def _publishers(self) -> dict[str, Publisher[Any]]:
+    def _publishers(self) -> dict[str, Publisher[Track | End] | Publisher[Run | Features | End]]:
         return {"tracks": self._tracks, "training": self._training}
 
     @property
@@ -59,7 +62,7 @@ class Outputs:
         """Whether all subscribers that had announced themselves are connected."""
         return all(publisher.all_connected for publisher in self._publishers.values())
 
-    def poll(self, awaited: Sender[Any] | None = None) -> None:
+    def poll(self, awaited: DataSender | None = None) -> None:
         """Process acknowledgements; wait a short time for one to the sender `awaited`."""
         for sender in self.senders:
             sender.poll(_TURN_SECONDS if sender is awaited else 0)
