@@ -27,7 +27,7 @@ _FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unst
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """The files that `catstream track` writes for a run; a resumed run goes on with the same files.
+    """The files that `catstream track` writes for a run; a resumed run continues the same files.
 
     output      folder of the results files, None for none
     video       whether an annotated video is among the results files
@@ -64,7 +64,7 @@ class Job:
 
     endpoint  where the processes meet; the setting of the same name if this is empty
     state     folder of the checkpoints and of the desired state; None if nothing is kept
-    resume    whether the processes go on with that state
+    resume    whether the processes continue from that state
     record    file that the compressor records all messages to
     owned     whether the process that started the run receives every track on the channel `results`
     since     value of `time.monotonic` from which the times of a live source count; None for its first frame
@@ -137,18 +137,18 @@ class Job:
         return (folder / _NAME).exists()
 
     def check_fits(self, other: Job, folder: Path) -> None:
-        """Raise SettingsError if another job cannot go on with what was learned by this one, kept in `folder`."""
+        """Raise SettingsError if another job cannot continue from what this one learned, kept in `folder`."""
         if other.size != self.size or other.part != self.part:
             raise SettingsError(
                 f"what is kept in {str(folder)!r} is of {self._frames()}, and this would be {other._frames()}: "
-                "go on with the same frames, or begin anew in another folder"
+                "continue with the same frames, or begin anew in another folder"
             )
         ours, theirs = self.settings.values(), other.settings.values()
         for name in sorted(ours.keys() - _FREE):
             if ours[name] != theirs[name]:
                 raise SettingsError(
                     f"what is kept in {str(folder)!r} was learned with {name}={ours[name]}, not {theirs[name]}: "
-                    "go on with the same settings (they are kept too: give none), or begin anew in another folder"
+                    "continue with the same settings (they are kept too: give none), or begin anew in another folder"
                 )
 
     def _frames(self) -> str:

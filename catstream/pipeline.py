@@ -66,7 +66,7 @@ class Pipeline:
     box : str or four numbers
         x, y, w, h of the object in the first frame, in pixels: `(120, 80, 64, 48)` or `"120,80,64,48"`. Without a
         box or a model, the run waits for the box that `catstream.control` gives: a file stays at its first frame, a
-        live source goes on.
+        live source continues.
     settings : Settings or mapping of str
         The settings that differ from the defaults, or from those of the run that is resumed.
     model : path
@@ -135,7 +135,7 @@ class Pipeline:
         save_model: str | os.PathLike[str] | None = None,
     ) -> None:
         if state is not None and resume is not None:
-            raise SettingsError("a run is begun in a folder (state) or goes on in one (resume): give one of them")
+            raise SettingsError("a run begins in a folder (state) or continues in one (resume): give one of them")
         self._kept = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         given = settings.changed() if isinstance(settings, Settings) else settings or {}
@@ -186,7 +186,7 @@ class Pipeline:
     def starting_after(self, position: Position | None) -> Self:
         """The same run, that has not started yet, with another `after`."""
         if self._stack is not None:
-            raise ServiceError("the pipeline has started: say after which track it goes on before that")
+            raise ServiceError("the pipeline has started: give the track after which it continues before that")
         other = copy(self)
         other._after = position
         return other
@@ -382,7 +382,7 @@ class Pipeline:
         """Take in the health, restart processes that died, and log what the user should know."""
         self._receive_health()
         self._children.check_children()
-        for line in self._children.news("detector"):
+        for line in self._children.new_lines("detector"):
             if self.live or line == COMPILING:  # a live source is lost, or is back
                 _log.warning("%s", line)
         if self._children.finished:
@@ -446,7 +446,7 @@ def _begun(folder: Path, kept: Job | None, job: Job) -> Iterator[None]:
     with locked(folder):
         if kept is None and began(folder):
             raise ServiceError(
-                f"a pipeline was kept in {str(folder)!r} already: go on with it (--resume {folder}), "
+                f"a pipeline was kept in {str(folder)!r} already: continue it (--resume {folder}), "
                 "or give another folder"
             )
         if job != kept:

@@ -1,4 +1,4 @@
-"""The state of a pipeline on disk: what it needs to go on after a power cut.
+"""The state of a pipeline on disk: what it needs to continue after a power cut.
 
     DIR/job.safetensors     the job of the run, readable by its owner only: see `catstream.job`
     DIR/desired_state.json  what was commanded: see `catstream.services.desired`

@@ -113,7 +113,7 @@ class one_thread(ContextDecorator):
 
     Parameters
     ----------
-    opencv : also limit OpenCV to one thread; this may not be used by several threads at once
+    opencv : also limit OpenCV to one thread; this must not be used by several threads at once
 
     >>> from threadpoolctl import threadpool_info
     >>> import numpy

@@ -102,7 +102,7 @@ class Tracker:
         detector = Detector(self.settings)
         detector.prepare()  # a library is held to one thread if it is there when a call begins
         with one_thread():
-            first = detector.init(image, start, time)  # if the box is refused, all goes on as before
+            first = detector.init(image, start, time)  # if the box is refused, nothing changes
             self.detector, self.compressor, self.trainer = detector, compressor, trainer
             self._size = image.shape[:2]
             self._learn(*first)
@@ -137,7 +137,7 @@ class Tracker:
         return self.track.box is not None, self.track.box
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all that was learned to one file, whole or not at all: `Tracker.load` goes on from there.
+        """Write all that was learned to one file, whole or not at all: `Tracker.load` continues from there.
 
         Raises
         ------
@@ -167,7 +167,7 @@ class Tracker:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """A tracker that goes on where `save` was called, bit for bit.
+        """A tracker that continues where `save` was called, bit for bit.
 
         Raises
         ------

@@ -50,7 +50,7 @@ class Child:
         self._watchdog = Watchdog()
         self._process: subprocess.Popen[bytes] | None = None
         self._log = (folder / f"{name}.log").open("w+b")
-        self._read = 0  # bytes of the log that `news` has returned
+        self._read = 0  # bytes of the log that `new_lines` has returned
 
     def start(self) -> None:
         """Start the process."""
@@ -128,7 +128,7 @@ class Child:
         self._log.close()
         self._watchdog.close()
 
-    def news(self) -> list[str]:
+    def new_lines(self) -> list[str]:
         """The lines that the process logged since the last call, without the output of Python itself."""
         # The child writes at the position of the file, which `pread` leaves alone.
         whole, end, _ = os.pread(self._log.fileno(), _LOG_STEP, self._read).rpartition(b"\n")

@@ -1,7 +1,7 @@
 """Decides the effect of each command on a detector; sends, receives and stores nothing itself.
 
 A command that needs no frame is carried out at once. A box is applied to the next frame that is tracked; during a pause
-of a file, to the current frame.
+of a file, to the frame that is held.
 """
 
 from __future__ import annotations

@@ -346,4 +346,4 @@ def _shown(source: str) -> str:
     text = without_password(source)
     if "://" in text:
         text = text.partition("?")[0]
-    return text.encode(errors="replace").decode()[:_LONGEST_SOURCE]  # the name of a file may not be UTF-8
+    return text.encode(errors="replace").decode()[:_LONGEST_SOURCE]  # the name of a file need not be UTF-8

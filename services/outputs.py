@@ -40,7 +40,7 @@ class Outputs:
             owned = process.job.owned
             self.results = stack.enter_context(Sender(RESULTS, endpoint, window)) if owned else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
-            self._training = stack.enter_context(Publisher(TRAINING, endpoint, greeting=process.run))
+            self._training = stack.enter_context(Publisher(TRAINING, endpoint, first_message=process.run))
             self._previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
         self.senders: list[DataSender] = [self.features, *([self.results] if self.results is not None else [])]
@@ -68,7 +68,7 @@ class Outputs:
             sender.poll(_TURN_SECONDS if sender is awaited else 0)
 
     def serve_late_joiners(self) -> None:
-        """Send the greeting or the newest preview to new subscribers."""
+        """Send the first message or the newest preview to new subscribers."""
         for publisher in self._publishers.values():
             publisher.serve_late_joiners()
         self._previews.turn()

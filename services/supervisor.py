@@ -73,9 +73,9 @@ class Supervisor:
         detector = self._children["detector"]
         return detector.last_line() if detector.code == SOURCE_FAILED else ""
 
-    def news(self, name: str) -> list[str]:
+    def new_lines(self, name: str) -> list[str]:
         """The lines that a child has logged since the last call."""
-        return self._children[name].news()
+        return self._children[name].new_lines()
 
     def check_children(self) -> None:
         """Restart the children that died, and kill those that hang; both are logged.

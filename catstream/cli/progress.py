@@ -43,7 +43,7 @@ class _Line(ProgressColumn):
 
 
 class RunProgress:
-    """Counts the tracks of a run, and shows them while it goes on and at its end."""
+    """Counts the tracks of a run, and shows them during the run and at its end."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline

@@ -51,7 +51,7 @@ _FOLDER = _FILE = click.Path(path_type=Path)
 @with_token("view-")
 @click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
 @click.option("--state", type=_FOLDER, help="Folder to keep what was learned in, through power cuts.")
-@click.option("--resume", type=_FOLDER, help="Go on with what is kept in such a folder.")
+@click.option("--resume", type=_FOLDER, help="Continue the run that is kept in such a folder.")
 @with_object
 @with_part
 @with_given
@@ -91,7 +91,7 @@ def track(
     so far are kept.
 
     With --state, what was learned is kept too, on disk, once a second: after a
-    power cut, a crash or Ctrl-C, --resume goes on where the run was, with the
+    power cut, a crash or Ctrl-C, --resume continues where the run was, with the
     same source, box, settings and results, unless they are given again.
 
     \b
@@ -135,11 +135,11 @@ def track(
       catstream track --resume kept
     """
     if state is not None and resume is not None:
-        raise click.UsageError("--state begins a run, --resume goes on with one: give one of them")
+        raise click.UsageError("--state begins a run, --resume continues one: give one of them")
     if resume is None and source is None:
         raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
     if resume is not None and overwrite:
-        raise click.UsageError("--resume goes on with the results that are there, --overwrite replaces them: give one")
+        raise click.UsageError("--resume continues the results that are there, --overwrite replaces them: give one")
     known = Job.load(resume).results if resume is not None else Results()
     results = _results(known, output, video, write, save_model)
     pipeline = Pipeline(
@@ -197,7 +197,7 @@ def track(
     if resume is not None and not run.frames and not interrupted:
         console.print(f"no frame was left to follow: the run in {resume} is complete", highlight=False)
     if interrupted:
-        go_on = f", go on with: catstream track --resume {state or resume}" if state or resume else ""
+        go_on = f", continue with: catstream track --resume {state or resume}" if state or resume else ""
         console.print(f"stopped: the results so far are kept{go_on}", highlight=False)
         sys.exit(INTERRUPTED)
 
@@ -264,7 +264,7 @@ def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
     if files.video and files.output is None:
         raise click.UsageError("--video needs --output, the folder to write it to")
     if pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)):
-        raise click.UsageError("a video reads the frames once more, and those of a live source are gone: leave it away")
+        raise click.UsageError("--video reads the frames once more, and a live source cannot repeat them: leave it out")
     return files
 
 

@@ -191,8 +191,8 @@ class Compressor:
         arrays, metadata = storage.read(path)
         if (kind := metadata.get("kind")) != _KIND:
             raise ServiceError(
-                f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: go on with the catstream that wrote it, "
-                "or begin anew in another folder"
+                f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: continue with the catstream that "
+                "wrote it, or begin anew in another folder"
             )
         try:
             self = cls.from_state(arrays, metadata, settings)
@@ -201,7 +201,7 @@ class Compressor:
         if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset.size}:
             raise SettingsError(
                 f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset.size}: "
-                "go on with the same settings"
+                "continue with the same settings"
             )
         return self
 

@@ -125,7 +125,7 @@ class Detector:
         return self._messages(track, training)
 
     def correct(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
-        """Go on with the same object at another box, whatever a search would have found.
+        """Continue with the same object at another box, whatever a search would have found.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class Detector:
         return self._messages(track, {})
 
     def adopt(self, model: Model) -> None:
-        """Go on with a model, unless it is older than the newest that arrived, or of an object before this one."""
+        """Use a model from now on, unless it is older than the newest that arrived, or of an object before this one."""
         if model.version <= self.newest_version:
             return
         self.newest_version = model.version
@@ -171,9 +171,9 @@ class Detector:
                 self.state = replace(self.state, motion=model.motion)
 
     def resume(self, seq: int, state: DetectorState, model: Model) -> None:
-        """Go on after message `seq` of a stream that another detector began.
+        """Continue after message `seq` of a stream that another detector began.
 
-        With the model that the other one had by then, it goes on as that would have, bit for bit.
+        With the model that the other one had by then, it continues as that would have, bit for bit.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ class Detector:
         return ({}, None) if self._scm is None else self._scm.state()
 
     def resume_scm(self, arrays: Arrays, metadata: Metadata | None) -> None:
-        """Go on with the paper's first tracker, as another detector did; after `resume`."""
+        """Continue the paper's first tracker of another detector; call it after `resume`."""
         if metadata is not None:
             from catstream.paper.scm import SparseCollaborativeModel
 

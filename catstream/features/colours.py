@@ -21,7 +21,7 @@ __all__ = ["SHADES", "SIDE", "add_scores", "histogram", "shades"]
 
 SIDE = CELL // 2  #: shades a cell is wide and high
 _LIGHT, _CHROMA, _CHROMA_STEP = 8, 6, 10  # levels of lightness, of a and of b; Lab units from one of these to the next
-SHADES = _LIGHT * _CHROMA * _CHROMA  #: how many are told apart
+SHADES = _LIGHT * _CHROMA * _CHROMA  #: how many are distinguished
 
 _WEIGHT = 3.0  # length of a histogram as features; that of a window's HOG is about 9
 _EDGE = SIDE  # shades of a window's first cell, which is not counted

@@ -65,7 +65,7 @@ class SparseCollaborativeModel:
         self._generative = _Generative.from_template(template[0], int(rng.integers(2**31)))
 
     def state(self) -> tuple[Arrays, Metadata]:
-        """Arrays and metadata that `resumed` goes on from."""
+        """Arrays and metadata from which `resumed` continues."""
         judged, made = self._discriminative, self._generative
         arrays = {
             "scm.state": self._state,
@@ -81,7 +81,7 @@ class SparseCollaborativeModel:
 
     @classmethod
     def resumed(cls, arrays: Arrays, metadata: Metadata) -> SparseCollaborativeModel:
-        """Go on where `state` was called, bit for bit; KeyError, TypeError or ValueError if these are none."""
+        """Continue where `state` was called, bit for bit; KeyError, TypeError or ValueError if they do not fit."""
         self = cls.__new__(cls)
         self._first, self._frames, self._particles = (
             Box(*metadata["box"]),

@@ -36,8 +36,8 @@ class Player:
         self._recording = recording
         with ExitStack() as stack:
             self._publishers = {
-                name: stack.enter_context(Publisher(CHANNELS[name], endpoint, greeting=greeting))
-                for name, greeting in (("training", recording.run), ("models", None), ("tracks", None))
+                name: stack.enter_context(Publisher(CHANNELS[name], endpoint, first_message=first_message))
+                for name, first_message in (("training", recording.run), ("models", None), ("tracks", None))
             }
             for name in CHANNELS["health"].senders:
                 self._publishers[name] = stack.enter_context(Publisher(CHANNELS["health"], endpoint, name))

@@ -203,7 +203,7 @@ class Receiver(ChannelSocket[Message]):
         self._reply(self._window.acknowledge(position))
 
     def answer(self, position: Position) -> None:
-        """Tell the senders that asked where to go on: after `position.seq`, up to which all is stored."""
+        """Send the position, up to which all is stored, to the senders that asked for it."""
         self._reply(self._window.answer(position))
 
     def close(self) -> None:

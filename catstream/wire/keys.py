@@ -89,7 +89,7 @@ class Keys:
         return _key(_read(self.folder / _SERVER), "secret", self.folder)
 
     def client(self, public: str) -> tuple[str, Role] | None:
-        """Current name and role of the client with this public key; None if it may not connect."""
+        """Current name and role of the client with this public key; None if it is not allowed to connect."""
         for name, client in clients(self.folder).items():
             if client.public == public:
                 return name, client.role
@@ -145,7 +145,7 @@ def allow(folder: Path, name: str, role: Role, output: Path | None = None, publi
 
 
 def revoke(folder: Path, name: str) -> None:
-    """Remove a client: it may not connect any more.
+    """Remove a client: it cannot connect any more.
 
     Raises
     ------
@@ -218,7 +218,7 @@ def _write(path: Path, **facts: bytes) -> None:
 
 
 def _read(path: Path) -> dict[str, object]:
-    others = 0o077 if path.suffix == ".key" else 0o022  # others may not read a secret key, nor write any file
+    others = 0o077 if path.suffix == ".key" else 0o022  # other users must not read a secret key or write any file
     try:
         with path.open("rb") as file:
             facts = os.fstat(file.fileno())

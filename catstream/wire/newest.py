@@ -42,11 +42,15 @@ class Publisher(ChannelSocket[Message]):
     Parameters
     ----------
     sender : which of the channel's senders this is, if there are several
-    greeting : message that is sent whenever a subscriber connects; on a channel that keeps every message
+    first_message : message that is sent whenever a subscriber connects; on a channel that keeps every message
     """
 
     def __init__(
-        self, channel: Channel[Message], endpoint: Endpoint, sender: str | None = None, greeting: Message | None = None
+        self,
+        channel: Channel[Message],
+        endpoint: Endpoint,
+        sender: str | None = None,
+        first_message: Message | None = None,
     ) -> None:
         self._newest = channel.keeps == "newest"
         super().__init__(zmq.XPUB, channel, endpoint, _NEWEST_SENT if self._newest else channel.high_water_mark)
@@ -55,7 +59,7 @@ class Publisher(ChannelSocket[Message]):
         self._topics = {b"", *map(opening, channel.messages)}  # that may be subscribed to
         self._subscribed: set[bytes] = set()
         self._expected: set[bytes] = set()  # topics of announced subscribers that are not connected yet
-        self._last: bytes | None = None if greeting is None else encode(greeting)
+        self._last: bytes | None = None if first_message is None else encode(first_message)
         self._repeat_at = math.inf
         self._bind(sender)
 
@@ -85,7 +89,7 @@ class Publisher(ChannelSocket[Message]):
         self.serve_late_joiners()
 
     def serve_late_joiners(self) -> None:
-        """Process subscriptions; send the greeting or the last message again if it is due. Call once per iteration."""
+        """Process subscriptions; send the first or the last message again if it is due. Call once per iteration."""
         self._read_events()
         due = monotonic() >= self._repeat_at
         for _ in range(_MAX_CHANGES):  # the rest waits for the next call: a flood does not stop the process

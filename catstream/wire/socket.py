@@ -25,8 +25,8 @@ __all__ = ["LINGER_MILLISECONDS", "ChannelSocket"]
 LINGER_MILLISECONDS = 2000  #: that a closed socket still has to transmit its last messages
 
 #: No ZeroMQ heartbeats: libzmq aborts the process if one is due to a peer that disconnected while its queue was full
-#: (libzmq issue 4767). On one machine the kernel reports that a peer is gone. If a host loses its power, TCP keepalive
-#: reports it after 11 s, or once the host is up again.
+#: (libzmq issue 4767). On one machine the kernel reports that a peer has ended. If a host loses its power, TCP
+#: keepalive reports it after 11 s, or once the host is up again.
 _OPTIONS = {
     zmq.LINGER: LINGER_MILLISECONDS,
     zmq.HANDSHAKE_IVL: 5000,

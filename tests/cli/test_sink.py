@@ -71,7 +71,7 @@ def test_repeated_frames_of_a_restarted_detector_are_skipped_and_another_run_end
         Publisher(HEALTH, endpoint, "detector") as health,
         Publisher(TRACKS, endpoint) as tracks,
         Publisher(
-            TRAINING, endpoint, greeting=Run.from_settings(Settings(run={"unstored_frames": 100}).portable())
+            TRAINING, endpoint, first_message=Run.from_settings(Settings(run={"unstored_frames": 100}).portable())
         ) as training,
     ):
         sink = catstream("sink", file, "--endpoint", folder)

@@ -1,4 +1,4 @@
-"""`catstream track --state` and `--resume`: what was learned outlives every process, and its results go on."""
+"""`catstream track --state` and `--resume`: what was learned outlives every process, and its results continue."""
 
 from __future__ import annotations
 

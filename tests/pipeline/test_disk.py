@@ -1,4 +1,4 @@
-"""A disk that is full or read-only: tracking goes on, it is said, and nothing that was kept is damaged."""
+"""A disk that is full or read-only: tracking continues, it is reported, and nothing that was kept is damaged."""
 
 from __future__ import annotations
 

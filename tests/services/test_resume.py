@@ -1,4 +1,4 @@
-"""Laws of resuming: from where a detector goes on, whatever the others answer."""
+"""Laws of resuming: from where a detector continues, whatever the others answer."""
 
 from __future__ import annotations
 

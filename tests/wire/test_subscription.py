@@ -142,7 +142,7 @@ def test_the_health_of_each_process_arrives_once(endpoint):
 
 def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, until):
     with (
-        Publisher(TRAINING, endpoint, greeting=Run("0", {"coreset.size": "64"})) as training,
+        Publisher(TRAINING, endpoint, first_message=Run("0", {"coreset.size": "64"})) as training,
         catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
     ):
         until(lambda: training.has_subscribers, training.serve_late_joiners)
