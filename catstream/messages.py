@@ -156,7 +156,7 @@ class Stored:
     """Acknowledges the messages of an acknowledged channel, receiver -> sender.
 
     seq      all messages up to this one are stored, except for the last `unsaved` ones: the sender drops them
-    taken    all messages up to this one have been processed
+    taken    all messages up to this one have been processed by the receiver
     version  version of the newest Sample, 0 before the first
     unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """

@@ -125,7 +125,7 @@ def test_every_option_is_explained(verb, option):
 
 def in_the_house() -> set[str]:
     """Files and folders that the tree of docs/architecture.md names."""
-    tree = page("docs/architecture.md").partition("## The house\n\n```\n")[2].partition("```")[0]
+    tree = page("docs/architecture.md").partition("## Modules\n\n```\n")[2].partition("```")[0]
     named, folders = set[str](), dict[int, str]()
     for line in tree.splitlines():
         depth = (len(line) - len(line.lstrip())) // 2
@@ -145,9 +145,9 @@ def test_the_tree_of_files_is_complete_and_current():
         for path in ROOT.glob(f"{house}/**/*.py")
     }
     missing = {path for path in modules if not path.endswith("__init__.py")} - named
-    assert not missing, f"docs/architecture.md, the house: add {', '.join(sorted(missing))}"
+    assert not missing, f"docs/architecture.md, the modules: add {', '.join(sorted(missing))}"
     gone = sorted(path for path in named if not (ROOT / path).exists())
-    assert not gone, f"docs/architecture.md, the house: remove {', '.join(gone)}"
+    assert not gone, f"docs/architecture.md, the modules: remove {', '.join(gone)}"
 
 
 def test_every_file_that_track_writes_is_explained(tmp_path):

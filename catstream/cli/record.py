@@ -71,7 +71,7 @@ def _record(output: Path, place: Endpoint, training: Subscriber[Run | Features |
             message = training.receive(0.05)
             if isinstance(message, End):
                 last = message
-            # A restarted detector repeats frames whose features the compressor has already taken.
+            # A restarted detector repeats frames whose features the compressor has already processed.
             if isinstance(message, Features) and message.seq > seq:
                 seq = message.seq
                 recorder.write(message)

@@ -88,8 +88,8 @@ class Compressor:
     def take(self, features: Features) -> Sample | None:
         """Insert the features of one frame; returns a sample if the trees have grown enough since the last one.
 
-        If a new object begins, all trees begin anew; the versions of samples continue. A message with a `seq` that was
-        taken before is ignored.
+        If a new object begins, all trees begin anew; the versions of samples continue. A message whose `seq`
+        was processed before is ignored.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class Compressor:
 
     @property
     def position(self) -> Position:
-        """Position at which the stream continues, once everything that was taken is stored."""
+        """Position at which the stream continues, once everything that was processed is stored."""
         return Position(self.seq, max(self.frame, 0), self.box, self.sampled, self.detector)
 
     @property

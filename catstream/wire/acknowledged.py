@@ -55,7 +55,7 @@ class Sender(ChannelSocket[Message]):
 
     @property
     def taken(self) -> int:
-        """Newest seq that the receiver has received."""
+        """Newest seq that the receiver has processed."""
         return self._window.taken
 
     @property
@@ -136,7 +136,7 @@ class Sender(ChannelSocket[Message]):
 class Receiver(ChannelSocket[Message]):
     """The receiving side of an acknowledged channel; it binds.
 
-    Receiving stores nothing. If a sender asks for the position while more was taken than is stored, `asked` becomes
+    Receiving stores nothing. If a sender asks for the position while more was received than is stored, `asked` becomes
     true; the owner then stores what it has, and calls `answer`. In a loop:
 
         message = receiver.receive(0.1)
@@ -148,9 +148,9 @@ class Receiver(ChannelSocket[Message]):
 
     Parameters
     ----------
-    position : where the stream continues; the next message taken is the one after `position.seq`
+    position : where the stream continues; the next message received is the one after `position.seq`
     window : as the sender's
-    check : raises ProtocolError if a message does not belong to this stream; it then does not count as taken
+    check : raises ProtocolError if a message does not belong to this stream; it then does not count as received
     """
 
     def __init__(

@@ -4,17 +4,19 @@ Events and the time in seconds go in; frames to transmit and replies come out. `
 connects the machines to sockets.
 
 The sender numbers its messages 1, 2, 3 ... (`seq`). It keeps a copy of each until the receiver acknowledges
-it, and keeps at most `size` copies. The receiver takes each message once and in order, and replies:
+it, and keeps at most `size` copies. The receiver delivers each message to the application once and in order, and
+replies once the application has processed it:
 
-    Stored      acknowledges a message: `taken` is the newest received, `seq` the newest that may be forgotten
-    Position    says where the sender has to go on: retransmit everything after `seq`
+    Stored      acknowledges messages: those up to `taken` are processed, and the sender drops its copies up to `seq`
+    Position    requests a retransmission of everything after `seq`
 
 The receiver replies with a Position if a message is missing, and if the sender asks (with an empty frame, the
 hello). The sender asks if it was started anew, and after `PATIENCE` seconds without a reply while messages wait.
-So either side may be restarted, and any frame may be lost or arrive twice: each message is still taken once, in order.
+So either side may be restarted, and any frame may be lost or arrive twice: each message is still delivered once, in
+order.
 
-`Stored.seq` may include messages that the receiver has only in memory, because its disk takes nothing; `unsaved`
-says how many. If such a receiver is restarted, the sender cannot retransmit them and raises `StreamRewoundError`.
+`Stored.seq` may include messages that the receiver has only in memory, because its disk cannot be written; `unsaved`
+is their number. If such a receiver is restarted, the sender cannot retransmit them and raises `StreamRewoundError`.
 """
 
 from __future__ import annotations
@@ -72,8 +74,8 @@ class SendWindow:
     ----------
     sent : newest seq that was pushed
     acknowledged : newest seq that the receiver will not ask for again while it lives
-    stored : newest seq that survives the receiver's death; less than `acknowledged` while its disk takes nothing
-    taken : newest seq that the receiver has received
+    stored : newest seq that survives the receiver's death; less than `acknowledged` while its disk fails
+    taken : newest seq that the receiver has processed
     version : newest sample that the receiver has made
     """
 
@@ -141,7 +143,7 @@ class SendWindow:
         if isinstance(reply, Position):
             self._go_back(reply)
         elif reply.seq < self.acknowledged or reply.taken < self.taken:
-            before = f"{self.taken} were taken and {self.acknowledged} acknowledged before"
+            before = f"{self.taken} were processed and {self.acknowledged} acknowledged before"
             return Reject("acknowledgement", f"expected no step back ({before}), got {reply.taken} and {reply.seq}")
         self._last_reply = now
         if reply.version > self.version:
@@ -182,12 +184,12 @@ class ReceiveWindow:
 
     Parameters
     ----------
-    position : where the stream continues; the next message taken is the one after `position.seq`
+    position : where the stream continues; the next message delivered is the one after `position.seq`
     size : unacknowledged messages that the sender keeps at most
 
     Attributes
     ----------
-    taken : newest seq that was delivered
+    taken : newest seq that was delivered; it is processed before `acknowledge` and the next `receive`
     ended : whether the sender has sent the end of the stream
     connected : whether the sender of the newest message is still connected
     """
@@ -202,11 +204,11 @@ class ReceiveWindow:
 
     @property
     def asked(self) -> bool:
-        """Whether a sender waits for `answer`: it asked for the position, and more was taken than is stored."""
+        """Whether a sender waits for `answer`: it asked for the position, and more was delivered than is stored."""
         return bool(self._asking)
 
     def hello(self, peer: bytes) -> list[Reply]:
-        """A sender asks for the position; it is answered at once if all that was taken is stored."""
+        """A sender asks for the position; it is answered at once if all delivered messages are stored."""
         if self._position.seq >= self.taken:
             return [Reply(peer, self._position)]
         if len(self._asking) < _MAX_ASKING:
@@ -215,7 +217,7 @@ class ReceiveWindow:
 
     def receive(self, peer: bytes, seq: int, now: float, last: bool = False) -> list[Deliver | Reply | Reject]:
         """A message arrived; `last` says whether it is the end of the stream."""
-        if seq <= self.taken:  # retransmitted: the sender does not know that it was taken
+        if seq <= self.taken:  # retransmitted: the sender does not know that it arrived
             return [Reply(peer, self._stored())]
         if seq == self.taken + 1:
             self.taken, self.ended = seq, last
@@ -230,7 +232,7 @@ class ReceiveWindow:
         return actions
 
     def acknowledge(self, position: Position) -> list[Reply]:
-        """All that was taken is processed, and stored up to `position.seq`, except the last `position.unsaved`."""
+        """All delivered messages are processed, and stored up to `position.seq`, except the last `position.unsaved`."""
         self._position = position
         return [] if self._peer is None else [Reply(self._peer, self._stored())]
 
