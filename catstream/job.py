@@ -1,4 +1,4 @@
-"""The job of a run: what is followed, with which settings, and where everything is kept.
+"""The job of a run: its source, object, settings and files.
 
 Whoever starts a run writes its job to one file, and every process of the run reads it there. A run with a state
 folder keeps a copy of the job in that folder, from which it is resumed.
@@ -21,7 +21,7 @@ __all__ = ["Job", "Results"]
 
 _NAME = "job.safetensors"
 
-#: Settings that change nothing of what is learned: a run may be resumed with others.
+#: Settings that do not affect the training: a run can be resumed with other values.
 _FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"}
 
 
@@ -87,7 +87,7 @@ class Job:
 
     def __post_init__(self) -> None:
         if self.box is not None and self.model is not None:
-            raise SettingsError("a box says where the object is, with a model it is searched for: give one of them")
+            raise SettingsError("a box gives the position of the object, and a model searches for it: give one of them")
 
     def save(self, folder: Path) -> Path:
         """Write the job to a folder, readable by its owner only: the source may contain a password.
@@ -106,7 +106,7 @@ class Job:
             storage.write(folder / _NAME, {}, metadata, mode=0o600)
         except OSError as error:
             raise ServiceError(
-                f"cannot keep the state in {str(folder)!r} ({error.strerror}): give another folder"
+                f"cannot write the state to {str(folder)!r} ({error.strerror}): give another folder"
             ) from None
         return folder / _NAME
 
@@ -123,32 +123,32 @@ class Job:
         """
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
-            raise ServiceError(f"no pipeline was kept in {str(path)!r}: start one with --state {path}")
+            raise ServiceError(f"{str(path)!r} contains no run: start one with --state {path}")
         metadata = storage.read(file)[1]
         try:
             read = {name: _READERS[name](metadata[name]) for name in _READERS}
             return cls(**(metadata | read))
         except (KeyError, TypeError) as error:
-            raise ProtocolError(f"{file} does not say how the pipeline was started ({error!r})") from None
+            raise ProtocolError(f"{file} is not a valid job of a pipeline ({error!r})") from None
 
     @staticmethod
     def is_in(folder: Path) -> bool:
-        """Whether a job was kept in a folder."""
+        """Whether a folder contains a job."""
         return (folder / _NAME).exists()
 
     def check_fits(self, other: Job, folder: Path) -> None:
-        """Raise SettingsError if another job cannot continue from what this one learned, kept in `folder`."""
+        """Raise SettingsError if another job cannot continue this one, whose state is in `folder`."""
         if other.size != self.size or other.part != self.part:
             raise SettingsError(
-                f"what is kept in {str(folder)!r} is of {self._frames()}, and this would be {other._frames()}: "
-                "continue with the same frames, or begin anew in another folder"
+                f"the run in {str(folder)!r} has {self._frames()}, and this one has {other._frames()}: "
+                "continue with the same frames, or start a new run in another folder"
             )
         ours, theirs = self.settings.values(), other.settings.values()
         for name in sorted(ours.keys() - _FREE):
             if ours[name] != theirs[name]:
                 raise SettingsError(
-                    f"what is kept in {str(folder)!r} was learned with {name}={ours[name]}, not {theirs[name]}: "
-                    "continue with the same settings (they are kept too: give none), or begin anew in another folder"
+                    f"the run in {str(folder)!r} was started with {name}={ours[name]}, not {theirs[name]}: "
+                    "continue without settings (they are stored too), or start a new run in another folder"
                 )
 
     def _frames(self) -> str:
@@ -179,7 +179,7 @@ def _path(text: str | None) -> Path | None:
     return Path(text) if text is not None else None
 
 
-#: What makes a field of the types of JSON again, for those that are of another type.
+#: Functions that convert a JSON value back to the type of a field, for fields of other types.
 _READERS: dict[str, Callable[[Any], object]] = {
     "box": lambda box: box and Box(*box),
     "model": _path,

@@ -41,18 +41,18 @@ _CHECK_SECONDS = 0.1
 _EXIT_SECONDS = 12.0  # time for the detector to exit after the end of the stream was received
 _TURN_SECONDS = 0.01
 
-_ONCE = "a pipeline runs once, and this one has run: make another Pipeline to follow the source again"
-_CLOSED = ExitStack()  # in place of that of a pipeline that is over
+_ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
+_CLOSED = ExitStack()  # marks a pipeline that was closed
 
 _log = logging.getLogger(__name__)
 
 
 class Pipeline:
-    """Follows an object with three processes, and yields exactly one `Track` for each frame.
+    """Tracks an object with three processes, and yields exactly one `Track` for each frame.
 
     Iterate over it with `for` or `async for`: the processes are started, and stopped at the end of the loop. Use it in
     a `with` or `async with` to read its endpoint and its counters too, and to iterate over it in parts. A pipeline runs
-    once; make another one to follow the source again.
+    once; make another one to track the source again.
 
     A process that dies is restarted, and the run continues. Backpressure: on a file, a slow consumer blocks the
     detector; on a live source, frames are skipped and counted. A live source has no end, and is opened again whenever
@@ -73,7 +73,7 @@ class Pipeline:
         File that `catstream save` wrote. The object is searched for, and absent until it is found; learning continues
         from the file.
     part : slice
-        The frames of a file or folder to follow: `slice(100, 200, 2)` for 100, 102 ... 198.
+        The frames of a file or folder to track: `slice(100, 200, 2)` for 100, 102 ... 198.
     record : path
         File to record all messages to, see `catstream replay`. No features are missing in it.
     state : path
@@ -109,14 +109,14 @@ class Pipeline:
     RecordingError
         From the constructor, if the file to record to exists.
     SettingsError
-        From the constructor, if the source cannot be followed with these settings: a live one in lockstep.
+        From the constructor, if the settings do not suit the source: a live one in lockstep.
     ServiceError, ProtocolError
-        From the constructor, if the model cannot be read, or the folder to resume holds no run or a damaged one.
+        From the constructor, if the model cannot be read, or the folder to resume contains no run or a damaged one.
     ServiceError
-        At the start, if the endpoint or the folder of the state is in use, or if it has run already. While iterating,
-        if a process cannot be kept alive.
+        At the start, if the endpoint or the state folder is in use, or if the pipeline has run already. While
+        iterating, if a process fails repeatedly.
     VideoError
-        While iterating, if the source breaks, after its last good frame.
+        While iterating, if the source fails, after its last valid frame.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class Pipeline:
         save_model: str | os.PathLike[str] | None = None,
     ) -> None:
         if state is not None and resume is not None:
-            raise SettingsError("a run begins in a folder (state) or continues in one (resume): give one of them")
+            raise SettingsError("state starts a new run, and resume continues one: give one of them")
         self._kept = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         given = settings.changed() if isinstance(settings, Settings) else settings or {}
@@ -148,7 +148,7 @@ class Pipeline:
             results=results if results is not None else job.results,
         )
         _check(job, _path(record), is_new=self._kept is None)
-        # The detector opens the source once more: a camera shows its picture to one program at a time.
+        # The source is closed here, because the detector opens it, and a camera can be open in one program only.
         image_rate, skip_damaged = job.settings.run.image_rate, job.settings.run.skip_damaged
         with open_source(job.source, part=job.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
@@ -161,7 +161,7 @@ class Pipeline:
             self._kept.check_fits(self._job, self._state)
         self._record, self._save_model = _path(record), _path(save_model)
         self._after, self._box = after, job.box
-        self._stack: ExitStack | None = None  # of all that is to be undone at the end, once it has started
+        self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
         self._supervisor: Supervisor | None = None
         self._checked = 0.0
@@ -170,12 +170,12 @@ class Pipeline:
 
     @property
     def source(self) -> str:
-        """The source, as it was given or kept; a path is absolute."""
+        """The source as given, or that of the resumed run; a path is absolute."""
         return self._job.source
 
     @property
     def part(self) -> slice:
-        """The frames that are followed."""
+        """The frames that are tracked."""
         return self._job.part
 
     @property
@@ -184,9 +184,9 @@ class Pipeline:
         return self._job.settings
 
     def starting_after(self, position: Position | None) -> Self:
-        """The same run, that has not started yet, with another `after`."""
+        """A copy of a pipeline that has not started yet, with another `after`."""
         if self._stack is not None:
-            raise ServiceError("the pipeline has started: give the track after which it continues before that")
+            raise ServiceError("the pipeline has started: call starting_after before that")
         other = copy(self)
         other._after = position
         return other
@@ -205,7 +205,7 @@ class Pipeline:
             self._box = start.box or self._box
             self._incoming = stack.enter_context(Receiver(RESULTS, endpoint, start, settings.run.unstored_frames))
             self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
-            if self._save_model is not None:  # by the compressor's last checkpoint
+            if self._save_model is not None:  # from the compressor's last checkpoint
                 stack.enter_context(_saved(self._save_model, self._state or folder, settings))
             supervisor = Supervisor(self._started(str(endpoint)), folder)
             stack.callback(supervisor.stop)
@@ -213,7 +213,7 @@ class Pipeline:
         return self
 
     def _started(self, endpoint: str) -> Job:
-        """The job of this start of the run, for its processes."""
+        """The job for the processes that are started now."""
         return replace(
             self._job,
             endpoint=endpoint,
@@ -228,7 +228,7 @@ class Pipeline:
         self.close()
 
     async def __aenter__(self) -> Self:
-        return self.__enter__()  # it starts processes and waits for none; they are to end with this thread
+        return self.__enter__()  # it does not block; the processes end with this thread
 
     async def __aexit__(self, *_: object) -> None:
         await asyncio.shield(asyncio.to_thread(self.close))
@@ -238,7 +238,7 @@ class Pipeline:
         stack, self._stack = self._stack, _CLOSED
         if stack is not None and stack is not _CLOSED:
             with stack:
-                self._receive_health()  # also what arrived since the last track, before Ctrl-C
+                self._receive_health()  # the health that has arrived since the last track, before Ctrl-C
 
     def __del__(self) -> None:
         if getattr(self, "_stack", None) not in (None, _CLOSED):
@@ -274,7 +274,7 @@ class Pipeline:
         self._raise_failure()
 
     async def _tracks_async(self) -> AsyncIterator[Track]:
-        """The same for an event loop: it waits only in `await`."""
+        """The same for an event loop, without blocking it."""
         while not self._over():
             if (track := self._take(0)) is not None:
                 yield track
@@ -305,7 +305,7 @@ class Pipeline:
         return message if isinstance(message, Track) else None
 
     def _raise_failure(self) -> None:
-        """Raise VideoError if the source broke."""
+        """Raise VideoError if the source failed."""
         if self._end is not None and self._end.failed:
             raise VideoError(self._end.reason)
 
@@ -334,12 +334,12 @@ class Pipeline:
 
     @property
     def trouble(self) -> dict[str, str]:
-        """What is wrong, for a person, by the name of the process; only of processes with a problem."""
+        """Descriptions of current problems, by the name of the process; empty if there are none."""
         return {name: health.trouble for name, health in self._health.items() if health.trouble}
 
     @property
     def pids(self) -> dict[str, int]:
-        """Process ids by name, of the processes that run."""
+        """Process ids of the running processes, by name."""
         return self._supervisor.pids if self._supervisor is not None else {}
 
     @property
@@ -354,19 +354,19 @@ class Pipeline:
 
     @property
     def waits(self) -> bool:
-        """Whether the run begins by waiting for a box; one that is resumed may have a box by now."""
+        """Whether a new run waits for a box, because it has neither box nor model; false for a resumed run."""
         return self._box is None and self._job.model is None and self._kept is None
 
     @property
     def complete(self) -> bool:
-        """Whether the run that would be resumed has followed all frames already; ask this before the start."""
+        """Whether the run to resume has already tracked all frames; valid before the start."""
         if self._kept is None or self._state is None or self.frames is None or self.live:
             return False
         return self._start(self._state).seq >= self.frames
 
     @property
     def holding(self) -> str:
-        """Why frames are not followed: "paused", or "waiting" for a box; empty if they are followed."""
+        """Reason for which no frames are tracked: "paused", or "waiting" for a box; empty if they are tracked."""
         counters = self.health.get("detector", {})
         return next((name for name in ("waiting", "paused") if counters.get(name)), "")
 
@@ -379,17 +379,17 @@ class Pipeline:
         return max(learned, self._after or learned, key=lambda start: start.seq)
 
     def _watch(self) -> None:
-        """Take in the health, restart processes that died, and log what the user should know."""
+        """Receive the health, restart processes that died, and log warnings for the user."""
         self._receive_health()
         self._children.check_children()
         for line in self._children.new_lines("detector"):
-            if self.live or line == COMPILING:  # a live source is lost, or is back
+            if self.live or line == COMPILING:  # a live source was lost or is available again
                 _log.warning("%s", line)
         if self._children.finished:
             raise ServiceError("the processes ended before the video did: this should not happen, please report it")
 
     def _receive_health(self) -> None:
-        """Take in the health of the processes, and log each new trouble."""
+        """Receive the health of the processes, and log each new problem."""
         for health in self._reports.receive_all():
             before = self._health.get(health.process)
             if health.trouble and (before is None or before.trouble != health.trouble):
@@ -397,7 +397,7 @@ class Pipeline:
             self._health[health.process] = health
 
     def _wait_for_exit(self) -> Iterator[None]:
-        """Turns until the detector has ended, which it does once it knows that its end was received."""
+        """Yield until the detector has exited; it does so once its last message is acknowledged."""
         deadline = time.monotonic() + _EXIT_SECONDS
         while not self._children.finished and time.monotonic() < deadline:
             yield
@@ -435,19 +435,18 @@ def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
     if job.model is not None:
         Learned.load(job.model)
     if job.settings.run.lockstep and is_live(job.source):
-        raise SettingsError("a live source does not wait, and no run of it can be repeated: leave lockstep away")
+        raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
     if record is not None and record.exists() and is_new:
         raise RecordingError(f"{record} exists already: give another name, or remove it")
 
 
 @contextmanager
 def _begun(folder: Path, kept: Job | None, job: Job) -> Iterator[None]:
-    """Lock the folder of the state, and keep the job there if it is new or has changed."""
+    """Lock the state folder, and store the job there if it is new or has changed."""
     with locked(folder):
         if kept is None and began(folder):
             raise ServiceError(
-                f"a pipeline was kept in {str(folder)!r} already: continue it (--resume {folder}), "
-                "or give another folder"
+                f"{str(folder)!r} already contains a run: continue it (--resume {folder}), or give another folder"
             )
         if job != kept:
             job.save(folder)
@@ -456,7 +455,7 @@ def _begun(folder: Path, kept: Job | None, job: Job) -> Iterator[None]:
 
 @contextmanager
 def _saved(path: Path, state: Path, settings: Settings) -> Iterator[None]:
-    """Write what was learned to a file afterwards; if the run failed, it is its error that is raised."""
+    """Save the model to a file afterwards; if the run failed, its error is raised in any case."""
     try:
         yield
     except BaseException:

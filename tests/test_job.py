@@ -59,7 +59,7 @@ def test_a_job_that_is_shown_does_not_show_its_password():
 
 
 def test_a_job_that_is_not_there_or_damaged_is_an_error_that_names_the_file(tmp_path):
-    with pytest.raises(ServiceError, match=f"no pipeline was kept in '{tmp_path}'"):
+    with pytest.raises(ServiceError, match=f"'{tmp_path}' contains no run"):
         Job.load(tmp_path)
     file = JOB.save(tmp_path)
     file.write_bytes(file.read_bytes().replace(b"320", b"321"))
@@ -67,11 +67,11 @@ def test_a_job_that_is_not_there_or_damaged_is_an_error_that_names_the_file(tmp_
         Job.load(tmp_path)
 
 
-def test_what_was_learned_is_gone_on_with_only_with_the_same_frames_and_settings_of_learning():
+def test_a_run_is_continued_only_with_the_same_frames_and_training_settings():
     JOB.check_fits(replace(JOB, settings=Settings(run={"lag_frames": 3})), Path("kept"))
     with pytest.raises(SettingsError, match="frames 3::"):
         JOB.check_fits(replace(JOB, part=slice(3, None)), Path("kept"))
-    with pytest.raises(SettingsError, match=r"learned with coreset\.size=64, not 32"):
+    with pytest.raises(SettingsError, match=r"started with coreset\.size=64, not 32"):
         JOB.check_fits(replace(JOB, settings=Settings(coreset={"size": 32})), Path("kept"))
 
 

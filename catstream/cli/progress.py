@@ -27,7 +27,7 @@ class _Line(ProgressColumn):
         self._pipeline, self._console = pipeline, console
 
     def render(self, task: Task) -> Text:
-        # The reason why there is no track that has a state: the source is lost, or the run is paused or waits.
+        # If there are no tracks: the source is lost, or the run is paused or waits for a box.
         lost = self._pipeline.lost_seconds
         state = f"lost {lost:.0f} s" if lost else self._pipeline.holding or task.fields["state"]
         total = "" if self._pipeline.live else f"/{'?' if task.total is None else int(task.total)}"
@@ -89,7 +89,7 @@ class RunProgress:
                 f"lost and opened again {self._detector('reopened'):.0f} times"
             )
         if damaged := self._detector("damaged"):
-            lines.append(f"damaged: {damaged:.0f} frames could not be decoded, and were left out")
+            lines.append(f"damaged: {damaged:.0f} frames could not be decoded, and were skipped")
         if totals := self._pipeline.totals:
             lines.append(f"features: {totals['sent']} messages sent, {totals['stored']} stored in the coreset trees")
         if self._pipeline.restarts:

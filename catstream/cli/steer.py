@@ -150,7 +150,7 @@ def save(target: _Target, file: Path, state: Path | None) -> None:
     \b
     EXAMPLES
       catstream save walker.safetensors
-      catstream save walker.safetensors --state kept
+      catstream save walker.safetensors --state checkpoints
       catstream track other.mp4 --model walker.safetensors
     """
     if state is None:

@@ -1,4 +1,4 @@
-"""`catstream track`: follow an object through a video."""
+"""`catstream track`: track an object in a video."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ _FOLDER = _FILE = click.Path(path_type=Path)
 @click.argument("source", required=False)
 @click.option("--output", type=_FOLDER, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
-@click.option("--write", type=_FILE, multiple=True, metavar="FILE", help="Write the tracks to this too, - for stdout.")
-@click.option("--overwrite", is_flag=True, help="Replace results that are there.")
-@click.option("--save-model", type=_FILE, metavar="FILE", help="Write what was learned to this, at the end.")
-@click.option("--record", type=click.Path(path_type=Path), help="File to record the run to: `catstream replay`.")
+@click.option("--write", type=_FILE, multiple=True, metavar="FILE", help="Also write the tracks to FILE; - for stdout.")
+@click.option("--overwrite", is_flag=True, help="Replace existing results.")
+@click.option("--save-model", type=_FILE, metavar="FILE", help="Save the model to FILE at the end.")
+@click.option("--record", type=click.Path(path_type=Path), help="Record the run to a file for `catstream replay`.")
 @click.option(
     "--view",
     type=AddressType(),
     is_flag=False,
     flag_value=str(PORT),
     metavar="[[HOST:]PORT]",
-    help="Serve a web page of it.",
+    help="Serve a web page of the run.",
 )
 @with_token("view-")
-@click.option("--lockstep", is_flag=True, help="Repeat a run bit for bit: wait for each model.")
-@click.option("--state", type=_FOLDER, help="Folder to keep what was learned in, through power cuts.")
-@click.option("--resume", type=_FOLDER, help="Continue the run that is kept in such a folder.")
+@click.option("--lockstep", is_flag=True, help="Wait for each model: the run is reproducible bit for bit.")
+@click.option("--state", type=_FOLDER, help="Folder for checkpoints, to resume the run from.")
+@click.option("--resume", type=_FOLDER, help="Resume the run of such a folder.")
 @with_object
 @with_part
 @with_given
@@ -74,48 +74,48 @@ def track(
     state: Path | None,
     resume: Path | None,
 ) -> None:
-    """Follow an object through a video.
+    """Track an object in a video.
 
-    It is shown by its box in the first frame, or found by what was learned of
-    it before, or waited for until `catstream set-box` says where it is, or
-    somebody who draws a box on the web page.
+    The object is given by its box in the first frame, or by a saved model. If
+    neither is given, tracking starts after `catstream set-box`, or after a box
+    is drawn on the web page.
 
     SOURCE is a video file, a folder of images, a pattern like
     images/%05d.png, a camera (0 or /dev/video0), or a stream (rtsp://... or
-    http://... for MJPEG). Cameras and streams are live: each time the newest
-    frame is followed, the others are skipped and counted, and one that is lost
-    is opened again until it is back.
+    http://... for MJPEG). Cameras and streams are live: only the newest frame
+    is tracked, the frames before it are skipped and counted, and a lost source
+    is opened again until it is available.
 
-    A detector, a compressor and a trainer run as processes of their own;
-    Ctrl-C ends them, as SIGTERM and a terminal that is lost do, and the results
-    so far are kept.
+    The detector, the compressor and the trainer run as separate processes.
+    Ctrl-C, SIGTERM and the loss of the terminal end them; the results so far
+    are kept.
 
-    With --state, what was learned is kept too, on disk, once a second: after a
-    power cut, a crash or Ctrl-C, --resume continues where the run was, with the
-    same source, box, settings and results, unless they are given again.
+    With --state, a checkpoint is written once a second. After a power failure,
+    a crash or Ctrl-C, --resume continues the run, with the same source, box,
+    settings and results unless they are given again.
 
     \b
     Writes
-      OUTPUT/NAME.txt               x,y,w,h a frame, nan where the object is absent
-      OUTPUT/NAME_confidence.value  the score a frame
-      OUTPUT/NAME_time.txt          seconds a frame
+      OUTPUT/NAME.txt               x,y,w,h of each frame, nan if the object is absent
+      OUTPUT/NAME_confidence.value  score of each frame
+      OUTPUT/NAME_time.txt          seconds for each frame
       OUTPUT/NAME.csv               frame, seconds, state, box, score, model version
       OUTPUT/NAME.mp4               with --video
 
-    NAME is that of the source, so that several sources may share a folder.
+    NAME is the name of the source, so that several sources can share a folder.
 
     \b
-    --write FILE, as often as wanted; each has every frame
-      .ndjson .jsonl   an object a line, with the fields of a track
+    --write FILE, may be repeated; each file contains every frame
+      .ndjson .jsonl   one JSON object per line, with the fields of a track
       -                the same, on standard output
       .json            one array of such objects
       .csv             as OUTPUT/NAME.csv
       .txt             MOT text: frame,1,x,y,w,h,score,-1,-1,-1, counted from 1
-      .sqlite          the table tracks; others may read it meanwhile
+      .sqlite          the table tracks; it can be read during the run
       .parquet         needs pip install "catstream[parquet]"
       .mp4             the frames with their tracks drawn in
 
-    Files that are there are not replaced without --overwrite.
+    Existing files are not replaced without --overwrite.
 
     \b
     EXAMPLES
@@ -131,15 +131,17 @@ def track(
       catstream track 0 --model walker.safetensors
       catstream track 0 --view
       VIEW_TOKEN=$(openssl rand -hex 16) catstream track 0 --view 0.0.0.0:8000
-      catstream track walk.mp4 --box 120,80,64,48 --output out --state kept
-      catstream track --resume kept
+      catstream track walk.mp4 --box 120,80,64,48 --output out --state checkpoints
+      catstream track --resume checkpoints
     """
     if state is not None and resume is not None:
-        raise click.UsageError("--state begins a run, --resume continues one: give one of them")
+        raise click.UsageError("--state starts a new run, and --resume continues one: give one of them")
     if resume is None and source is None:
         raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
     if resume is not None and overwrite:
-        raise click.UsageError("--resume continues the results that are there, --overwrite replaces them: give one")
+        raise click.UsageError(
+            "--resume continues the existing results, and --overwrite replaces them: give one of them"
+        )
     known = Job.load(resume).results if resume is not None else Results()
     results = _results(known, output, video, write, save_model)
     pipeline = Pipeline(
@@ -172,7 +174,7 @@ def track(
         if box is not None:
             raise click.UsageError(f"{_complete(pipeline, resume, output)}: no frame is left for a box")
         if not files.made:
-            with files.opened(resume=True):  # those that are new, or that were not closed
+            with files.opened(resume=True):  # creates new files, and closes those that were not closed
                 pass
         console.print(_complete(pipeline, resume, output), highlight=False)
         return
@@ -185,7 +187,7 @@ def track(
             if view is not None:
                 _serve(pipeline, view, token, console, stack)
             if pipeline.waits:
-                console.print(f"it waits for a box: {_ways_to_give_it(pipeline, view is not None)}", highlight=False)
+                console.print(f"waiting for a box: {_ways_to_set_box(pipeline, view is not None)}", highlight=False)
             _write_tracks(pipeline, files, run, console, interrupts, resumed=resume is not None)
     except KeyboardInterrupt:
         interrupted = True
@@ -195,10 +197,10 @@ def track(
             if record is not None:
                 console.print(f"recording: {record}, {Recording(record)}", highlight=False)
     if resume is not None and not run.frames and not interrupted:
-        console.print(f"no frame was left to follow: the run in {resume} is complete", highlight=False)
+        console.print(f"no frames were left to track: the run in {resume} is complete", highlight=False)
     if interrupted:
-        go_on = f", continue with: catstream track --resume {state or resume}" if state or resume else ""
-        console.print(f"stopped: the results so far are kept{go_on}", highlight=False)
+        hint = f"; to continue: catstream track --resume {state or resume}" if state or resume else ""
+        console.print(f"stopped: the results so far are kept{hint}", highlight=False)
         sys.exit(INTERRUPTED)
 
 
@@ -220,27 +222,27 @@ def _write_tracks(
         write: Callable[[Track, float], None] | None = None
         moment = time.perf_counter()
         for track in pipeline:
-            # The files are opened with the first track: a run that cannot start leaves older results alone.
+            # The files are opened with the first track: a run that cannot start does not change older results.
             write = write or stack.enter_context(files.opened(resume=resumed))
             before, moment = moment, time.perf_counter()
-            with interrupts.deferred():  # a frame is in all results, and counted, or in none
+            with interrupts.deferred():  # so that a frame is in all results or in none
                 write(track, moment - before)
                 run.show(progress, track)
 
 
 def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
-    """Says that a run that is resumed has come to its end."""
+    """The message for a resumed run that is complete."""
     results = f", its results are in {output}" if output is not None else ""
     return (
-        f"the run in {resume} is complete, all {pipeline.frames} frames were followed{results}; "
-        "to follow the source again, begin a new run in another folder (--state DIR)"
+        f"the run in {resume} is complete, all {pipeline.frames} frames were tracked{results}; "
+        "to track the source again, start a new run in another folder (--state DIR)"
     )
 
 
 def _results(
     known: Results, output: Path | None, video: bool, write: tuple[Path, ...], save_model: Path | None
 ) -> Results:
-    """The files of a run, those of an earlier part of it included; a run may be resumed from any working directory."""
+    """The files of a run, including those of its earlier part; the paths are absolute, to resume from any folder."""
     files = tuple(file.absolute() for file in write if file != STDOUT)
     return Results(
         output=output.absolute() if output is not None else known.output,
@@ -251,7 +253,7 @@ def _results(
 
 
 def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
-    """The files that the tracks go to, and the standard output if it is wanted."""
+    """The files to which the tracks are written, including the standard output if requested."""
     files = RunFiles(
         pipeline.name,
         pipeline.source,
@@ -262,9 +264,11 @@ def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
         pipeline.settings.run.image_rate,
     )
     if files.video and files.output is None:
-        raise click.UsageError("--video needs --output, the folder to write it to")
+        raise click.UsageError("--video requires --output, the folder for the video")
     if pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)):
-        raise click.UsageError("--video reads the frames once more, and a live source cannot repeat them: leave it out")
+        raise click.UsageError(
+            "a video needs the frames once more, and a live source cannot repeat them: omit the video"
+        )
     return files
 
 
@@ -275,7 +279,7 @@ def _check_model(file: Path, overwrite: bool) -> None:
         raise ServiceError(f"cannot write {file}: give a file in a folder that exists and that you may write to")
 
 
-def _ways_to_give_it(pipeline: Pipeline, page: bool) -> str:
+def _ways_to_set_box(pipeline: Pipeline, page: bool) -> str:
     place = f"--endpoint {pipeline.endpoint}"
     drawn = "draw one on the page" if page else f"draw one on the page of catstream view {place}"
-    return f"{drawn}, or say it: catstream set-box X,Y,W,H {place}"
+    return f"{drawn}, or run catstream set-box X,Y,W,H {place}"

@@ -191,8 +191,8 @@ class Compressor:
         arrays, metadata = storage.read(path)
         if (kind := metadata.get("kind")) != _KIND:
             raise ServiceError(
-                f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: continue with the catstream that "
-                "wrote it, or begin anew in another folder"
+                f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: continue with the version that wrote it, "
+                "or start a new run in another folder"
             )
         try:
             self = cls.from_state(arrays, metadata, settings)

@@ -57,7 +57,7 @@ def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, stee
     assert steer("resume") == (0, "resumed after frame 0")
     errors = run.communicate(timeout=120)[1]
     assert run.returncode == 0, errors
-    (hint,) = (line for line in errors.splitlines() if line.startswith("it waits for a box: "))
+    (hint,) = (line for line in errors.splitlines() if line.startswith("waiting for a box: "))
     assert f"catstream view --endpoint {tmp_path / 'run'}" in hint
     assert f"catstream set-box X,Y,W,H --endpoint {tmp_path / 'run'}" in hint
     assert "60 messages sent, 60 stored" in errors

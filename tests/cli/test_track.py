@@ -135,7 +135,7 @@ def test_a_damaged_place_is_skipped_if_that_is_asked_for_and_counted(video, said
         good = sum(1 for _ in whole)
     code, _, errors = said("track", damaged, "--box", box, "--output", tmp_path / "out", "--skip-damaged")
     assert code == 0, errors
-    assert "frames could not be decoded, and were left out" in errors
+    assert "frames could not be decoded, and were skipped" in errors
     assert readable(damaged) < len((tmp_path / "out" / "damaged.txt").read_text().splitlines()) == good < 60
 
 

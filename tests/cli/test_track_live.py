@@ -157,7 +157,7 @@ def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, 
 
 LIVE = "http://127.0.0.1:1/one"
 REFUSED = {
-    "in lockstep": (["--lockstep"], "leave lockstep away"),
+    "in lockstep": (["--lockstep"], "omit lockstep"),
     "from a later frame": (["--start", "9"], "leave out start, end and stride"),
     "not there": ([], "connection refused"),
 }
@@ -179,5 +179,5 @@ def test_its_frames_cannot_be_had_once_more_for_a_video(camera, said, story, tmp
     for run in ([cam.url, "--box", ",".join(map(str, story[0][1]))], ["--resume", tmp_path / "kept"]):
         code, _, errors = said("track", *run, "--output", tmp_path / "out", "--video")
         assert code == 2
-        assert "leave it away" in " ".join(errors.split())
+        assert "omit the video" in " ".join(errors.split())
         assert not (tmp_path / "out").exists()

@@ -120,10 +120,10 @@ def test_a_damaged_checkpoint_is_reported_and_the_previous_one_is_used(killed, w
 def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed, video, said, catstream, tmp_path):
     kept, out, (source, box) = killed / "kept", killed / "out", video
     refusals = {
-        "go on with it": ["track", source, "--box", box, "--state", kept],
-        "learned with coreset.size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset.size=32"],
+        "continue it": ["track", source, "--box", box, "--state", kept],
+        "started with coreset.size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset.size=32"],
         "frames 3::": ["track", "--resume", kept, "--start", "3"],
-        "no pipeline was kept": ["track", "--resume", tmp_path / "none"],
+        "contains no run": ["track", "--resume", tmp_path / "none"],
         "give one of them": ["track", "--resume", kept, "--state", kept],
         "needs SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
     }
@@ -217,7 +217,7 @@ def test_a_run_that_is_complete_is_not_resumed_and_says_so(video, said, tmp_path
     before = (out / "demo.csv").read_bytes()
     code, output, errors = said("track", "--resume", kept)
     assert (code, output) == (0, "")
-    assert f"the run in {kept} is complete, all 6 frames were followed, its results are in {out}" in errors
+    assert f"the run in {kept} is complete, all 6 frames were tracked, its results are in {out}" in errors
     code, _, errors = said("track", "--resume", kept, "--box", "1,2,30,40")
     assert code == 2
     assert "is complete" in errors
