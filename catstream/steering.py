@@ -59,9 +59,9 @@ class Control:
     def set_box(self, box: str | Iterable[float], *, keep: bool = False) -> Answer:
         """Set the box of the object in the next frame that is tracked: x, y, w, h in pixels.
 
-        During a pause of a file, it is the frame that is held; the pipeline tracks it and stays paused. By default it
-        is a new object, and everything learned of the previous one is dropped. With `keep` it is the same object, and
-        its box is corrected.
+        During a pause it is the frame that is held, or the next one of a live source; the pipeline tracks it and stays
+        paused. By default it is a new object, and everything learned of the previous one is dropped. With `keep` it is
+        the same object, and its box is corrected.
         """
         return self._ask("set-box", Box.parse(box), keep)
 
