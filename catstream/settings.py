@@ -187,7 +187,8 @@ class BeliefSettings(_Group):
         float,
         _about(
             "Score from which the detector is confident if the object is trusted: it learns from the frame and adapts "
-            "the size (that of a redetected object is adapted from belief.weak_score). A lost object returns at this score."
+            "the size (that of a redetected object is adapted from belief.weak_score). A lost object returns at this "
+            "score."
         ),
     ] = 0.45
     trusted_score: Annotated[
