@@ -1,8 +1,8 @@
 """A pipeline with injectable faults of processes, links, disk and clock; each process has its own loopback address.
 
-The three processes run as on three hosts: 127.0.0.1, .2 and .3. Between them are links, TCP proxies that can be
-cut and slowed. Who dies is started again at once, as systemd or docker would do it; the arena itself is the owner,
-and takes every track.
+Each of the three processes runs as if on a host of its own: 127.0.0.1, .2 and .3. They are connected by links, TCP
+proxies that can be cut and slowed. A process that dies is restarted at once, as systemd or docker does; the arena
+itself is the owner of the run, which receives every track.
 """
 
 from __future__ import annotations
@@ -134,20 +134,20 @@ class Link:
 
 
 class Arena:
-    """One run of a pipeline; open it, and `turn` it until `end` is there.
+    """One run of a pipeline; open it, and call `turn` until `end` is set.
 
     Parameters
     ----------
-    source, box : what is followed
+    source, box : the video, and the box of the object in its first frame
     state : folder for the checkpoints
     scratch : folder for logs
 
     Attributes
     ----------
     tracks : the received tracks, in order
-    end : the last message of the stream, None before it
-    deaths : how often a process ended and was started again
-    links : by channel
+    end : the last message of the stream, None before it was received
+    deaths : number of restarts of processes
+    links : link of each channel
     """
 
     def __init__(self, source: str, box: Box, settings: Settings, state: Path, scratch: Path) -> None:
@@ -158,7 +158,7 @@ class Arena:
         self._clock = scratch / "clock"
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._places: dict[str, Endpoint] = {}
-        self._heard = monotonic()
+        self._last_received = monotonic()
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -194,7 +194,7 @@ class Arena:
         """
         message = self._results.receive(seconds)
         if message is not None:
-            self._heard = monotonic()
+            self._last_received = monotonic()
             if isinstance(message, Track):
                 self.tracks.append(message)
                 self._box = message.box or self._box
@@ -202,7 +202,7 @@ class Arena:
             else:
                 self._results.acknowledge(Position(message.seq))
                 self.end = message
-        elif monotonic() - self._heard > _PATIENCE_SECONDS:
+        elif monotonic() - self._last_received > _PATIENCE_SECONDS:
             raise ServiceError(
                 f"no track arrived for {_PATIENCE_SECONDS:.0f} s after {len(self.tracks)}: {self.words()}"
             )

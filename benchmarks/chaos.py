@@ -1,8 +1,8 @@
 """Injects a random schedule of faults into a running pipeline, and checks that no track and no row is lost.
 
-Processes are killed (kill -9) and frozen (SIGSTOP), links cut and slowed, the disk filled, the clock set wrong, one
-fault after the other. In lockstep, all that was sent must be in the trees exactly once, and the trees be those of a
-run without faults, bit for bit. Otherwise, the run must succeed as well as one without.
+One fault follows the other: processes are killed (kill -9) or frozen (SIGSTOP), links are cut or slowed, the disk is
+full, or the clock is wrong. In lockstep, the trees must contain every message exactly once and be equal, bit for bit,
+to those of a run without faults. Otherwise, the success rate must be as high as without faults.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Coverage-guided fuzzing: a million inputs for each decoder, with limits on the time and memory of each input.
 
-Each decoder has a process of its own under atheris (libFuzzer), which begins with good messages or files and changes
-them where that leads somewhere new. An input is taken, or refused by the error that is meant for it. Another error,
-an input that takes longer than 5 seconds, or 64 MB more than after the first thousandth of the inputs ends the
-process, and with it this program: it names the file that holds the input.
+Each decoder has a process of its own under atheris (libFuzzer), which starts from valid messages or files and changes
+them if the change reaches new code. A decoder must accept an input, or reject it with its specified exception. Any
+other exception, an input that takes longer than 5 seconds, and a growth of 64 MB since the first thousandth of the
+inputs end the process and this program, which prints the name of the file with the input.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ MEGABYTES = 64  # limit of the growth of resident memory
 LONGEST = 4096  # maximum length of an input, unless a seed is longer
 SETTINGS = Settings(coreset={"size": 2})
 
-COLUMNS = ("decoder", "inputs", "taken", "refused", "inputs a second", "MB more", "crashes", "hangs")
+COLUMNS = ("decoder", "inputs", "accepted", "rejected", "inputs per second", "MB more", "crashes", "hangs")
 
 
 class Decoder:
@@ -191,21 +191,21 @@ class Trial:
 
     def __init__(self, decoder: Decoder, inputs: int, totals: Path) -> None:
         self._decoder, self._inputs, self._totals = decoder, inputs, totals
-        self._taken = self._refused = 0
+        self._accepted = self._rejected = 0
         self._before = self._most = 0.0
 
     def __call__(self, data: bytes) -> None:
         try:
             self._decoder.take(data)
-            self._taken += 1
+            self._accepted += 1
         except self._decoder.error:
-            self._refused += 1
-        count = self._taken + self._refused
+            self._rejected += 1
+        count = self._accepted + self._rejected
         if count % max(1, self._inputs // 1000) == 0:
             resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
             self._before = self._before or resident
             self._most = max(self._most, resident - self._before)
-            self._totals.write_text(json.dumps([count, self._taken, self._refused, self._most]))
+            self._totals.write_text(json.dumps([count, self._accepted, self._rejected, self._most]))
             if self._most > MEGABYTES:
                 raise MemoryError(f"{self._most:.0f} MB more than after the first inputs")
 
@@ -244,14 +244,14 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
             seconds = os.times().children_user - before
             if done.returncode:
                 raise SystemExit(f"{name}: {done.stderr[-4000:]}")
-            count, taken, refused, megabytes = json.loads((folder / "totals").read_text())
-            rows.append((name, count, taken, refused, round(count / max(seconds, 0.01)), round(megabytes, 1), 0, 0))
+            count, accepted, rejected, megabytes = json.loads((folder / "totals").read_text())
+            rows.append((name, count, accepted, rejected, round(count / max(seconds, 0.01)), round(megabytes, 1), 0, 0))
             print(f"{name}: {count} inputs, {seconds:.0f} s", file=sys.stderr)
     note = (
-        f"an input is at most {LONGEST} bytes, or as long as a good one; "
-        f"a crash, one of {SECONDS} s, or {MEGABYTES} MB more ends the run"
+        f"an input is at most {LONGEST} bytes, or as long as the longest valid one; "
+        f"a crash, an input of {SECONDS} s, or {MEGABYTES} MB more ends the run"
     )
-    yield Table("what became of hostile inputs", COLUMNS, rows, note)
+    yield Table("Hostile inputs", COLUMNS, rows, note)
 
 
 if __name__ == "__main__":

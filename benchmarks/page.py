@@ -115,10 +115,10 @@ def faults(record: Record) -> Iterator[Table]:
 def totals(record: Record) -> Iterator[Table]:
     """Summarise the fuzzing record over all decoders."""
     (table,) = select()(record)
-    inputs, taken, refused, _, memory, crashes, hangs = list(zip(*table.rows, strict=True))[1:]
-    heads = ("decoders", "inputs", "taken", "refused", "most MB more", "crashes", "hangs")
+    inputs, accepted, rejected, _, memory, crashes, hangs = list(zip(*table.rows, strict=True))[1:]
+    heads = ("decoders", "inputs", "accepted", "rejected", "most MB more", "crashes", "hangs")
     yield Table(
-        "", heads, [(len(table.rows), *map(sum, (inputs, taken, refused)), max(memory), sum(crashes), sum(hangs))]
+        "", heads, [(len(table.rows), *map(sum, (inputs, accepted, rejected)), max(memory), sum(crashes), sum(hangs))]
     )
 
 
@@ -151,15 +151,15 @@ def load(record: Record) -> Iterator[Table]:
 
 def limit(record: Record) -> Iterator[Table]:
     """Select the highest rate that met the limits, and the lowest that did not."""
-    held = [step for step in record["steps"] if not step["violations"]]
-    broken = [step for step in record["steps"] if step["violations"]]
-    bounds = [max(held, key=_due, default=None), min(broken, key=_due, default=None)]
+    met = [step for step in record["steps"] if not step["violations"]]
+    exceeded = [step for step in record["steps"] if step["violations"]]
+    bounds = [max(met, key=_due, default=None), min(exceeded, key=_due, default=None)]
     rows = [
-        (_due(step), step["followed"], 1000 * step["track"]["p99"], "broken" if step["violations"] else "held")
+        (_due(step), step["followed"], 1000 * step["track"]["p99"], "exceeded" if step["violations"] else "met")
         for step in bounds
         if step is not None
     ]
-    yield Table("", ("frames/s due", "followed", "track p99, ms", "limits"), rows)
+    yield Table("", ("frames/s due", "tracked", "track p99, ms", "limits"), rows)
 
 
 def _due(step: Record) -> float:

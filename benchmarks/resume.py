@@ -37,10 +37,10 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     video, boxes = write(place, frames, (320, 240))
     kept, out = place / "kept", place / "out"
     begin = [str(video), "--box", ",".join(map(str, boxes[0])), "--output", str(out), "--state", str(kept)]
-    go_on = ["--resume", str(kept)]
+    resumed = ["--resume", str(kept)]
     watched(begin, out, chance.randrange(most))
-    seconds = [watched(go_on, out, chance.randrange(most)) for _ in range(moments - 1)]
-    seconds.append(watched(go_on, out, None))
+    seconds = [watched(resumed, out, chance.randrange(most)) for _ in range(moments - 1)]
+    seconds.append(watched(resumed, out, None))
 
     rows = [track.frame for track in read_tracks(out, video.stem)]
     stored = CheckpointStore(kept / TREES).load(Settings()).seq

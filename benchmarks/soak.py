@@ -1,8 +1,9 @@
 """Measures whether the compressor slows down or its memory grows: a million features messages in one process,
 and some through the compressor process.
 
-The rows are real, cut by a detector that follows a video; each message draws a few of them anew, a little
-brighter or darker than they were. So few rows a message let a million of them pass in minutes; the law is in rows.
+The rows come from a detector on a real video; each message contains a random choice of a few rows, with a random
+change of brightness. With few rows in each message, a million messages take only minutes; the expected memory depends
+on the number of rows.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ GAIN = 0.02  # standard deviation of a drawn row's brightness
 COLUMNS = ("messages", "rows", "us a message", "nodes", "trees MB", "law MB", "resident MB", "handles", "disk MB")
 
 
-class Sight(NamedTuple):
+class Measurement(NamedTuple):
     """The measurements after some messages; a megabyte is 10**6 bytes.
 
-    messages, rows  taken so far, inserted into the four trees so far
-    micros          microseconds of processor time a message since the sight before, reductions and samples included
+    messages, rows  number of messages processed, and of rows inserted into the four trees
+    micros          microseconds of processor time per message since the last measurement, with reductions and samples
     nodes, trees    nodes of all trees, and megabytes of their arrays
     law             megabytes of log2(p/n) + 1 nodes and n pending rows in each tree
     resident        megabytes of the process
@@ -116,9 +117,9 @@ def cut(sequence: Sequence, frames: int, settings: Settings) -> Iterator[Feature
             detector.adopt(trainer.train(sample))
 
 
-def alone(stream: Stream, messages: int, settings: Settings) -> list[Sight]:
+def alone(stream: Stream, messages: int, settings: Settings) -> list[Measurement]:
     """Run a compressor in this process; measure and save it after each block."""
-    compressor, me, file, sights = Compressor(settings), psutil.Process(), scratch() / "soak.safetensors", []
+    compressor, me, file, measurements = Compressor(settings), psutil.Process(), scratch() / "soak.safetensors", []
     block, busy = max(messages // BLOCKS, 1), 0.0
     for seq in range(1, messages + 1):
         message = stream.message(seq)
@@ -128,17 +129,19 @@ def alone(stream: Stream, messages: int, settings: Settings) -> list[Sight]:
         if seq % block == 0:
             compressor.save(file)
             seen = compressor.counters()
-            sights.append(
-                Sight(
+            measurements.append(
+                Measurement(
                     seq, int(seen["rows"]), busy / block * 1e6, int(seen["nodes"]), seen["bytes"] / 1e6,
                     sum(map(law, compressor.trees.values())) / 1e6, me.memory_info().rss / 1e6, me.num_fds(),
                     file.stat().st_size / 1e6,
                 )
             )  # fmt: skip
             busy = 0.0
-            if len(sights) % 10 == 0:
-                print(f"{seq} of {messages} messages, {sights[-1].micros:.0f} us each", file=sys.stderr, flush=True)
-    return sights
+            if len(measurements) % 10 == 0:
+                print(
+                    f"{seq} of {messages} messages, {measurements[-1].micros:.0f} us each", file=sys.stderr, flush=True
+                )
+    return measurements
 
 
 def law(tree: CoresetTree) -> float:
@@ -186,15 +189,15 @@ def wait(sender: Sender, seq: int) -> None:
         sender.poll(0.05)
 
 
-def doubling(sights: list[Sight]) -> Iterator[Sight]:
-    """The last sights whose messages double from one to the next; time is the mean of up to four before each."""
-    for place in (len(sights) // 2**doubled - 1 for doubled in reversed(range(BLOCKS.bit_length()))):
+def doubling(measurements: list[Measurement]) -> Iterator[Measurement]:
+    """The last measurements whose messages double from one to the next; time is the mean of up to four before each."""
+    for place in (len(measurements) // 2**doubled - 1 for doubled in reversed(range(BLOCKS.bit_length()))):
         if place >= 0:
-            near = [sight.micros for sight in sights[max(place - 3, 0) : place + 1]]
-            yield sights[place]._replace(micros=sum(near) / len(near))
+            near = [measurement.micros for measurement in measurements[max(place - 3, 0) : place + 1]]
+            yield measurements[place]._replace(micros=sum(near) / len(near))
 
 
-def draw(sights: list[Sight], file: Path) -> None:
+def draw(measurements: list[Measurement], file: Path) -> None:
     """Plot time per message, and memory with its bound, against the number of messages."""
     import matplotlib
 
@@ -202,11 +205,11 @@ def draw(sights: list[Sight], file: Path) -> None:
     from matplotlib import pyplot
 
     figure, (time, memory) = pyplot.subplots(2, 1, sharex=True, figsize=(8, 6), layout="constrained")
-    counts = [sight.messages for sight in sights]
-    time.plot(counts, [sight.micros for sight in sights])
+    counts = [measurement.messages for measurement in measurements]
+    time.plot(counts, [measurement.micros for measurement in measurements])
     time.set(ylabel="us a message", ylim=(0, None))
     for label in ("resident", "law", "trees", "disk"):
-        memory.plot(counts, [getattr(sight, label) for sight in sights], label=label)
+        memory.plot(counts, [getattr(measurement, label) for measurement in measurements], label=label)
     memory.set(ylabel="MB", xlabel="messages of features", xscale="log", ylim=(0, None))
     memory.legend(fontsize="small")
     file.parent.mkdir(parents=True, exist_ok=True)
