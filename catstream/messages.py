@@ -74,7 +74,7 @@ class DetectorState:
 
     first_frame       the object's first; a model of frames before it is of another object
     level             of the belief that the object was found, see `catstream.detection.belief`
-    window            where the object was; the next search begins there
+    window            window of the object; the next search is centred on it
     confident_window  the same in the last frame whose level was confident or redetected; while the object of a saved
                       model is searched for, the best window of the last frame
     first_window      the same in the first frame; None while the object of a saved model has not been found
@@ -169,7 +169,7 @@ class Stored:
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where a stream continues: the answer of a receiver to each new connection.
+    """The position at which a stream continues: the answer of a receiver to each new connection.
 
     seq       the last message that is stored, 0 in a new stream: the sender continues with the next one
     frame     number of its frame
@@ -244,7 +244,7 @@ class Model:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Track:
-    """Where the object is in one frame, detector -> anyone.
+    """The object in one frame, detector -> anyone.
 
     Attributes
     ----------
@@ -335,7 +335,7 @@ class Health:
     process   name of the process
     time      seconds since the epoch (1970)
     counters  counters of the process, by name
-    trouble   description of what is wrong with the process, empty if nothing is
+    trouble   description of a problem of the process, empty if there is none
     source    the video source without user and password; empty except for the detector
     """
 
@@ -348,7 +348,7 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a pipeline runs with: with it, its features can be learned from again, detector -> anyone.
+    """The settings of a pipeline, with which its features can be used for training again, detector -> anyone.
 
     program   version of catstream
     settings  all settings except `run.endpoint` and `run.keys`, by name, each as the text that `--set` takes
@@ -402,7 +402,7 @@ class Answer:
 
     id       id of the command
     done     whether it was executed
-    reason   description of what was done, or why nothing was
+    reason   description of the effect, or of the reason for a rejection
     frame    number of the newest frame that was processed
     box      last box of the object, None if there is none
     version  version of the newest model of this object, 0 before the first

@@ -1,4 +1,4 @@
-"""The schema of messages: what each field may hold, as metadata of its annotation.
+"""The schema of messages: the allowed values of each field, as metadata of its annotation.
 
 `catstream.messages` states the schema. The checks of `catstream.wire.checks`, the files of `catstream.packing`, the
 tables of `docs/protocol.md` and the fuzzers are derived from it by `fields`. Without metadata a field has the limits

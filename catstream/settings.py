@@ -143,7 +143,7 @@ class CoresetSettings(_Group):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchSettings(_Group):
-    """Where in a frame the object is searched for."""
+    """The search for the object in a frame."""
 
     group = "search"
 
@@ -172,7 +172,7 @@ class SearchSettings(_Group):
 
 @dataclass(frozen=True, kw_only=True)
 class BeliefSettings(_Group):
-    """What a score means: about 0 on background, about 1 on the object."""
+    """The thresholds of the score, which is about 0 on background and about 1 on the object."""
 
     group = "belief"
 
@@ -525,7 +525,7 @@ def _flat(values: Mapping[str, object]) -> dict[str, object]:
 
 
 def _takes(name: str) -> str:
-    """What a setting takes: its type, or the options, and its bounds."""
+    """The valid values of a setting: its type or options, and its bounds."""
     kind, meta = _kinds()[name].__origin__, _kinds()[name].__metadata__[0]
     bounds = [
         f"{sign} {value:g}"

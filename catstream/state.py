@@ -39,7 +39,7 @@ def began(folder: Path) -> bool:
 
 
 def position(folder: Path, settings: Settings) -> Position:
-    """Where the newest whole checkpoint is."""
+    """The position of the newest valid checkpoint."""
     return CheckpointStore(folder / TREES).load(settings).position
 
 

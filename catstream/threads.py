@@ -29,7 +29,7 @@ def limit_process() -> None:
 
 
 class _Library(Protocol):
-    """What is used of a controller of threadpoolctl."""
+    """The part of the interface of a threadpoolctl controller that is used here."""
 
     user_api: str
     filepath: str

@@ -24,7 +24,7 @@ __all__ = ["replay"]
 
 @click.command()
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--endpoint", default="", metavar="PLACE", help="Where subscribers connect; a new endpoint if not given.")
+@click.option("--endpoint", default="", metavar="PLACE", help="Endpoint for subscribers; a new one by default.")
 @click.option("--keys", default="", metavar="DIR", help="Folder of keys; subscribers then need keys.")
 @click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Factor to the speed of recording.")
 @click.option("--fast", is_flag=True, help="Play without pauses.")

@@ -1,4 +1,4 @@
-"""Belief: how sure the detector is that a detection is the object, and what it does at each level.
+"""Belief: how sure the detector is that a detection is the object, and its behaviour at each level.
 
 The level combines two facts, the score of the frame and whether the object is trusted:
 
@@ -29,7 +29,7 @@ __all__ = ["Policy", "is_redetection", "level_of", "policies", "updated"]
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """What the detector does at a level of belief.
+    """The behaviour of the detector at a level of belief.
 
     report           the object counts as present
     resize           size and aspect ratio change
@@ -50,7 +50,7 @@ class Policy:
 
 @lru_cache(maxsize=8)
 def policies(interval: int) -> Mapping[Level, Policy]:
-    """The table: what the detector does at each level; `interval` is the setting `search.whole_interval`.
+    """The behaviour of the detector at each level; `interval` is the setting `search.whole_interval`.
 
     The search interval applies to the level of this frame's local score, without hysteresis; all else to the level of
     the state after the frame.

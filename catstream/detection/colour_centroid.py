@@ -36,7 +36,7 @@ def recentred(
 
     Parameters
     ----------
-    known : what the frames before showed, as above; None before the first
+    known : the state of the earlier frames, as above; None before the first
     window : of the detection
     around : features that hold it
     weights : float32 (SHADES,), of the histogram of colours in the model

@@ -56,7 +56,7 @@ class Detector:
 
     @property
     def box(self) -> Box | None:
-        """Where the object was last, in pixels; None before the first frame."""
+        """The last box of the object, in pixels; None before the first frame."""
         return self.state.window.box(self.settings.search.context) if self.seq and self.state else None
 
     def init(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:

@@ -68,7 +68,7 @@ def _followed(
 
 
 def track_of(state: DetectorState, seq: int, time: float, score: float, model: Model, settings: Settings) -> Track:
-    """What is reported of a state: the box, unless the level of belief forbids it."""
+    """The reported box of a state, unless the level of belief forbids it."""
     reported = _policy(state, settings).report
     box = state.window.box(settings.search.context) if reported else None
     present: State = "present" if model.version else "bootstrapping"

@@ -1,4 +1,4 @@
-"""The teacher: training rows of the windows in and around the object's, and what label each should get.
+"""The teacher: training rows of the windows in and around the object's, and the label of each.
 
 A row of the object has label 1, one of the background 0. Between them are near misses, windows beside the object, and
 windows of the object of a wrong size or aspect ratio. Both get a Gaussian of their offset, so that scores fall smoothly

@@ -55,7 +55,7 @@ _ANNOUNCER = _Announcer()
 
 
 def _cache_folder() -> str:
-    """Where compiled kernels are kept: beside the code only if that can be written."""
+    """The folder for compiled kernels: beside the code if that is writable."""
     beside = Path(__file__).parent
     if os.access(beside, os.W_OK):
         return str(beside / "__pycache__")

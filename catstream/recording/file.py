@@ -67,7 +67,7 @@ class RecordingWriter:
     Parameters
     ----------
     path : of the file
-    run : what the pipeline runs with
+    run : the settings of the pipeline
     resume : continue the file after its last whole message, if it exists
 
     Attributes
@@ -164,7 +164,7 @@ class Recording:
 
     Attributes
     ----------
-    run : what the pipeline ran with
+    run : the settings of the pipeline
     counts : messages by kind, `counts[Features]` ...; of features and models those that `features` and `models` yield
     missing : features and tracks that are missing, judged by gaps in `seq`; also before the first and, if the end was
         recorded, after the last

@@ -29,7 +29,7 @@ class Player:
     Parameters
     ----------
     recording : to be published
-    endpoint : where subscribers connect
+    endpoint : endpoint for the subscribers
     """
 
     def __init__(self, recording: Recording, endpoint: Endpoint) -> None:

@@ -1,1 +1,1 @@
-"""Sinks: where the tracks of a running pipeline go, a kind of file each."""
+"""Sinks: the file formats to which tracks are written."""

@@ -1,1 +1,1 @@
-"""The wire: what flows between the processes, in which bytes, over which sockets."""
+"""The wire: the encoding of messages, and the sockets between the processes."""

@@ -28,7 +28,7 @@ class Announcement:
     Parameters
     ----------
     endpoint : Endpoint
-        Where the subscriber waits.
+        Endpoint at which the subscriber waits.
     channels : iterable of str
         Names of the channels whose messages it receives from the first one on.
 

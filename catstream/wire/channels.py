@@ -1,4 +1,4 @@
-"""The channels: what flows between the processes, from whom to whom, and what a slow reader misses.
+"""The channels between the processes: their messages, their two ends, and their behaviour with slow readers.
 
     features   the training rows of each frame; every message is delivered exactly once: it is acknowledged, and
                retransmitted to a restarted receiver
@@ -40,7 +40,7 @@ __all__ = [
     "Role",
 ]
 
-#: What a client may do: each role includes those before it.
+#: The permissions of a client: each role includes those before it.
 Role = Literal["watch", "steer", "pipeline"]
 
 #: The port of the first channel, by default.
@@ -53,7 +53,7 @@ Message = TypeVar("Message", covariant=True)
 class Channel(Generic[Message]):
     """One row of the table.
 
-    name             the plural of what flows
+    name             the plural of the messages
     messages         kinds of message that it carries
     senders          processes that send, or "anyone"
     receiver         the one process that every message is for, or None: any number of subscribers

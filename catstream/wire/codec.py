@@ -71,7 +71,7 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
     Raises
     ------
     ProtocolError
-        If it is anything else; says what was expected and what came.
+        If it is anything else; the error has the expected and the received kind.
     """
     expected = " or ".join(sorted(kind.__name__.lower() for kind in kinds))
     try:

@@ -1,4 +1,4 @@
-"""Endpoints: where the sockets of a pipeline are, and how a running pipeline is found.
+"""Endpoints: the addresses of the sockets of a pipeline, and the search for running pipelines.
 
 An endpoint is a folder with one Unix socket for each channel (`FOLDER/features`), which only this user may enter; or
 `tcp://127.0.0.1:5700`, from which each channel takes the port that its row in the table says. With keys other machines
@@ -36,7 +36,7 @@ _NOTE = "endpoint"  # file in the private folder of a running pipeline that hold
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where the sockets of a pipeline are: a folder, or hosts and the first port; and the keys to connect with.
+    """The address of the sockets of a pipeline: a folder, or hosts and the first port; and the keys to connect with.
 
     host    of all processes that `hosts` does not name, as ZeroMQ takes it
     hosts   of single processes, by name
@@ -290,9 +290,7 @@ def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
             raise ServiceError(f"{len(found)} pipelines follow {source!r}: say which (--endpoint){_listed(found)}")
         return found[0]
     if not endpoints:
-        raise ServiceError(
-            "no pipeline of yours is running: start one (catstream track), or say where it is (--endpoint)"
-        )
+        raise ServiceError("no pipeline of yours is running: start one (catstream track), or give its --endpoint")
     if len(endpoints) > 1:
         raise ServiceError(
             f"{len(endpoints)} pipelines are running: say which (--endpoint or --source){_listed(endpoints)}"

@@ -29,7 +29,7 @@ from catstream.wire.channels import Role
 
 __all__ = ["ROLES", "Client", "Keys", "allow", "clients", "create", "revoke"]
 
-#: What a client may do: each role includes those before it.
+#: The permissions of a client: each role includes those before it.
 ROLES: tuple[Role, ...] = get_args(Role)
 
 _SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS = "server.key", "server.pub", "client.key", "clients"

@@ -1,4 +1,4 @@
-"""What ZeroMQ reports about the connections of a socket."""
+"""The connection events that ZeroMQ reports for a socket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What this process rejected: counted by reason for its health, and logged once for each cause.
+"""Rejected messages and connections: counted by reason for the health, and logged once for each cause.
 
 Messages are counted by what is wrong with them: `catstream.errors.ProtocolError` has the reasons. If the pipeline has
 keys, connections are counted by what is wrong with the keys of the peer: "handshake" (it has none, or those of another

@@ -1,4 +1,4 @@
-"""What all sockets of a channel have in common: limits, keys, connection events, and the check of what arrives.
+"""The base class of all sockets of a channel: limits, keys, connection events, and the check of messages.
 
 Every queue, message and handshake has a limit. A frame that is not a message of the channel is counted, logged
 once and dropped (`catstream.wire.rejects`). If the endpoint has keys, everything is encrypted (CURVE), and a peer that
@@ -203,7 +203,7 @@ class ChannelSocket(Generic[Message]):
         if event.denied:
             raise ServiceError(
                 f"{self._endpoint} does not let this key take part in {self.channel.name}: "
-                "ask who runs it for one that may (catstream keys allow)"
+                "ask its administrator for a key with that role (catstream keys allow)"
             )
         if event.other_mechanism and self._endpoint.keys is None:
             raise ServiceError(
