@@ -173,7 +173,7 @@ def track(
     if resume is not None and pipeline.complete:
         if box is not None:
             raise click.UsageError(f"{_complete(pipeline, resume, output)}: no frame is left for a box")
-        if not files.made:
+        if not files.complete:
             with files.opened(resume=True):  # creates new files, and closes those that were not closed
                 pass
         console.print(_complete(pipeline, resume, output), highlight=False)

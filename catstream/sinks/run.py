@@ -11,7 +11,7 @@ from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.messages import Position, Track
-from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, is_closed, is_there, open_sink, reader
+from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, file_exists, is_closed, open_sink, reader
 from catstream.storage import is_writable
 from catstream.video import results
 from catstream.video.frames import RATE
@@ -72,7 +72,7 @@ class RunFiles:
             if file in self.files[:count]:
                 raise VideoError(f"{file} is named twice: give each file once")
             check_writable(file, may_exist=True)
-            if is_there(file) and not overwrite and file not in known:
+            if file_exists(file) and not overwrite and file not in known:
                 raise VideoError(f"{file} exists already: replace it with --overwrite, or give another name")
         files = [file for file in self.files if file != STDOUT]
         if resumable and self.output is None and files and not any(map(reader, files)):
@@ -82,7 +82,7 @@ class RunFiles:
             )
 
     @property
-    def made(self) -> bool:
+    def complete(self) -> bool:
         """Whether all files exist and are complete."""
         files = [file for file in self.files if file != STDOUT]
         return all(is_closed(file) for file in [*files, *([self._video_file()] if self.video else [])])
@@ -122,7 +122,7 @@ class RunFiles:
                 rows.append(writer)
                 restarted += [partial(writer.write, seconds=float("nan"))] if new else []
             for file in (*self.files, *([self._video_file()] if self.video else [])):
-                new = reader(file) is None or not is_there(file)
+                new = reader(file) is None or not file_exists(file)
                 if not resume:
                     discard(file)
                 sink = stack.enter_context(
@@ -159,7 +159,7 @@ class RunFiles:
             found.append((count, partial(results.read_tracks, self.output, self.name)))
         for file in self.files:
             read = reader(file)
-            if read is not None and is_there(file):
+            if read is not None and file_exists(file):
                 found.append((max((track.frame + 1 for track in read(file)), default=0), partial(read, file)))
         return found
 

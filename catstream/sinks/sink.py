@@ -28,7 +28,7 @@ from catstream.storage import is_writable
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 
-__all__ = ["STDOUT", "SUFFIXES", "Sink", "check_writable", "discard", "is_closed", "is_there", "open_sink", "reader"]
+__all__ = ["STDOUT", "SUFFIXES", "Sink", "check_writable", "discard", "file_exists", "is_closed", "open_sink", "reader"]
 
 #: Stands for standard output in place of a file.
 STDOUT = Path("-")
@@ -80,7 +80,7 @@ def check_writable(path: Path, *, may_exist: bool = False) -> None:
         return
     if path.suffix not in SUFFIXES:
         raise VideoError(f"{path}: the name of a file for tracks ends with {', '.join(SUFFIXES)}, or is - for stdout")
-    if not may_exist and is_there(path):
+    if not may_exist and file_exists(path):
         raise VideoError(f"{path} exists already: give another name, or remove it")
     if path.suffix == ".parquet":
         require_extra("parquet")
@@ -88,7 +88,7 @@ def check_writable(path: Path, *, may_exist: bool = False) -> None:
         raise VideoError(f"cannot write {path}: give a file in a folder that exists and that you may write to")
 
 
-def is_there(path: Path) -> bool:
+def file_exists(path: Path) -> bool:
     """Return whether a file exists, or one that belongs to it."""
     return path != STDOUT and any(file.exists() for file in _files(path))
 

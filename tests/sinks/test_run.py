@@ -73,13 +73,13 @@ def test_a_run_that_is_resumed_leaves_the_files_of_one_in_one_go(files, tmp_path
     assert broken.position() == Position(6, 5, track(5).box)
     fill(broken, 6, 12, resume=True)
     assert held(broken) == held(whole)
-    assert broken.made
+    assert broken.complete
 
 
 def test_a_file_that_is_new_when_a_run_is_resumed_gets_all_tracks(files):
     fill(files("run", ["t.csv"]), 0, 7)
     more = files("run", ["t.csv", "t.json", "t.txt"])
-    assert not more.made
+    assert not more.complete
     fill(more, more.position().seq, 9, resume=True)
     assert [row["frame"] for row in json.loads(more.files[1].read_text())] == list(range(9))
     assert len(more.files[2].read_text().splitlines()) == 6, "MOT text has no line where the object is absent"
