@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import click
@@ -178,19 +179,10 @@ def track(
                 pass
         console.print(_complete(pipeline, resume, output), highlight=False)
         return
-    interrupts = Interrupts()
-    interrupts.install()
     run = RunProgress(pipeline)
-    interrupted = False
+    serve = partial(_serve, pipeline, view, token, console) if view is not None else None
     try:
-        with pipeline, ExitStack() as stack:
-            if view is not None:
-                _serve(pipeline, view, token, console, stack)
-            if pipeline.waits:
-                console.print(f"waiting for a box: {_ways_to_set_box(pipeline, view is not None)}", highlight=False)
-            _write_tracks(pipeline, files, run, console, interrupts, resumed=resume is not None)
-    except KeyboardInterrupt:
-        interrupted = True
+        interrupted = _run(pipeline, files, run, console, serve, resumed=resume is not None)
     finally:
         if run.frames:
             console.print(run.summary([*([output] if output is not None else []), *files.files]), highlight=False)
@@ -202,6 +194,30 @@ def track(
         hint = f"; to continue: catstream track --resume {state or resume}" if state or resume else ""
         console.print(f"stopped: the results so far are kept{hint}", highlight=False)
         sys.exit(INTERRUPTED)
+
+
+def _run(
+    pipeline: Pipeline,
+    files: RunFiles,
+    run: RunProgress,
+    console: Console,
+    serve: Callable[[ExitStack], None] | None,
+    *,
+    resumed: bool,
+) -> bool:
+    """Run the pipeline to its end, with the page if `serve` starts one; returns whether Ctrl-C or a signal ended it."""
+    interrupts = Interrupts()
+    interrupts.install()
+    try:
+        with pipeline, ExitStack() as stack:
+            if serve is not None:
+                serve(stack)
+            if pipeline.waits:
+                console.print(f"waiting for a box: {_ways_to_set_box(pipeline, serve is not None)}", highlight=False)
+            _write_tracks(pipeline, files, run, console, interrupts, resumed=resumed)
+    except KeyboardInterrupt:
+        return True
+    return False
 
 
 def _serve(pipeline: Pipeline, view: Address, token: str | None, console: Console, stack: ExitStack) -> None:
