@@ -166,7 +166,7 @@ def slow_at_the_top(path: Path) -> Iterator[str]:
         yield f"imports {library} at module level: this is slow, import it in the function that needs it"
 
 
-def test_slow_libraries_are_imported_where_they_are_used():
+def test_slow_libraries_are_imported_by_the_functions_that_use_them():
     assert not violations(slow_at_the_top)
 
 

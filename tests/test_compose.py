@@ -83,7 +83,7 @@ def published(service):
         yield from ((address, port) for port in range(int(first), int(last or first) + 1))
 
 
-def test_there_is_a_service_for_each_process_the_page_and_one_that_holds_the_network():
+def test_there_is_a_service_for_each_process_one_for_the_page_and_one_for_the_network():
     assert set(SERVICES) == {*NAMES, "view", "network"}
     assert {service["image"] for service in SERVICES.values()} == {"catstream"}
 
@@ -125,7 +125,7 @@ def test_without_a_token_the_page_does_not_start():
         Server("tcp://127.0.0.1:5700", host="0.0.0.0", port=0, token=token)
 
 
-def test_who_dies_goes_on_where_it_stopped():
+def test_a_process_that_dies_resumes_from_its_state():
     assert all(SERVICES[name]["restart"].startswith("on-failure") for name in NAMES)
     assert f"state:{parsed('compressor')[1]['state']}" in SERVICES["compressor"]["volumes"]
     assert parsed("detector")[1]["resume"]
@@ -140,12 +140,12 @@ def test_the_video_is_mounted_read_only_and_named_by_the_user():
         assert f"${{{name}:?" in " ".join(SERVICES["detector"]["command"])
 
 
-def test_the_address_of_a_camera_is_taken_as_it_is():
+def test_the_address_of_a_camera_is_used_unchanged():
     assert filled_in(SERVICES["detector"]["command"][-1], SOURCE="rtsp://10.0.0.7/one") == "rtsp://10.0.0.7/one"
 
 
 @PROCESSES
-def test_the_health_check_hears_its_process_and_notices_silence(name):
+def test_the_health_check_receives_from_its_process_and_detects_silence(name):
     *command, script, address = SERVICES[name]["healthcheck"]["test"]
     assert command == ["CMD", "python", "-P", "-c"]
     compose = Endpoint.parse(settings(name).run.endpoint)
@@ -164,7 +164,7 @@ def test_the_health_check_hears_its_process_and_notices_silence(name):
     assert hearing.returncode == 0
 
 
-def test_what_a_client_may_subscribe_to_is_published_on_this_host_alone_if_there_are_keys():
+def test_ports_for_subscribers_are_published_on_this_host_alone_if_there_are_keys():
     compose = Endpoint.parse(settings("detector").run.endpoint)
     wanted = {
         int(compose.address(channel, sender).rpartition(":")[2])

@@ -93,7 +93,7 @@ def test_a_tree_of_a_sample_stands_for_as_many_rows_with_the_same_mean(compresso
     CoresetTree.from_state(*other.state())
 
 
-def test_a_compressor_goes_on_from_a_sample_with_its_version_and_its_weight(learned, rng, tmp_path):
+def test_a_compressor_continues_from_a_sample_with_its_version_and_its_weight(learned, rng, tmp_path):
     learned.save(tmp_path / "one")
     compressor = Compressor.from_sample(Learned.load(tmp_path / "one").sample, Settings(coreset={"size": SIZE}))
     assert compressor.sampled == learned.sample.version
@@ -102,7 +102,7 @@ def test_a_compressor_goes_on_from_a_sample_with_its_version_and_its_weight(lear
     assert samples[-1].trees["object"].count > learned.sample.trees["object"].count / 2
 
 
-def test_where_another_object_begins_nothing_of_the_one_before_is_left_but_the_versions(compressor, rng):
+def test_a_new_object_keeps_nothing_of_the_previous_one_except_the_versions(compressor, rng):
     version, fresh = compressor.version, Compressor(Settings(coreset={"size": SIZE}))
     stream = [features(rng, seq, begins=seq == 101) for seq in range(101, 140)]
     ours = [compressor.take(message) for message in stream]

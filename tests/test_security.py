@@ -66,7 +66,7 @@ def test_no_input_is_executed():
         "import subprocess\nsubprocess.run('true', shell=bool(1))",
     ],
 )
-def test_what_is_looked_for_is_found(source):
+def test_each_forbidden_pattern_is_found(source):
     assert found(source)
 
 

@@ -62,7 +62,7 @@ WAYS = {
         ("teaching.classifier", "wrong", "joint | least-squares | one-class"),
     ],
 )
-def test_a_value_that_does_not_fit_is_refused_with_what_the_setting_takes(way, name, value, takes):
+def test_an_invalid_value_is_rejected_with_the_values_that_the_setting_accepts(way, name, value, takes):
     with pytest.raises(SettingsError) as error:
         WAYS[way](name, value)
     shown = (repr(value), repr(str(value)), repr(float(value)) if name == "run.checkpoint_seconds" else "")
@@ -70,7 +70,7 @@ def test_a_value_that_does_not_fit_is_refused_with_what_the_setting_takes(way, n
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_name_that_does_not_exist_is_refused_with_the_nearest_ones(way):
+def test_an_unknown_name_is_rejected_with_the_nearest_ones(way):
     with pytest.raises(SettingsError) as error:
         WAYS[way]("coreset.sice", 64)
     assert str(error.value).startswith("there is no setting 'coreset.sice', did you mean 'coreset.size'")
@@ -81,23 +81,23 @@ def test_a_name_that_does_not_exist_is_refused_with_the_nearest_ones(way):
 @pytest.mark.parametrize(
     ("name", "nearest"), [("coreset_size", "coreset.size"), ("lockstep", "run.lockstep"), ("keys", "run.keys")]
 )
-def test_a_name_without_its_group_is_refused_with_the_full_name(name, nearest):
+def test_a_name_without_its_group_is_rejected_with_the_full_name(name, nearest):
     with pytest.raises(SettingsError, match=f"there is no setting '{name}', did you mean '{re.escape(nearest)}'"):
         Settings.from_values({name: 1})
 
 
-def test_a_name_that_is_similar_to_no_other_says_how_to_list_them():
+def test_the_error_for_a_name_similar_to_no_other_contains_the_command_that_lists_them():
     with pytest.raises(SettingsError, match=r"there is no setting 'qqq': `catstream settings` lists all \d+$"):
         Settings(qqq=1)
 
 
 @pytest.mark.parametrize("make", [Settings, CoresetSettings], ids=["all", "group"])
-def test_a_value_without_a_name_is_refused(make):
+def test_a_value_without_a_name_is_rejected(make):
     with pytest.raises(SettingsError, match="given by name, got 64"):
         make(64)
 
 
-def test_a_group_that_is_no_group_is_refused():
+def test_an_invalid_group_is_rejected():
     with pytest.raises(SettingsError, match=r"the group of settings coreset cannot be 64: give a CoresetSettings"):
         Settings(coreset=64)
 

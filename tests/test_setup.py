@@ -26,7 +26,7 @@ def names(requirements):
     return found - {"catstream"}
 
 
-def test_what_runs_catstream_with_its_page_is_in_one_lock_and_what_tests_it_in_the_other():
+def test_runtime_and_test_dependencies_are_in_separate_lock_files():
     project = PROJECT["project"]
     extras = project["optional-dependencies"]
     run, test = pinned("requirements.lock"), pinned("requirements-dev.lock")

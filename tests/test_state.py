@@ -23,7 +23,7 @@ def umask():
     os.umask(before)
 
 
-def test_what_holds_no_secret_is_for_whom_the_umask_says(tmp_path, umask):
+def test_a_file_without_a_secret_has_the_permissions_of_the_umask(tmp_path, umask):
     umask(0o027)
     storage.write(tmp_path / "tree", {}, {})
     assert stat.S_IMODE((tmp_path / "tree").stat().st_mode) == 0o640

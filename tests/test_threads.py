@@ -67,7 +67,7 @@ def test_the_last_of_two_threads_restores_the_number():
 
 
 @pytest.mark.usefixtures("libraries")
-def test_a_number_set_by_the_user_meanwhile_is_kept():
+def test_a_number_of_threads_set_by_the_user_meanwhile_is_kept():
     holder = one_thread()
     holder.__enter__()
     with threadpool_limits(1):

@@ -47,7 +47,7 @@ def test_a_patch_is_followed(video, preset):
     assert np.mean([box is not None and box.overlap(Box(*truth)) > 0.5 for box, truth in pairs]) > 0.9
 
 
-def test_a_share_of_an_unknown_length_is_refused(video):
+def test_a_share_of_an_unknown_length_is_rejected(video):
     with pytest.raises(SettingsError, match="for_length"):
         follow(video, Settings(coreset={"share": 0.1}))
     with pytest.raises(SettingsError, match="is not known"):
@@ -77,12 +77,12 @@ def test_init_forgets_all_before(video):
     assert [tracker.update(frame)[1] for frame in frames[1:]] == found
 
 
-def test_update_before_init_is_refused(video):
+def test_update_before_init_is_rejected(video):
     with pytest.raises(BoxError, match="call init"):
         Tracker().update(video[0][0])
 
 
-def test_a_refused_box_leaves_what_is_followed(video):
+def test_a_rejected_box_does_not_change_the_tracked_object(video):
     frames, boxes = video
     tracker = Tracker()
     tracker.init(frames[0], boxes[0])
@@ -102,7 +102,7 @@ def test_frames_of_other_libraries_give_the_boxes_of_the_same_frames(video):
 
 
 @pytest.mark.parametrize("bad", [None, np.zeros((3, 240, 320), np.uint8), np.zeros((240, 320), bool)])
-def test_what_is_no_frame_is_refused_and_the_tracker_goes_on(video, bad):
+def test_an_invalid_frame_is_rejected_and_the_tracker_continues(video, bad):
     frames, boxes = video
     tracker = Tracker()
     with pytest.raises(FrameError):
@@ -113,7 +113,7 @@ def test_what_is_no_frame_is_refused_and_the_tracker_goes_on(video, bad):
     assert (tracker.track.seq, tracker.update(frames[1])[0]) == (1, True)
 
 
-def test_a_frame_of_another_size_is_refused(video):
+def test_a_frame_of_another_size_is_rejected(video):
     frames, boxes = video
     tracker = Tracker()
     tracker.init(frames[0], boxes[0])
@@ -127,7 +127,7 @@ def test_settings_may_be_given_as_a_mapping():
     assert Tracker({"coreset.size": 32}).settings == Settings(coreset={"size": 32})
 
 
-def test_trackers_in_two_threads_give_what_each_gives_alone(video):
+def test_trackers_in_two_threads_give_the_same_tracks_as_alone(video):
     with ThreadPoolExecutor(2) as pool:
         one, two = (pool.submit(follow, video, Settings(run={"seed": seed})) for seed in (0, 1))
     assert (one.result()[0], two.result()[0]) == (
@@ -145,7 +145,7 @@ _SCM = {"teaching.bootstrap": "scm", "coreset.size": 36, "teaching.copies": 5}
 
 @pytest.mark.parametrize("settings", [{}, _SCM], ids=["copies", "scm"])
 @pytest.mark.parametrize("after", [1, 4, 11], ids="after {} frames".format)
-def test_a_saved_tracker_goes_on_bit_for_bit(video, tmp_path, settings, after):
+def test_a_saved_tracker_continues_bit_for_bit(video, tmp_path, settings, after):
     frames, boxes = video
     tracker = Tracker(settings)
     tracker.init(frames[0], boxes[0])
@@ -178,7 +178,7 @@ for frame in np.load(sys.argv[2]):
 """
 
 
-def test_another_process_goes_on_bit_for_bit_whatever_its_threads(video, tmp_path):
+def test_another_process_continues_bit_for_bit_with_any_number_of_threads(video, tmp_path):
     frames, boxes = video
     tracker = Tracker()
     tracker.init(frames[0], boxes[0])
@@ -197,7 +197,7 @@ def test_nothing_is_saved_before_init(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_is_no_saved_tracker_is_refused(video, tmp_path):
+def test_a_file_that_is_not_a_saved_tracker_is_rejected(video, tmp_path):
     kept = tmp_path / "kept"
     with pytest.raises(ServiceError, match="there is no saved tracker"):
         Tracker.load(kept)
@@ -217,7 +217,7 @@ def test_a_file_that_is_no_saved_tracker_is_refused(video, tmp_path):
         Tracker.load(kept)
 
 
-def test_a_tracker_of_other_features_is_refused(video, tmp_path):
+def test_a_tracker_of_other_features_is_rejected(video, tmp_path):
     tracker = Tracker()
     tracker.init(video[0][0], video[1][0])
     tracker.save(tmp_path / "kept")
@@ -227,7 +227,7 @@ def test_a_tracker_of_other_features_is_refused(video, tmp_path):
         Tracker.load(tmp_path / "kept")
 
 
-def test_a_saved_tracker_that_cannot_be_written_is_said_in_one_line(video, tmp_path):
+def test_a_saved_tracker_that_cannot_be_written_is_reported_in_one_line(video, tmp_path):
     tracker = Tracker()
     tracker.init(video[0][0], video[1][0])
     with pytest.raises(ServiceError, match=r"cannot write .*: give another file"):

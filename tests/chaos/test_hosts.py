@@ -79,7 +79,7 @@ def test_a_host_that_is_cut_off_for_a_while_costs_nothing(video, calm, hosts, st
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", NAMES)
-def test_a_host_that_loses_its_power_and_comes_back_costs_nothing(video, calm, hosts, start, until, tmp_path, victim):
+def test_a_host_that_loses_power_and_restarts_costs_no_frame(video, calm, hosts, start, until, tmp_path, victim):
     processes = {name: start(name) for name in NAMES}
     until(lambda: reached(tmp_path / "state", 5))
     hosts.power_off(victim, processes[victim])

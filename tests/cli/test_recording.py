@@ -21,7 +21,7 @@ def recorded(whole_run):
     return whole_run / "rec"
 
 
-def test_a_run_that_is_recorded_says_what_is_in_the_file(whole_run):
+def test_the_content_of_a_recording_is_reported(whole_run):
     errors = (whole_run / "stderr").read_text()
     assert "recording: rec, 60 features, " in errors
     assert "none missing" in errors
@@ -47,7 +47,7 @@ def test_the_learning_is_replayed_and_compared_with_other_settings(recorded, sai
     assert str(smaller.counts[Model]) == rows["coreset.size=32"][1]
 
 
-def test_a_model_that_does_not_come_out_again_is_an_error(recorded, said, tmp_path):
+def test_a_model_that_is_not_reproduced_is_an_error(recorded, said, tmp_path):
     recording = Recording(recorded)
     with RecordingWriter(tmp_path / "other.rec", recording.run) as writer:
         for _, message in list(recording.messages())[1:]:
@@ -59,7 +59,7 @@ def test_a_model_that_does_not_come_out_again_is_an_error(recorded, said, tmp_pa
     assert "recorded models were not reproduced" in errors
 
 
-def test_what_is_refused_leaves_no_file_and_may_be_asked_for_again(recorded, said, tmp_path):
+def test_rejected_training_leaves_no_file_and_may_be_requested_again(recorded, said, tmp_path):
     recording, output = Recording(recorded), tmp_path / "models.rec"
     with RecordingWriter(tmp_path / "gap.rec", recording.run) as writer:
         for _, message in list(recording.messages())[1:]:
@@ -91,7 +91,7 @@ def holds_tracks(path):
     return path.exists() and path.stat().st_size > 0 and Recording(path).counts[Track] > 0
 
 
-def test_what_a_pipeline_says_is_recorded_from_outside(video, catstream, tmp_path):
+def test_the_messages_of_a_pipeline_are_recorded_by_another_process(video, catstream, tmp_path):
     source, box = video
     settings, paths = (
         Settings(run={"unstored_frames": 1, "endpoint": str(tmp_path)}),

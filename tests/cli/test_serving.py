@@ -16,7 +16,7 @@ def test_a_malformed_address_is_an_error(text):
 
 
 @pytest.mark.parametrize("prefix", ["", "view-"])
-def test_the_token_of_a_page_comes_from_an_option_a_variable_or_a_file(prefix, tmp_path):
+def test_the_token_of_a_page_is_read_from_an_option_a_variable_or_a_file(prefix, tmp_path):
     file, empty = tmp_path / "token", tmp_path / "empty"
     file.write_text("from-a-file-of-mine\n")
     empty.write_text("\n")

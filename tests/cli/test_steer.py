@@ -94,7 +94,7 @@ def test_box_and_model_together_are_an_error(video, said, tmp_path):
 
 
 @pytest.mark.parametrize("verb", STEER)
-def test_where_no_pipeline_runs_one_line_says_so(said, tmp_path, verb):
+def test_if_no_pipeline_runs_that_is_reported_in_one_line(said, tmp_path, verb):
     assert verb in VERBS
     words = {"set-box": ["1,2,3,4"], "save": [tmp_path / "one"]}.get(verb, [])
     code, output, errors = said(verb, *words, "--endpoint", tmp_path / "run", "--timeout", 0.2)

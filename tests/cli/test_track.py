@@ -124,7 +124,7 @@ def test_a_truncated_video_is_followed_up_to_the_break(video, said_by_process, t
     assert len((tmp_path / "out" / "broken.txt").read_text().splitlines()) == good
 
 
-def test_a_damaged_place_is_skipped_if_that_is_asked_for_and_counted(video, said, tmp_path):
+def test_damaged_frames_are_skipped_if_requested_and_counted(video, said, tmp_path):
     source, box = video
     damaged = tmp_path / "damaged.mpg"
     data = bytearray(encoded(source, damaged).read_bytes())
@@ -139,7 +139,7 @@ def test_a_damaged_place_is_skipped_if_that_is_asked_for_and_counted(video, said
     assert readable(damaged) < len((tmp_path / "out" / "damaged.txt").read_text().splitlines()) == good < 60
 
 
-def test_an_image_of_another_size_ends_the_run_where_it_comes(video, said, tmp_path):
+def test_an_image_of_another_size_ends_the_run_at_that_frame(video, said, tmp_path):
     source, box = video
     images = tmp_path / "walk"
     images.mkdir()
@@ -153,7 +153,7 @@ def test_an_image_of_another_size_ends_the_run_where_it_comes(video, said, tmp_p
     assert len((tmp_path / "out" / "walk.txt").read_text().splitlines()) == 10
 
 
-REFUSED = {
+REJECTED = {
     "a file that is not there": (["none.mp4"], "no video or folder"),
     "an empty folder": (["."], "neither images nor a video"),
     "a text": (["notes.txt"], "not a video|no video in"),
@@ -169,8 +169,8 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("arguments", "word"), REFUSED.values(), ids=REFUSED)
-def test_bad_input_is_refused_in_one_line_and_nothing_is_written(video, said, tmp_path, arguments, word):
+@pytest.mark.parametrize(("arguments", "word"), REJECTED.values(), ids=REJECTED)
+def test_bad_input_is_rejected_in_one_line_and_nothing_is_written(video, said, tmp_path, arguments, word):
     source, box = video
     (tmp_path / "notes.txt").write_text("not a video\n")
     given = arguments if not arguments[0].startswith("--") else [source, *arguments]
@@ -184,7 +184,7 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_written(video, said, tm
 
 
 @pytest.mark.parametrize("output", ["a file", "/proc/catstream"])
-def test_an_output_that_cannot_be_written_to_is_refused(video, said, tmp_path, output):
+def test_an_output_folder_that_cannot_be_written_is_rejected(video, said, tmp_path, output):
     source, box = video
     folder = tmp_path / "file" if output == "a file" else Path(output)
     (tmp_path / "file").write_text("mine\n")

@@ -100,7 +100,7 @@ def found(row, story):
     return bool(box) and max(box.overlap(truth) for _, truth in story) > 0.6
 
 
-def test_a_server_that_freezes_and_dies_is_followed_again_with_what_was_learned(rtsp, following, story):
+def test_tracking_resumes_with_the_learned_model_after_a_server_freezes_and_dies(rtsp, following, story):
     server, port = rtsp()
     with following(f"rtsp://127.0.0.1:{port}/one") as run:
         run.until(lambda counters: counters["model_version"] >= 5)
@@ -156,15 +156,15 @@ def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, 
 
 
 LIVE = "http://127.0.0.1:1/one"
-REFUSED = {
+REJECTED = {
     "in lockstep": (["--lockstep"], "omit lockstep"),
     "from a later frame": (["--start", "9"], "leave out start, end and stride"),
     "not there": ([], "connection refused"),
 }
 
 
-@pytest.mark.parametrize(("options", "words"), REFUSED.values(), ids=REFUSED)
-def test_what_a_stream_cannot_give_is_refused_before_anything_starts(said, tmp_path, options, words):
+@pytest.mark.parametrize(("options", "words"), REJECTED.values(), ids=REJECTED)
+def test_options_that_a_stream_does_not_support_are_rejected_before_anything_starts(said, tmp_path, options, words):
     code, _, errors = said("track", LIVE, "--box", "10,10,20,20", *options, cwd=tmp_path)
     assert code in (1, 2)
     assert "Traceback" not in errors
@@ -172,7 +172,7 @@ def test_what_a_stream_cannot_give_is_refused_before_anything_starts(said, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-def test_its_frames_cannot_be_had_once_more_for_a_video(camera, said, story, tmp_path):
+def test_the_frames_of_a_stream_cannot_be_read_again_for_a_video(camera, said, story, tmp_path):
     cam = camera(lambda _: story[0][0])
     with Pipeline(cam.url, story[0][1], state=tmp_path / "kept"):
         pass

@@ -142,7 +142,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
     assert frames(out) == list(range(60))
 
 
-def test_settings_that_are_given_again_change_and_all_others_are_kept(video, said, monkeypatch, tmp_path):
+def test_settings_that_are_given_again_change_and_all_others_stay(video, said, monkeypatch, tmp_path):
     monkeypatch.setattr(Pipeline, "__iter__", lambda _: iter(()))  # kept when it starts: no frame has to be followed
     (source, box), kept = video, tmp_path / "kept"
     assert said("track", source, "--box", box, "--state", kept, *OFTEN)[0] == 0
@@ -173,7 +173,7 @@ def test_settings_that_are_given_again_change_and_all_others_are_kept(video, sai
         assert Job.load(kept).settings.changed() == changed
 
 
-def test_a_program_that_goes_on_gives_the_settings_that_are_others(video, tmp_path):
+def test_a_program_that_resumes_a_run_gives_only_the_changed_settings(video, tmp_path):
     source, box = video
     begun = {"settings": Settings(run={"unstored_frames": 8, "lockstep": True}), "state": tmp_path / "kept"}
     with Pipeline(source, [float(side) for side in box.split(",")], **begun):
@@ -210,7 +210,7 @@ def test_a_terminal_that_is_lost_ends_a_run_like_ctrl_c(video, catstream, until,
         assert len(frames(tmp_path)) - sum(1 for _ in film) in (0, 1)
 
 
-def test_a_run_that_is_complete_is_not_resumed_and_says_so(video, said, tmp_path):
+def test_a_complete_run_is_not_resumed_and_that_is_reported(video, said, tmp_path):
     (source, box), kept, out = video, tmp_path / "kept", tmp_path / "out"
     code, _, errors = said("track", source, "--box", box, "--end", 6, "--output", out, "--state", kept)
     assert code == 0, errors

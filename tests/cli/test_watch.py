@@ -101,7 +101,7 @@ TERMINAL = {**os.environ, "TERM": "xterm", "COLUMNS": "160"}
 
 
 @pytest.mark.parametrize("arguments", [("watch", "tracks"), ("status",)], ids=" ".join)
-def test_where_no_pipeline_runs_one_line_says_so(said, tmp_path, arguments):
+def test_if_no_pipeline_runs_that_is_reported_in_one_line(said, tmp_path, arguments):
     nowhere = {**os.environ, "TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}
     code, output, errors = said(*arguments, env=nowhere)
     assert (code, output) == (1, "")

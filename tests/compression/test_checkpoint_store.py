@@ -95,7 +95,7 @@ def test_after_a_damaged_checkpoint_the_next_one_is_kept_beside_the_valid_one(ke
     assert CheckpointStore(kept).load(SETTINGS).seq == 50
 
 
-def test_where_none_is_whole_all_is_learned_anew_and_said(kept):
+def test_if_no_checkpoint_is_valid_learning_starts_anew_and_that_is_reported(kept):
     for path in kept.iterdir():
         path.write_bytes(b"")
     store = CheckpointStore(kept)
@@ -122,6 +122,6 @@ def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, m
     assert CheckpointStore(kept).load(SETTINGS).seq == 65
 
 
-def test_another_coreset_size_is_refused_and_not_taken_for_damage(kept):
+def test_another_coreset_size_is_rejected_and_not_reported_as_damage(kept):
     with pytest.raises(SettingsError, match="same settings"):
         CheckpointStore(kept).load(SETTINGS.but({"coreset.size": 16}))

@@ -66,7 +66,7 @@ def assert_same(sample: Sample, other: Sample) -> None:
         assert (summary.count, summary.levels) == (expected.count, expected.levels)
 
 
-def test_each_row_goes_where_its_label_says(settings, messages):
+def test_each_row_is_inserted_into_the_tree_of_its_label(settings, messages):
     compressor = Compressor(settings)
     sample = take(compressor, messages, 60)[-1]
     frames = sample.frame + 1
@@ -108,7 +108,7 @@ def test_a_message_stored_already_is_ignored(settings, messages):
     assert compressor.counters() == before
 
 
-def test_a_missing_message_is_an_error_and_the_late_one_is_still_welcome(settings, messages):
+def test_a_missing_message_is_an_error_and_is_still_accepted_later(settings, messages):
     compressor, (first, second) = Compressor(settings), (next(messages), next(messages))
     with pytest.raises(ProtocolError, match="features 2 came after 0: 1 are missing"):
         compressor.take(second)
@@ -117,7 +117,7 @@ def test_a_missing_message_is_an_error_and_the_late_one_is_still_welcome(setting
     assert compressor.seq == 2
 
 
-def test_rows_of_another_length_are_refused_and_nothing_is_stored(settings, messages):
+def test_rows_of_another_length_are_rejected_and_nothing_is_stored(settings, messages):
     compressor, (first, second) = Compressor(settings), (next(messages), next(messages))
     compressor.take(first)
     before = compressor.counters()
@@ -143,7 +143,7 @@ def test_versions_count_up_and_samples_keep_their_distance(settings, messages):
     assert (apart[len(apart) // 2 :] >= settings.coreset.sample_interval).all()
 
 
-def test_a_sample_is_made_only_where_a_leaf_is_new(settings, messages):
+def test_a_sample_is_made_only_if_a_leaf_is_new(settings, messages):
     compressor, idle = Compressor(settings), 0
     take(compressor, messages, 40)
     for _ in range(40):
@@ -151,7 +151,7 @@ def test_a_sample_is_made_only_where_a_leaf_is_new(settings, messages):
     assert idle <= 1
 
 
-def test_centres_come_in_whole_blocks_with_nan_where_absent(settings, messages):
+def test_centres_are_sent_in_whole_blocks_with_nan_for_absent_objects(settings, messages):
     samples = take(Compressor(settings), messages, 60)
     for sample in samples:
         blocks = (sample.frame + 1) // settings.search.motion_frames
@@ -162,7 +162,7 @@ def test_centres_come_in_whole_blocks_with_nan_where_absent(settings, messages):
 
 
 @pytest.mark.parametrize("count", [0, 1, 37])
-def test_a_saved_compressor_goes_on_bit_for_bit(settings, messages, count, tmp_path):
+def test_a_saved_compressor_continues_bit_for_bit(settings, messages, count, tmp_path):
     compressor = Compressor(settings)
     take(compressor, messages, count)
     compressor.save(tmp_path / "state")
@@ -188,7 +188,7 @@ def test_the_last_sample_can_be_had_again_though_the_trees_have_grown(settings, 
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_the_detector_state_of_the_last_message_is_kept_bit_for_bit(settings, messages, moving, rng, tmp_path):
+def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, messages, moving, rng, tmp_path):
     motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
     detector = DetectorState(7, "lost", *(Window(*rng.random(4)) for _ in range(3)), False, 2)
     if moving:
@@ -209,7 +209,7 @@ def test_memory_is_flat_between_doublings(settings, messages):
 
 
 @pytest.mark.parametrize("share", [0, 0.2, 0.9])
-def test_a_torn_state_is_refused(settings, messages, share, tmp_path):
+def test_an_incomplete_state_is_rejected(settings, messages, share, tmp_path):
     compressor, path = Compressor(settings), tmp_path / "state"
     take(compressor, messages, 37)
     compressor.save(path)
@@ -220,7 +220,7 @@ def test_a_torn_state_is_refused(settings, messages, share, tmp_path):
 
 
 @pytest.mark.parametrize(("energy", "level"), [("0x1p9999", 0), ("nan", 0), ("0x1p3", 10**9)])
-def test_a_forged_state_is_refused(energy, level, settings, messages, tmp_path):
+def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path):
     """Its checksum fits: whoever writes one on purpose sees to that."""
     compressor, path = Compressor(settings), tmp_path / "state"
     take(compressor, messages, 37)
@@ -238,7 +238,7 @@ def test_a_tree_is_no_compressor(settings, tmp_path):
         Compressor.load(tmp_path / "tree", settings)
 
 
-def test_a_checkpoint_of_another_version_is_refused_with_one_line(settings, messages, tmp_path):
+def test_a_checkpoint_of_another_version_is_rejected_with_one_line(settings, messages, tmp_path):
     compressor, path = Compressor(settings), tmp_path / "000000000001.safetensors"
     take(compressor, messages, 37)
     arrays, metadata = compressor.state()
@@ -248,7 +248,7 @@ def test_a_checkpoint_of_another_version_is_refused_with_one_line(settings, mess
     assert "\n" not in str(error.value)
 
 
-def test_a_state_of_another_coreset_size_is_refused(settings, messages, tmp_path):
+def test_a_state_of_another_coreset_size_is_rejected(settings, messages, tmp_path):
     compressor = Compressor(settings)
     take(compressor, messages, 37)
     compressor.save(tmp_path / "state")

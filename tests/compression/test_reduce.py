@@ -53,7 +53,7 @@ def test_no_other_rows_keep_more_energy(stream):
     assert_allclose(energy(reduce(rows, SIZE)), best, rtol=1e-6)
 
 
-def test_nothing_is_dropped_where_the_rank_fits(rng):
+def test_nothing_is_dropped_if_the_rank_fits(rng):
     rows = (rng.normal(size=(2 * SIZE, SIZE)) @ rng.normal(size=(SIZE, 200))).astype(np.float32)
     kept = reduce(rows, SIZE).astype(np.float64)
     exact = rows.astype(np.float64)
@@ -62,7 +62,7 @@ def test_nothing_is_dropped_where_the_rank_fits(rng):
 
 @settings(deadline=None)
 @given(matrices, st.integers(1, 14))
-def test_rows_are_orthogonal_and_the_strongest_comes_first(rows, size):
+def test_rows_are_orthogonal_and_the_strongest_is_first(rows, size):
     kept = reduce(rows, size).astype(np.float64)
     gram, slack = kept @ kept.T, ROUNDING * energy(rows) + 1e-30
     assert kept.shape == (min(size, len(rows)), rows.shape[1])
@@ -76,7 +76,7 @@ def test_every_direction_points_towards_the_sum(rows, size):
     assert np.all(reduce(rows, size) @ rows.sum(axis=0) >= -ROUNDING * energy(rows) - 1e-30)
 
 
-def test_a_direction_is_turned_towards_what_is_given(rng):
+def test_the_sign_of_a_direction_follows_the_given_vector(rng):
     rows = rng.normal(size=(8, 5)).astype(np.float32)
     there, back = reduce(rows, 4, towards=np.ones(5)), reduce(rows, 4, towards=-np.ones(5))
     assert_array_equal(there, -back)

@@ -57,7 +57,7 @@ def test_each_row_weighs_one_original_row(rng):
     assert_allclose(rows, np.tile(row, (len(rows), 1)), rtol=1e-4)
 
 
-def test_every_row_lies_where_the_data_lies():
+def test_every_row_lies_within_the_span_of_the_data():
     """Without the spread, all but the first would be variations around zero."""
     rng = np.random.default_rng(0)
     stream = (5 + rng.normal(size=(SIZE * 13, 30))).astype(np.float32)

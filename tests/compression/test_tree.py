@@ -133,7 +133,7 @@ def test_same_rows_same_bits_however_they_are_cut(cuts, seed):
     assert bits(tree) == bits(grown(rows, size=4))
 
 
-def test_rows_inserted_are_not_held_on_to(stream):
+def test_a_tree_keeps_no_reference_to_inserted_rows(stream):
     rows = stream.copy()
     tree, other = grown(rows[:50]), grown(stream[:50])
     rows[:] = 0
@@ -161,7 +161,7 @@ def test_merging_keeps_the_form_of_a_tree(count, other_count, seed):
     assert bits(other) == before
 
 
-def test_a_tree_goes_on_after_a_merge(stream):
+def test_a_merged_tree_continues(stream):
     tree = grown(stream[:50])
     tree.merge(grown(stream[50:90]))
     tree.insert(stream[90:])
@@ -173,7 +173,7 @@ def test_a_tree_goes_on_after_a_merge(stream):
 
 
 @pytest.mark.parametrize("count", [0, 3, 64, 103])
-def test_a_saved_tree_goes_on_bit_for_bit(stream, count, tmp_path):
+def test_a_saved_tree_continues_bit_for_bit(stream, count, tmp_path):
     tree = grown(stream[:count])
     tree.save(tmp_path / "tree")
     loaded = CoresetTree.load(tmp_path / "tree")
@@ -200,7 +200,7 @@ def test_an_incomplete_file_is_an_error(stream, share, tmp_path):
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4))
-def test_a_damaged_file_is_refused_unless_nothing_of_the_tree_is_hurt(tmp_path_factory, damage):
+def test_a_damaged_file_is_rejected_unless_the_tree_in_it_is_intact(tmp_path_factory, damage):
     path, tree = tmp_path_factory.mktemp("damaged") / "tree", grown(whole_numbers(14, seed=0), size=4)
     tree.save(path)
     content = bytearray(path.read_bytes())
@@ -222,7 +222,7 @@ def test_a_damaged_file_is_refused_unless_nothing_of_the_tree_is_hurt(tmp_path_f
     [np.ones((3, 5)), np.ones(6), np.full((2, 6), np.nan), np.full((2, 6), np.inf)],
     ids=["longer", "flat", "nan", "inf"],
 )
-def test_rows_it_cannot_hold_are_refused_and_leave_it_as_it_was(rows):
+def test_invalid_rows_are_rejected_and_do_not_change_the_tree(rows):
     tree = grown(whole_numbers(14, seed=1), size=4)
     before = bits(tree)
     with pytest.raises(ProtocolError):
@@ -230,7 +230,7 @@ def test_rows_it_cannot_hold_are_refused_and_leave_it_as_it_was(rows):
     assert bits(tree) == before
 
 
-def test_trees_of_other_sizes_or_rows_are_refused():
+def test_trees_of_other_sizes_or_rows_are_rejected():
     tree = grown(np.ones((9, 6)), size=4)
     with pytest.raises(ProtocolError, match=r"size 4 .* size 5"):
         tree.merge(grown(np.ones((9, 6)), size=5))
@@ -238,6 +238,6 @@ def test_trees_of_other_sizes_or_rows_are_refused():
         tree.merge(grown(np.ones((9, 7)), size=4))
 
 
-def test_a_size_below_one_is_refused():
+def test_a_size_below_one_is_rejected():
     with pytest.raises(ValueError, match="size=0"):
         CoresetTree(0)

@@ -49,7 +49,7 @@ def test_a_share_of_them_is_put_on_another_background(rng, moved, changed, chann
     assert (changed == 0) or differ.any()
 
 
-def test_on_another_background_the_object_keeps_its_middle(rng):
+def test_on_another_background_the_object_keeps_its_centre(rng):
     image = rng.integers(0, 256, (200, 240, 3), np.uint8)
     image[40:120, 56:136] = 60
     plain, moved = (copies(image, WINDOW, 2, context=1.25, moved=share)[1].copy() for share in (0.0, 1.0))

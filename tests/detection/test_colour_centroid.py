@@ -62,7 +62,7 @@ def test_within_the_slack_it_stays_and_one_frame_moves_little(model):
     assert abs(shown(known, model, far, frame)[1].centre[0] - far.centre[0]) < 1
 
 
-def test_colours_that_lay_to_one_side_at_first_may_come_back_to_the_middle(model):
+def test_colours_that_were_off_centre_at_first_may_return_to_the_centre(model):
     frame, aside = meadow(112, 92), Window(80 + 14, 60, 64, 64)
     known, window = shown(None, model, aside, frame, FRAMES)
     assert window == aside
@@ -87,12 +87,12 @@ def test_a_slack_of_a_whole_window_shifts_nothing(model):
     assert shown(known, model, drifted, meadow(112, 92), FRAMES, slack=1)[1] == drifted
 
 
-def test_at_the_edge_of_what_was_searched_nothing_is_learned(model):
+def test_at_the_edge_of_the_search_area_nothing_is_learned(model):
     around, edge = ScoreMap.around(meadow(112, 92), GOOD, 20, model), GOOD.centred(60, 92)
     assert recentred(None, edge, around, model.weights[COLOURS], SLACK) == (None, edge)
 
 
-def test_what_is_known_is_not_changed_in_place(model):
+def test_the_colour_centroid_is_not_changed_in_place(model):
     known, _ = shown(None, model, GOOD, meadow(112, 92), 45)
     before = known.copy()
     shown(known, model, GOOD.centred(94, 92), meadow(112, 92), 3)

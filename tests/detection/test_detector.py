@@ -88,7 +88,7 @@ def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
     assert not features.training
 
 
-def test_an_object_that_comes_back_elsewhere_is_found_in_the_whole_frame(scene):
+def test_an_object_that_reappears_in_another_place_is_found_in_the_whole_frame(scene):
     detector = started(scene)
     detector.step(scene())
     track, _ = detector.step(scene((250, 180)))
@@ -97,7 +97,7 @@ def test_an_object_that_comes_back_elsewhere_is_found_in_the_whole_frame(scene):
 
 @pytest.mark.parametrize("detection", ["local", "full"])
 @pytest.mark.parametrize(("trust", "teaches"), [(0.0, True), (10.0, False)])
-def test_what_is_found_elsewhere_teaches_only_once_it_is_trusted(scene, trust, teaches, detection):
+def test_a_redetected_object_is_learned_from_only_if_it_is_trusted(scene, trust, teaches, detection):
     detector = started(scene, {"belief.trusted_score": trust, "search.mode": detection})
     detector.step(scene())
     _, features = detector.step(scene((250, 180)))
@@ -121,7 +121,7 @@ def test_older_models_are_ignored(scene):
     assert detector.model is new
 
 
-def test_another_detector_goes_on_where_one_stopped(scene):
+def test_another_detector_continues_from_the_state_of_a_stopped_one(scene):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
@@ -133,7 +133,7 @@ def test_another_detector_goes_on_where_one_stopped(scene):
 
 
 @pytest.mark.parametrize("absent", [False, True])
-def test_with_the_state_after_a_frame_another_detector_goes_on_bit_for_bit(scene, absent):
+def test_another_detector_continues_bit_for_bit_from_the_state_after_a_frame(scene, absent):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1, motion=Motion(np.eye(4), np.eye(2)))
     detector.adopt(model)
@@ -178,7 +178,7 @@ def test_a_detector_that_is_resumed_adopts_no_model_of_the_object_before_either(
     assert other.model.version == 2
 
 
-def test_a_frame_teaches_the_same_whatever_came_before(scene):
+def test_the_training_rows_of_a_frame_do_not_depend_on_earlier_frames(scene):
     detector, other = started(scene), Detector(Settings())
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
@@ -190,7 +190,7 @@ def test_a_frame_teaches_the_same_whatever_came_before(scene):
 @pytest.mark.parametrize(
     "box", [(400, 10, 20, 20), (-50, 10, 20, 20), (10, 10, 0, 20), (10, 10, 20, -3), (np.nan, 1, 20, 20)]
 )
-def test_a_box_that_is_none_is_refused(scene, box):
+def test_an_invalid_box_is_rejected(scene, box):
     with pytest.raises(BoxError):
         Detector(Settings()).init(scene(), Box(*box))
 
@@ -199,7 +199,7 @@ def test_a_box_that_is_none_is_refused(scene, box):
 @pytest.mark.parametrize(
     "box", [(-1e300, -1e300, 2e300, 2e300), (0, 0, 641, 20), (0, 0, 20, 481)], ids=["huge", "wide", "high"]
 )
-def test_a_box_of_more_than_twice_the_frame_is_refused_and_what_is_goes_on(scene, place, box):
+def test_a_box_of_more_than_twice_the_frame_is_rejected_and_tracking_continues(scene, place, box):
     detector = started(scene)
     with pytest.raises(BoxError, match="twice as wide and high as the frame of 320 x 240 pixels"):
         getattr(detector, place)(scene((60, 50)), Box(*box))
@@ -211,7 +211,7 @@ def test_a_box_of_twice_the_frame_is_a_start(scene):
     assert track.box.overlap(Box(-160, -120, 640, 480)) > 0.9
 
 
-def test_a_step_before_a_start_is_refused(scene):
+def test_a_step_before_a_start_is_rejected(scene):
     with pytest.raises(BoxError, match="call init"):
         Detector(Settings()).step(scene())
 
@@ -248,7 +248,7 @@ def test_another_object_begins_with_a_model_of_its_own_and_older_ones_are_not_ad
 @pytest.mark.parametrize(
     "box", [(400, 10, 20, 20), (10, 10, 0, 10), (150, 20, 30, 30)], ids=["outside", "empty", "flat"]
 )
-def test_a_box_that_cannot_be_followed_leaves_what_is(box):
+def test_a_box_that_cannot_be_tracked_changes_nothing(box):
     image = np.full((120, 200, 3), 90, np.uint8)
     image[40:80, 20:60] = np.random.default_rng(2).integers(0, 256, (40, 40, 3))
     detector = Detector(Settings())
@@ -297,7 +297,7 @@ def test_a_window_that_does_not_lead_its_frame_is_not_the_object(scene, learned)
     assert tracks[-1].score > Settings().belief.confident_score
 
 
-def test_what_is_in_another_place_in_each_frame_is_not_the_object(scene, learned):
+def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned):
     tracks = sought(learned, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
     assert {track.state for track in tracks} == {"absent"}
 
@@ -310,7 +310,7 @@ def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned):
     assert any(taught)
 
 
-def test_a_search_that_is_resumed_goes_on_bit_for_bit(scene, learned):
+def test_a_resumed_search_continues_bit_for_bit(scene, learned):
     frame = scene((90, 60))
     tracks = sought(learned, [frame] * 5)
     other, before = Detector(Settings()), Detector(Settings())
@@ -321,12 +321,12 @@ def test_a_search_that_is_resumed_goes_on_bit_for_bit(scene, learned):
     assert [other.step(frame)[0] for _ in range(3)] == tracks[2:]
 
 
-def test_a_model_of_other_features_is_refused():
+def test_a_model_of_other_features_is_rejected():
     with pytest.raises(ProtocolError, match="learn it anew"):
         Detector(Settings()).seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START)
 
 
-def test_a_corrected_box_is_gone_on_with_and_teaches(scene):
+def test_tracking_continues_from_a_corrected_box_which_is_learned_from(scene):
     detector = started(scene)
     detector.adopt(dataclasses.replace(detector.model, version=1))
     track, features = detector.correct(scene((90, 60)), Box(90, 60, 48, 40))
@@ -337,7 +337,7 @@ def test_a_corrected_box_is_gone_on_with_and_teaches(scene):
     assert detector.step(scene((92, 60)))[0].box.overlap(Box(92, 60, 48, 40)) > 0.7
 
 
-def test_a_corrected_box_says_anew_where_the_colours_lie(scene):
+def test_a_corrected_box_resets_the_colour_centroid(scene):
     detector = started(scene)
     assert detector.step(scene((62, 50)))[1].detector.colour_centroid[0] == 1
     assert detector.correct(scene((90, 60)), Box(90, 60, 48, 40))[1].detector.colour_centroid is None

@@ -66,6 +66,6 @@ def test_if_the_belief_is_low_only_the_place_is_followed():
     assert extent.followed(WINDOW, found, False) == pytest.approx(WINDOW.centred(90, 80))
 
 
-def test_a_far_larger_change_is_a_detection_elsewhere_and_taken_as_it_is():
+def test_a_far_larger_change_is_a_redetection_and_used_unchanged():
     found = WINDOW.scaled(1.5).centred(90, 80)
     assert extent.followed(WINDOW, found, False) == found

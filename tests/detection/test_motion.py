@@ -70,7 +70,7 @@ def test_a_lost_object_is_less_certain_every_frame(motion):
     assert np.all(np.diff(variances) > 0)
 
 
-def test_an_object_that_comes_back_is_believed_more_than_one_that_never_left(motion):
+def test_an_object_that_reappears_has_a_higher_belief_than_one_that_never_left(motion):
     never_left, back = moving(motion), moving(motion)
     for _ in range(30):
         back = predicted(back, motion, lost=True)

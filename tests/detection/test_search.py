@@ -44,7 +44,7 @@ def test_of_a_frame_that_is_too_large_for_a_tiny_window_the_part_around_it_is_se
     assert origin[0] + image.shape[1] / 8 * step[0] == pytest.approx(800 - origin[0], abs=2)
 
 
-def test_a_maximum_lies_between_cells_as_its_neighbours_say(image):
+def test_a_maximum_between_cells_is_interpolated_from_its_neighbours(image):
     row, column = np.mgrid[:9, :9]
     scores = (1 - 0.01 * ((row - 4.3) ** 2 + (column - 3.8) ** 2)).astype(np.float32)
     found = ScoreMap(Cells.of(image[:128, :128]), scores, (0, 0), (1, 1))

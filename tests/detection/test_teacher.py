@@ -71,7 +71,7 @@ def test_background_is_beyond_the_near_misses_and_half_of_it_scores_highest(fram
     assert best in taken
 
 
-def test_the_object_at_the_edge_of_what_was_searched_is_learned_from_as_well(frame, model):
+def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, model):
     around = ScoreMap.around(frame, OBJECT, 20, model)
     edge = around.window(0, 12)
     rows, own, misses, background = cut(frame, model, around, edge)
@@ -82,7 +82,7 @@ def test_the_object_at_the_edge_of_what_was_searched_is_learned_from_as_well(fra
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["model", "none"])
-def test_where_no_search_left_cells_they_are_cut_around_the_box(frame, model, known):
+def test_without_the_cells_of_a_search_new_ones_are_cut_around_the_box(frame, model, known):
     rows, own, misses, background = cut(frame, model if known else None)
     assert own.sum() == 1 + SETTINGS.teaching.copies
     assert misses.any()

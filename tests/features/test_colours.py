@@ -29,7 +29,7 @@ def test_a_histogram_is_the_root_of_shares_in_the_middle_6_by_6_cells():
     assert sorted(features[features > 0]) == pytest.approx([3 * np.sqrt(0.25), 3 * np.sqrt(0.75)])
 
 
-def test_where_a_colour_is_makes_no_difference_and_the_edge_none_at_all(rng):
+def test_neither_the_place_of_a_colour_nor_the_edge_of_the_image_changes_the_features(rng):
     image = np.repeat(np.repeat(rng.integers(0, 256, (32, 32, 3), np.uint8), 2, axis=0), 2, axis=1)
     turned = image.copy()
     turned[8:56, 8:56] = np.rot90(image[8:56, 8:56])

@@ -26,7 +26,7 @@ def test_a_pixel_is_the_mean_of_those_that_it_stands_for(rng):
     assert np.abs(small - blocks.mean(axis=(1, 3))).max() <= 1, "each halving rounds"
 
 
-def test_what_was_made_is_not_made_again(rng):
+def test_a_level_of_the_pyramid_is_made_once(rng):
     pyramid = Pyramid(rng.integers(0, 256, (64, 96, 3), np.uint8))
     assert pyramid.near(5)[0] is pyramid.near(4)[0]
     assert pyramid.near(1)[0] is pyramid.image

@@ -67,7 +67,7 @@ _OKLAB = (
 
 
 @pytest.mark.parametrize("seen", _SEEN.values(), ids=_SEEN)
-def test_the_colours_of_curves_can_be_told_apart_by_the_colour_blind(seen):
+def test_the_colours_of_curves_are_distinguishable_by_the_colour_blind(seen):
     """In OKLab, where a difference of 0.02 is just seen side by side."""
     values = np.array([[int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5)] for colour in COLOURS])
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)

@@ -34,7 +34,7 @@ def test_the_latency_of_a_frame_without_a_track_ends_with_the_run(schedule, trac
     assert measures.track["max"] == pytest.approx(4.2)
 
 
-def test_stills_before_the_start_and_after_the_end_count_only_for_what_they_cover(schedule, track):
+def test_stills_before_the_start_and_after_the_end_count_only_for_the_time_within_the_run(schedule, track):
     observations = Observations(tracks=[track(-3, 0.01), track(4, 0.01), track(12, 0.01)])
     measures = measure(observations, schedule, 10, TRUTH, end=105.0, totals={})
     assert measures.followed.sum() == 1

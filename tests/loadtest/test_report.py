@@ -69,7 +69,7 @@ def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
     assert ">detector<" in processor
 
 
-def test_json_holds_what_json_can(result):
+def test_the_json_report_contains_only_valid_json(result):
     run = result([0.01] * 5, recoveries=[Recovery(Kill(101.0, 0, "trainer"), None, None)])
     text = json.dumps(to_json(LoadTest([Limit("recovery", 1.0)], False, [Step(run, [])])), allow_nan=False)
     figures = json.loads(text)

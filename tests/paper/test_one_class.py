@@ -33,12 +33,12 @@ def test_decides_as_the_linear_kernel_does(rows, background, nu):
     assert_allclose((background - origin) @ one_class(rows, origin, nu), expected, rtol=1e-5, atol=1e-5 * len(rows))
 
 
-def test_tells_the_object_from_the_background(rows, background):
+def test_the_classifier_separates_the_object_from_the_background(rows, background):
     direction = one_class(rows, background.mean(axis=0))
     assert (rows @ direction).min() > (background @ direction).max()
 
 
-def test_what_object_and_background_share_does_not_count(rows, background):
+def test_features_shared_by_object_and_background_do_not_count(rows, background):
     """Adding the same edges to everything leaves the direction as it was."""
     edges = np.linspace(0, 1, rows.shape[1], dtype=np.float32)
     plain = one_class(rows, background.mean(axis=0))
@@ -53,7 +53,7 @@ def test_same_rows_same_bits(rows, background):
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_rows_equal_to_the_background_are_refused(background, count):
+def test_rows_equal_to_the_background_are_rejected(background, count):
     origin = background.mean(axis=0)
     with pytest.raises(ProtocolError, match="differs from the background"):
         one_class(np.tile(origin, (count, 1)), origin)

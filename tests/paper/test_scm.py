@@ -64,14 +64,14 @@ def test_the_demos_object_is_followed():
     assert min(found_box.overlap(box) for (_, found_box), box in zip(found, truth[1:], strict=True)) > 0.5
 
 
-def test_an_object_half_covered_is_held(scene):
+def test_a_half_covered_object_is_tracked(scene):
     ways = [(60 + 2 * i, 50 + i, 0.4 if 4 <= i < 12 else 0.0) for i in range(16)]
     found = followed(itertools.starmap(scene, ways), START)
     overlaps = [box.overlap(Box(x, y, 48, 40)) for (_, box), (x, y, _) in zip(found, ways[1:], strict=True)]
     assert min(overlaps) > 0.5
 
 
-def test_the_score_falls_where_the_object_is_gone(scene):
+def test_the_score_falls_if_the_object_is_absent(scene):
     (there, _), (gone, _) = followed([scene(60, 50), scene(62, 51), scene(250, 180)], START)
     assert there > 0.6 > 0.5 > gone
 

@@ -54,23 +54,23 @@ def test_in_a_with_it_is_iterated_piece_by_piece_and_afterwards_no_more(pipeline
             again()
 
 
-def test_a_file_address_is_kept_as_a_path_which_a_run_can_be_resumed_by(video):
+def test_a_file_address_is_stored_as_a_path_from_which_a_run_can_resume(video):
     path, boxes = video
     assert Pipeline(Path(path).as_uri(), str(boxes[0])).source == str(path)
 
 
-def test_before_it_has_started_it_says_what_it_has_not(pipeline):
+def test_before_its_start_a_pipeline_has_no_processes_and_no_endpoint(pipeline):
     assert (pipeline.pids, pipeline.restarts, pipeline.health) == ({}, 0, {})
     with pytest.raises(ServiceError, match="no endpoint before it has started"):
         _ = pipeline.endpoint
 
 
-def test_where_it_goes_on_is_said_before_it_starts(pipeline):
+def test_the_first_frame_is_set_before_the_start(pipeline):
     with pipeline, pytest.raises(ServiceError, match="before that"):
         pipeline.starting_after(None)
 
 
-def test_one_that_is_never_closed_is_warned_of_and_ends(video, alive):
+def test_a_pipeline_that_is_never_closed_causes_a_warning_and_ends(video, alive):
     path, boxes = video
     forgotten = Pipeline(path, boxes[0], SETTINGS, part=PART).__enter__()
     pids = list(forgotten.pids.values())
@@ -81,7 +81,7 @@ def test_one_that_is_never_closed_is_warned_of_and_ends(video, alive):
 
 
 @pytest.mark.parametrize("enter", [True, False])
-def test_an_event_loop_goes_on_while_tracks_are_waited_for(pipeline, enter):
+def test_an_event_loop_continues_while_it_waits_for_tracks(pipeline, enter):
     async def follow():
         return [track.frame async for track in pipeline]
 

@@ -60,7 +60,7 @@ def test_all_processes_tell_how_they_are(run):
     assert pipeline.health["detector"]["sent"] > 0
 
 
-def test_what_a_process_said_after_the_last_track_was_taken_counts_too(video, until):
+def test_a_health_report_after_the_last_track_counts_too(video, until):
     path, boxes = video
 
     def told():
@@ -119,7 +119,7 @@ def test_a_part_is_followed_whole_though_the_detector_dies(video):
     assert [track.time for track in tracks] == pytest.approx([number / 30 for number in wanted], abs=0.002)
 
 
-def test_a_restarted_trainer_goes_on_learning(video, until):
+def test_a_restarted_trainer_continues_to_learn(video, until):
     path, boxes = video
     with Pipeline(path, boxes[0], SETTINGS) as pipeline:
         versions = []
@@ -178,7 +178,7 @@ def test_a_second_pipeline_at_the_same_endpoint_is_rejected(video, transport, fo
         assert next(iter(next_one)).frame == 0, "the place is free at once"
 
 
-def test_who_attaches_late_gets_the_last_model(video, until):
+def test_a_late_subscriber_of_a_pipeline_receives_the_last_model(video, until):
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 4})) as pipeline:
         for track in pipeline:
@@ -191,17 +191,17 @@ def test_who_attaches_late_gets_the_last_model(video, until):
 
 
 @pytest.mark.parametrize("box", [(0, 0, 0, 10), (400, 10, 20, 20), (10, 10, float("nan"), 20)])
-def test_a_box_that_is_not_in_the_first_frame_is_refused_before_anything_starts(video, box):
+def test_a_box_outside_the_first_frame_is_rejected_before_anything_starts(video, box):
     with pytest.raises(BoxError):
         Pipeline(video[0], box)
 
 
-def test_a_source_that_is_not_there_is_refused_before_anything_starts(folder):
+def test_a_missing_source_is_rejected_before_anything_starts(folder):
     with pytest.raises(VideoError, match="no video or folder"):
         Pipeline(str(folder / "none.mp4"), (0, 0, 10, 10))
 
 
-def test_a_first_start_that_compiles_says_so_to_the_user(video, tmp_path, monkeypatch, caplog):
+def test_a_first_start_that_compiles_is_logged(video, tmp_path, monkeypatch, caplog):
     without_one = shutil.ignore_patterns("cells.*.nbi")
     shutil.copytree(numba.config.CACHE_DIR, tmp_path / "kernels", ignore=without_one)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))

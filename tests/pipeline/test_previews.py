@@ -34,7 +34,7 @@ def looks(folder, previews, until):
     return begin
 
 
-def test_a_picture_is_small_and_says_how_large_the_frame_is(previews, looks):
+def test_a_preview_is_small_and_contains_the_size_of_the_frame(previews, looks):
     image = np.zeros((720, 1280, 3), np.uint8)
     with looks() as reader:
         previews.show(7, image, Box(5.0, 6.0, 70.0, 80.0))
@@ -58,7 +58,7 @@ def test_none_is_made_while_nobody_looks(previews, monkeypatch):
         previews.show(frame, np.zeros((48, 64, 3), np.uint8), None)
 
 
-def test_who_begins_to_look_while_no_frame_comes_sees_the_newest(previews, looks):
+def test_a_new_viewer_receives_the_newest_frame_if_none_arrives(previews, looks):
     for frame in range(5):
         previews.show(frame, np.zeros((48, 64, 3), np.uint8), None)
     with looks() as reader:

@@ -15,7 +15,7 @@ from catstream.recording.learning import learn
 from catstream.settings import Settings
 
 
-def test_no_features_are_missing_and_every_model_comes_out_again_whatever_dies(video, tmp_path):
+def test_no_features_are_missing_and_every_model_is_reproduced_whichever_process_dies(video, tmp_path):
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16}), record=tmp_path / "run.rec") as pipeline:
         for track in pipeline:

@@ -85,7 +85,7 @@ def test_no_process_outlives_its_supervisor(video, service, number, code, until,
     until(lambda: not any(alive(child.pid) for child in children))
 
 
-def test_all_that_are_asked_to_end_at_once_do_so_in_order_and_all_is_stored(video, folder, service, until):
+def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(video, folder, service, until):
     path, boxes = video
     arguments = {
         "compressor": ["--state", folder, "--record", folder / "run.rec"],
@@ -105,7 +105,7 @@ def test_all_that_are_asked_to_end_at_once_do_so_in_order_and_all_is_stored(vide
     assert Recording(folder / "run.rec").end is not None
 
 
-def test_a_compressor_that_is_asked_to_end_alone_stores_what_it_has_and_leaves(video, folder, service, until):
+def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folder, service, until):
     path, boxes = video
     arguments = {"compressor": ["--state", folder], "detector": [path, "--box", ",".join(map(str, boxes[0]))]}
     place = [
@@ -129,7 +129,7 @@ def test_a_compressor_that_is_asked_to_end_alone_stores_what_it_has_and_leaves(v
     assert detector.poll() is None
 
 
-def test_a_process_whose_parent_is_gone_already_ends_at_once(folder, service):
+def test_a_process_whose_parent_has_already_ended_ends_at_once(folder, service):
     file = Job(endpoint=str(folder)).save(folder)
     assert service("child", "trainer", file, "--parent", 2**22 + 1).wait(60) == 0
 

@@ -17,7 +17,7 @@ from catstream.services.start import environment, import_path, service_command
 HOME = str(Path(catstream.__file__).parents[1])
 
 
-def test_children_look_where_this_program_looks_but_not_in_the_current_folder(tmp_path, monkeypatch):
+def test_children_use_the_import_path_of_this_program_without_the_current_folder(tmp_path, monkeypatch):
     own = tmp_path / "own"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", ["", ".", "own", str(tmp_path), str(own), HOME])
@@ -26,7 +26,7 @@ def test_children_look_where_this_program_looks_but_not_in_the_current_folder(tm
     assert environment()["PYTHONPATH"] == str(own)
 
 
-def test_the_folder_that_catstream_was_imported_from_is_kept_wherever_that_is(monkeypatch):
+def test_the_folder_that_catstream_was_imported_from_stays_in_the_import_path(monkeypatch):
     monkeypatch.chdir(HOME)
     monkeypatch.setattr(sys, "path", [""])
     assert import_path() == [HOME]
@@ -48,7 +48,7 @@ def test_children_import_the_catstream_of_their_parent(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("executable", ["", "/usr/sbin/uwsgi"])
-def test_a_program_that_embeds_python_is_not_taken_for_the_interpreter(executable, tmp_path, monkeypatch):
+def test_a_program_that_embeds_python_is_not_used_as_the_interpreter(executable, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", executable)
     monkeypatch.setattr(spawn, "get_executable", lambda: executable)
     assert Path(service_command()[0]).name.startswith("python")

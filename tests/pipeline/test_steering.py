@@ -71,7 +71,7 @@ def saved(video, once):
     return once("saved", save) / "object.safetensors"
 
 
-def test_without_a_box_the_first_frame_is_held_and_in_a_pause_a_box_is_for_the_frame_that_is_held(video):
+def test_without_a_box_the_first_frame_waits_and_in_a_pause_a_box_applies_to_the_waiting_frame(video):
     path, boxes = video
     with steered(path) as (pipeline, steering, _):
         assert told(pipeline, lambda counters: counters["waiting"])["sent"] == 0
@@ -131,7 +131,7 @@ def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_w
     assert all(track.model_version == 0 or track.model_version > newest for track in after)
 
 
-def test_the_same_object_elsewhere_keeps_its_model_and_stopped_by_a_command_all_is_stored(video):
+def test_a_moved_object_keeps_its_model_and_a_stop_command_stores_all(video):
     path, boxes = video
     tracks = []
     with steered(path, boxes[0]) as (pipeline, steering, pool):
@@ -175,7 +175,7 @@ def test_commands_that_a_power_cut_tore_are_an_error(tmp_path, torn):
         DesiredState.load(tmp_path / "desired_state.json")
 
 
-def test_commands_that_a_power_cut_tore_are_said_and_the_run_goes_on(video, tmp_path):
+def test_an_incomplete_file_of_commands_is_reported_and_the_run_continues(video, tmp_path):
     path, boxes = video
     with Pipeline(path, boxes[0], SETTINGS, state=tmp_path / "kept") as pipeline:
         before = next(track for track in pipeline if track.model_version >= 2)
@@ -199,7 +199,7 @@ def test_commands_are_on_disk_before_they_take_the_place_of_older_ones(tmp_path,
     assert DesiredState.load(tmp_path / "desired_state.json") == DesiredState(paused=True)
 
 
-def test_a_saved_model_finds_the_object_and_learning_goes_on_from_it(video, saved):
+def test_a_saved_model_finds_the_object_and_learning_continues_from_it(video, saved):
     path, boxes = video
     version = Learned.load(saved).model.version
     with Pipeline(path, settings=SETTINGS, model=saved, part=slice(40, None)) as pipeline:
@@ -213,7 +213,7 @@ def test_a_saved_model_finds_the_object_and_learning_goes_on_from_it(video, save
     assert versions[-1] > version
 
 
-def test_in_lockstep_a_run_from_a_saved_model_repeats_itself_also_where_the_detector_dies(video, saved):
+def test_in_lockstep_a_run_from_a_saved_model_is_repeatable_even_if_the_detector_dies(video, saved):
     settings = Settings(run={"lockstep": True})
     runs = []
     for dies in (False, True):
@@ -265,7 +265,7 @@ def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera
     assert pipeline.totals == {"sent": len(tracks), "stored": len(tracks)}
 
 
-def test_a_model_that_cannot_be_used_is_refused_before_anything_starts(video, saved, tmp_path):
+def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_path):
     path, boxes = video
     torn = tmp_path / "torn"
     torn.write_bytes(saved.read_bytes()[:-9])

@@ -18,7 +18,7 @@ def watchdog():
     watchdog.close()
 
 
-def test_who_watches_sees_each_turn(watchdog):
+def test_a_watchdog_counts_each_iteration(watchdog):
     loop = Watchdog(watchdog.handle)
     for turn in range(1, 4):
         loop.beat()
@@ -50,7 +50,7 @@ def test_the_time_limit_follows_the_duration_of_recent_iterations(watchdog, monk
     assert watchdog.patience == PATIENCE
 
 
-def test_where_each_turn_is_longer_each_has_its_time(watchdog):
+def test_a_longer_time_limit_applies_to_each_iteration(watchdog):
     watchdog.allow_each(6)
     for _ in range(3):
         watchdog.beat()
@@ -72,7 +72,7 @@ def test_a_detector_has_time_for_each_frame_of_the_file_that_it_passes_over(part
     assert opening_seconds(part, first) == pytest.approx((60 + 0.1 * passed_over, 0.1 * each))
 
 
-def test_a_compressor_has_time_to_read_the_recording_that_it_goes_on_with(tmp_path):
+def test_a_compressor_has_time_to_read_the_recording_that_it_continues(tmp_path):
     with (tmp_path / "run.rec").open("wb") as file:
         file.truncate(5_000_000_000)
     assert reading_seconds(tmp_path / "run.rec") >= 500

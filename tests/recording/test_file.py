@@ -42,7 +42,7 @@ def read(path):
     return [message for _, message in Recording(path).messages()]
 
 
-def test_what_was_written_is_read_with_the_settings(written):
+def test_written_messages_are_read_back_with_the_settings(written):
     settings = Settings(coreset={"size": 32}, teaching={"classifier": "one-class"}, run={"endpoint": "somewhere"})
     messages = [track(1), features(1), model(1, 0), Health("trainer", 2.0, {"trained": 1.0}), End(2, "its end")]
     recording = Recording(written(messages, settings))
@@ -158,7 +158,7 @@ def test_it_continues_after_the_last_whole_message(written):
     assert recording.torn == 0
 
 
-def test_what_a_restarted_compressor_took_anew_replaces_what_it_had_taken(written):
+def test_features_that_a_restarted_compressor_receives_again_replace_the_earlier_ones(written):
     path = written([features(1), model(1, 0), features(2), features(3, 0.125), model(2, 2)])
     written([features(3, 0.75), model(2, 2), features(4)], resume=True)
     recording = Recording(path)
@@ -175,7 +175,7 @@ def test_a_model_that_was_made_once_more_counts_once(written):
     assert [model.version for model in recording.models()] == [1, 2]
 
 
-def test_a_model_of_features_that_were_replaced_is_none_of_the_run_even_where_it_came_once_more(written):
+def test_a_model_of_replaced_features_does_not_count_even_if_it_is_received_again(written):
     """A restarted compressor hears the last model of the trainer, which learned from what it had not stored."""
     path = written([features(1), model(1, 0), features(2), features(3)])
     written([model(2, 2), features(2, 0.75), features(3, 0.75), features(4)], resume=True)
@@ -184,7 +184,7 @@ def test_a_model_of_features_that_were_replaced_is_none_of_the_run_even_where_it
     assert recording.counts[Model] == 1
 
 
-def test_what_is_missing_is_counted_at_the_begin_between_and_at_the_end(written):
+def test_missing_messages_are_counted_at_the_start_in_between_and_at_the_end(written):
     recording = Recording(written([features(3), features(6), track(2), track(9), End(11, "its end")]))
     assert recording.missing == {Features: 2 + 2 + 4, Track: 1 + 6 + 1}
     assert "8 features and 8 tracks missing" in str(recording)
@@ -204,7 +204,7 @@ def test_a_full_disk_is_an_error_and_leaves_the_file_whole(tmp_path):
     assert (recording.counts[Features], recording.size, recording.torn) == (0, size, 0)
 
 
-def test_a_file_that_is_there_is_kept(written):
+def test_an_existing_file_is_not_overwritten(written):
     path = written([track(1)])
     with pytest.raises(RecordingError, match="exists already"):
         written([])
@@ -228,7 +228,7 @@ def test_a_message_that_this_version_cannot_read_is_an_error_of_one_line(written
         Recording(path)
 
 
-def test_what_is_no_recording_is_refused(tmp_path):
+def test_a_file_that_is_not_a_recording_is_rejected(tmp_path):
     (tmp_path / "video.mp4").write_bytes(b"something else entirely")
     with pytest.raises(RecordingError, match="is no recording"):
         Recording(tmp_path / "video.mp4")

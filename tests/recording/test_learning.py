@@ -44,7 +44,7 @@ def test_other_settings_give_other_models_of_the_same_rows(said, written, change
     assert now.prequential.error != then.prequential.error
 
 
-def test_where_features_are_missing_nothing_is_learned_unless_that_is_wanted(said, written):
+def test_if_features_are_missing_nothing_is_learned_unless_requested(said, written):
     recording = Recording(written([message for message in said if getattr(message, "seq", 0) != 4]))
     with pytest.raises(RecordingError, match="misses the features of 1 frames"):
         learn(recording, recording.settings)

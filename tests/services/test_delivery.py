@@ -28,7 +28,7 @@ def test_a_message_that_is_stored_is_done_however_late(asked, patience):
 
 
 @given(st.lists(st.sampled_from(["taken", "stored", "asked"]), max_size=9), st.integers(0, 3))
-def test_a_message_that_its_receiver_takes_and_stores_within_the_patience_is_done(events, patience):
+def test_a_message_that_is_received_and_stored_within_the_time_limit_is_done(events, patience):
     sent = stored = False
     asked = -1
     for event in [*events, "taken", "stored"]:

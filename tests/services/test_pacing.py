@@ -37,7 +37,7 @@ def test_the_detector_is_never_further_ahead_than_the_lag_and_always_gets_to_the
 
 
 @given(st.integers(-9, 9), st.integers(0, 9), st.integers(0, 9), st.integers(0, 9))
-def test_a_model_is_waited_for_only_once_the_features_are_taken(due, taken, sample, newest):
+def test_a_model_is_awaited_only_after_the_features_are_received(due, taken, sample, newest):
     found = awaited(due, taken, sample, newest)
     assert (found is Awaited.TAKEN) == (taken < due)
     assert (found is Awaited.MODEL) == (taken >= due and newest < sample)

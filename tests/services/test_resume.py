@@ -39,7 +39,7 @@ def test_no_receiver_misses_a_message(history):
 
 
 @given(histories)
-def test_a_detector_state_is_gone_on_with_only_together_with_its_model_and_of_the_same_object(history):
+def test_a_detector_state_is_resumed_only_with_its_model_and_for_the_same_object(history):
     received, model, desired = history
     found = begin(history)
     assert (found.detector is None) == (found.model is None)

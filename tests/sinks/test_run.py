@@ -85,7 +85,7 @@ def test_a_file_that_is_new_when_a_run_is_resumed_gets_all_tracks(files):
     assert len(more.files[2].read_text().splitlines()) == 6, "MOT text has no line where the object is absent"
 
 
-def test_results_that_are_there_are_refused_and_replaced_together_if_that_is_asked_for(files, tmp_path):
+def test_existing_results_are_rejected_or_if_requested_replaced_together(files, tmp_path):
     earlier = files("run", ["t.csv"])
     fill(earlier, 0, 9)
     for again, words in (
@@ -114,12 +114,12 @@ def test_results_that_are_there_are_refused_and_replaced_together_if_that_is_ask
         (["t.txt", "t.mp4"], True, "does not hold all tracks"),
     ],
 )
-def test_what_cannot_be_written_is_refused_before_the_run(files, names, resumable, words):
+def test_results_that_cannot_be_written_are_rejected_before_the_run(files, names, resumable, words):
     with pytest.raises(VideoError, match=words):
         files("run", names, output=False).check_writable(overwrite=False, resumable=resumable)
 
 
-def test_a_file_of_somebody_else_is_not_gone_on_with(files):
+def test_a_file_of_another_program_is_not_continued(files):
     run = files("run", ["t.csv"], output=False)
     with closing(open_sink(run.files[0])) as other:
         other.write(track(0))

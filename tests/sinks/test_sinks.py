@@ -59,7 +59,7 @@ def test_csv_is_that_of_the_results(filled, tmp_path):
     assert [row["state"] for row in csv.DictReader(path.read_text().splitlines())] == [track.state for track in TRACKS]
 
 
-def test_mot_counts_from_one_and_has_no_line_where_the_object_is_absent(filled):
+def test_mot_counts_from_one_and_has_no_line_if_the_object_is_absent(filled):
     assert filled("tracks.txt").read_text() == (
         "1,1,11.00,21.00,30.50,40.00,1.0000,-1,-1,-1\n4,1,-1.00,22.00,30.00,40.00,0.7500,-1,-1,-1\n"
     )
@@ -88,7 +88,7 @@ def test_json_is_one_array_once_it_is_closed(tmp_path):
     assert json.loads((tmp_path / "empty.json").read_text()) == []
 
 
-def test_a_parquet_file_is_made_when_it_is_closed_of_rows_that_are_kept_until_then(tmp_path):
+def test_a_parquet_file_is_written_at_close_from_buffered_rows(tmp_path):
     arrow = pytest.importorskip("pyarrow.parquet")
     sink = open_sink(tmp_path / "tracks.parquet")
     for track in TRACKS:
@@ -120,7 +120,7 @@ def left(tmp_path):
 
 @pytest.mark.parametrize("suffix", COMPLETE)
 @pytest.mark.parametrize("closed", [True, False], ids=["closed", "killed"])
-def test_a_file_goes_on_after_the_frame_that_is_asked_for(left, suffix, closed):
+def test_a_file_continues_after_the_requested_frame(left, suffix, closed):
     path = left(f"tracks{suffix}", closed)
     read, before = reader(path), path.read_bytes() if path.exists() else b""
     kept = [replace(track, seq=track.frame + 1, pts=None) for track in TRACKS] if suffix == ".csv" else TRACKS
@@ -168,7 +168,7 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_file_that_is_there_is_kept(tmp_path, suffix):
+def test_an_existing_file_is_not_overwritten(tmp_path, suffix):
     path = tmp_path / f"tracks{suffix}"
     path.write_text("dear to somebody")
     with pytest.raises(VideoError, match="exists already"):
@@ -186,6 +186,6 @@ def test_a_file_that_is_there_is_kept(tmp_path, suffix):
         ("walk.mp4", "rtsp://127.0.0.1/cam", "is live"),
     ],
 )
-def test_what_cannot_be_written_is_refused_before_any_work(tmp_path, name, source, words):
+def test_an_output_that_cannot_be_written_is_rejected_before_any_work(tmp_path, name, source, words):
     with pytest.raises(VideoError, match=words):
         open_sink(tmp_path / name, source)

@@ -44,7 +44,7 @@ def test_agrees_with_pykalman(rng):
     agree(walk(rng))
 
 
-def test_agrees_with_pykalman_where_centres_are_missing(rng):
+def test_the_motion_model_agrees_with_pykalman_if_centres_are_missing(rng):
     centres = walk(rng)
     centres[rng.permutation(62)[:20] + 1] = np.nan
     agree(centres)

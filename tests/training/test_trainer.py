@@ -41,7 +41,7 @@ def test_centres_give_a_motion(sample):
     assert Trainer(Settings()).train(sample).motion is None
 
 
-def test_score_and_extent_together_say_how_well_a_cut_fits(sample, rng):
+def test_the_sum_of_score_and_extent_predicts_how_well_a_cut_fits(sample, rng):
     x, fits = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=40)
     rows = np.column_stack([x, np.ones(40), fits]).astype(np.float32)
     cuts = Summary(rows, rows.mean(axis=0), 40, (0,))
@@ -50,7 +50,7 @@ def test_score_and_extent_together_say_how_well_a_cut_fits(sample, rng):
     np.testing.assert_allclose(together - together.mean(), fits - fits.mean(), atol=1e-2)
 
 
-def test_an_object_like_the_background_is_refused(sample):
+def test_an_object_like_the_background_is_rejected(sample):
     same = dataclasses.replace(sample, trees=sample.trees | {"object": sample.trees["background"]})
     with pytest.raises(ProtocolError, match="give another box"):
         Trainer(Settings()).train(same)

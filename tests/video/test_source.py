@@ -233,7 +233,7 @@ def test_a_closed_source_has_no_frames(video):
 # --- images ------------------------------------------------------------------------------------------
 
 
-def test_images_of_a_folder_come_in_natural_order(images):
+def test_images_of_a_folder_are_read_in_natural_order(images):
     folder = images("walk", [f"{number}.png" for number in range(12)])
     source = open_source(folder)
     assert (source.name, source.frames, source.size) == ("walk", 12, (160, 120))

@@ -32,7 +32,7 @@ def test_a_page_that_connects_late_gets_all_parts(dashboard, facts):
     assert len(dashboard.updates(late)["points"]) == 21
 
 
-def test_two_minutes_of_points_are_kept_however_fast_tracks_come(dashboard, facts):
+def test_two_minutes_of_points_are_kept_at_any_rate_of_tracks(dashboard, facts):
     for frame in range(20_000):
         dashboard.take(facts.track(frame), 0.01 * frame)
     moments = [point[0] for point in dashboard.updates({})["points"]]

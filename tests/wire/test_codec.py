@@ -191,18 +191,18 @@ def test_a_field_of_a_later_version_is_ignored():
 
 
 @MESSAGES
-def test_a_message_of_another_kind_is_refused(message):
+def test_a_message_of_another_kind_is_rejected(message):
     others = [kind for kind in ALL if kind is not type(message)]
     with pytest.raises(ProtocolError, match=f"got '{type(message).__name__.lower()}'"):
         decode(encode(message), *others)
 
 
 TREES_SENT = fields_of("sample")["trees"]
-REFUSED = {
-    "a verb that is none": packed("command", verb="format"),
-    "a box that nothing is done with": packed("command", verb="stop"),
+REJECTED = {
+    "an unknown verb": packed("command", verb="format"),
+    "a box that the verb does not use": packed("command", verb="stop"),
     "set-box without a box": packed("command", box=None),
-    "a dtype that is not promised": retrained(rows=plain("<f8", [3, 5], bytes(120))),
+    "a dtype that is not allowed": retrained(rows=plain("<f8", [3, 5], bytes(120))),
     "objects": retrained(rows=plain("|O", [3, 5], bytes(120))),
     "another width of its labels": retrained(labels=plain("<f4", [2], bytes(8))),
     "rows in one dimension": retrained(rows=plain("<f4", [15], bytes(60))),
@@ -256,8 +256,8 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("data", REFUSED.values(), ids=REFUSED)
-def test_what_breaks_a_promise_is_refused_on_arrival(data):
+@pytest.mark.parametrize("data", REJECTED.values(), ids=REJECTED)
+def test_a_message_that_violates_its_schema_is_rejected_on_arrival(data):
     with pytest.raises(ProtocolError):
         decode(data, *ALL)
 
@@ -274,7 +274,7 @@ def test_what_breaks_a_promise_is_refused_on_arrival(data):
     ],
     ids=["dtype", "shape", "NaN", "negative"],
 )
-def test_what_would_be_refused_on_arrival_is_not_sent(message):
+def test_a_message_that_would_be_rejected_on_arrival_is_not_sent(message):
     with pytest.raises(ProtocolError):
         encode(message)
 
@@ -308,7 +308,7 @@ def decoded_or_refused(data: bytes) -> None:
 
 @FUZZ
 @given(st.sampled_from(ALL), st.data())
-def test_any_value_in_any_field_arrives_whole_or_is_refused(kind, data):
+def test_any_value_in_any_field_arrives_whole_or_is_rejected(kind, data):
     version, name, sent = msgpack.unpackb(encode(data.draw(messages(kind))))
     place = sent
     while isinstance(inner := place[key := data.draw(st.sampled_from(sorted(place)))], dict) and inner:
@@ -325,7 +325,7 @@ def test_any_value_in_any_field_arrives_whole_or_is_refused(kind, data):
     st.lists(st.tuples(st.integers(0, 2**16), st.integers(0, 255)), min_size=1, max_size=8),
     st.integers(0, 2**16),
 )
-def test_damaged_bytes_arrive_whole_or_are_refused(kind, changes, cut):
+def test_damaged_bytes_arrive_whole_or_are_rejected(kind, changes, cut):
     data = bytearray(encode(EXAMPLES[kind]))
     for place, value in changes:
         data[place % len(data)] = value
@@ -336,6 +336,6 @@ def test_damaged_bytes_arrive_whole_or_are_refused(kind, changes, cut):
 @FUZZ
 @given(st.binary(max_size=64))
 @example(b"\xc1")
-def test_random_bytes_are_refused(data):
+def test_random_bytes_are_rejected(data):
     with pytest.raises(ProtocolError):
         decode(data, *ALL)

@@ -59,7 +59,7 @@ def test_a_command_gets_its_answer(endpoint):
     assert heard == [PAUSE]
 
 
-def test_who_asks_before_anybody_is_there_is_answered_once_somebody_is(endpoint):
+def test_a_command_sent_before_the_pipeline_runs_is_answered_as_soon_as_it_does(endpoint):
     with ThreadPoolExecutor(1) as pool, Requester(endpoint) as requester:
         assert requester.ask(PAUSE, 0.3) is None
         answer = pool.submit(requester.ask, PAUSE, 20)
@@ -68,7 +68,7 @@ def test_who_asks_before_anybody_is_there_is_answered_once_somebody_is(endpoint)
     assert heard == [PAUSE]
 
 
-def test_a_command_that_comes_again_is_answered_again_and_carried_out_once(endpoint, raw, until):
+def test_a_repeated_command_is_answered_again_and_executed_once(endpoint, raw, until):
     with Responder(endpoint) as responder:
         heard = []
         for _ in range(3):  # on its way when the first is taken, and after its answer
@@ -88,7 +88,7 @@ def test_a_command_that_comes_again_is_answered_again_and_carried_out_once(endpo
     assert answers == [done(PAUSE)] * 2
 
 
-def test_of_two_who_ask_each_gets_its_own_answer(endpoint):
+def test_two_requesters_each_receive_their_own_answer(endpoint):
     with (
         answering(endpoint, done),
         Requester(endpoint) as one,
@@ -104,7 +104,7 @@ def test_of_two_who_ask_each_gets_its_own_answer(endpoint):
     [[b""], [b"\xc1"], [b"", b"", b""], [encode(PAUSE), b"more"], [encode(done(PAUSE))]],
     ids=["nothing", "no msgpack", "many parts", "two parts", "an answer"],
 )
-def test_what_is_no_command_is_counted_and_the_next_one_is_answered(endpoint, raw, parts):
+def test_an_invalid_command_is_counted_and_the_next_one_is_answered(endpoint, raw, parts):
     with answering(endpoint, done) as (responder, heard):
         raw.send_multipart(parts)
         raw.send(encode(PAUSE))
@@ -130,7 +130,7 @@ def test_a_flood_of_commands_is_bounded_and_those_that_were_dropped_may_come_aga
     assert len(heard) == 65
 
 
-def test_the_helm_sends_each_command_with_an_id_of_its_own(endpoint):
+def test_control_sends_each_command_with_an_id_of_its_own(endpoint):
     with answering(endpoint, done) as (_, heard), Control(str(endpoint), timeout=20) as control:
         for answer in (control.set_box((1, 2, 3, 4), keep=True), control.pause(), control.resume(), control.stop()):
             assert (answer.done, answer.frame) == (True, 7)
@@ -140,7 +140,7 @@ def test_the_helm_sends_each_command_with_an_id_of_its_own(endpoint):
     ]  # fmt: skip
 
 
-def test_what_is_refused_says_why(endpoint):
+def test_a_rejected_command_raises_an_error_with_the_reason(endpoint):
     def refuse(command):
         return Answer(command.id, False, "it is no time for that")
 
@@ -152,7 +152,7 @@ def test_what_is_refused_says_why(endpoint):
         control.pause()
 
 
-def test_where_nobody_answers_it_says_so(endpoint):
+def test_a_command_without_an_answer_raises_an_error(endpoint):
     with (
         Control(str(endpoint), timeout=0.3) as control,
         pytest.raises(SilenceError, match=r"no answer to stop from .* within 0\.3 s: is a pipeline running there"),
@@ -160,6 +160,6 @@ def test_where_nobody_answers_it_says_so(endpoint):
         control.stop()
 
 
-def test_a_box_that_cannot_travel_is_refused_before_it_is_sent(endpoint):
+def test_a_box_that_cannot_be_encoded_is_rejected_before_it_is_sent(endpoint):
     with Control(str(endpoint)) as control, pytest.raises(ProtocolError, match="above 0"):
         control.set_box((1, 2, 0, 4))

@@ -50,7 +50,7 @@ def test_this_machine_is_accepted(host):
 @pytest.mark.parametrize(
     "host", ["0.0.0.0", "192.168.1.1", "[::]", "[fe80::1]", "example.org", "*", "127.0.0.1.nip.io"]
 )
-def test_a_host_that_others_can_reach_is_refused(host):
+def test_a_host_that_others_can_reach_is_rejected(host):
     with pytest.raises(ServiceError, match="other machines"):
         Endpoint.parse(f"tcp://{host}:5700")
 
@@ -59,7 +59,7 @@ def test_a_host_that_others_can_reach_is_refused(host):
     "text",
     ["tcp://", "tcp://127.0.0.1", "tcp://127.0.0.1:0", "tcp://127.0.0.1:65535", "tcp://127.0.0.1:x", "tcp://[:5700"],
 )
-def test_a_tcp_endpoint_without_room_for_its_ports_is_refused(text):
+def test_a_tcp_endpoint_without_room_for_its_ports_is_rejected(text):
     with pytest.raises(ServiceError, match="more ports after PORT"):
         Endpoint.parse(text)
 
@@ -87,12 +87,12 @@ def test_a_pipeline_with_keys_is_found_with_them(folder):
 @pytest.mark.parametrize(
     ("text", "word"), [("", "--set run.endpoint"), ("udp://127.0.0.1:1", "a folder or tcp"), ("x" * 100, "too long")]
 )
-def test_what_is_no_endpoint_is_refused(text, word):
+def test_an_invalid_endpoint_is_rejected(text, word):
     with pytest.raises(ServiceError, match=word):
         Endpoint.parse(text)
 
 
-def test_a_private_folder_is_for_this_user_and_gone_afterwards():
+def test_a_private_folder_is_for_this_user_and_removed_afterwards():
     with private_folder() as folder:
         assert mode(folder) == 0o700
         (folder / "features").touch()
@@ -104,14 +104,14 @@ def test_a_folder_that_is_made_is_for_this_user_alone(folder):
         assert mode(folder / "a" / "b") == 0o700
 
 
-def test_a_folder_that_others_may_write_to_is_refused(folder):
+def test_a_folder_that_others_may_write_to_is_rejected(folder):
     folder.chmod(0o777)
     with pytest.raises(ServiceError, match="other users may write"), meeting_place(str(folder), folder):
         pass
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
-def test_a_folder_of_another_user_is_refused(folder):
+def test_a_folder_of_another_user_is_rejected(folder):
     (folder / "theirs").mkdir(mode=0o755)
     os.chown(folder / "theirs", 12345, 12345)
     with pytest.raises(ServiceError, match="a folder of your own"), meeting_place(str(folder / "theirs"), folder):

@@ -248,7 +248,7 @@ def test_a_message_that_is_missing_is_reported_at_once_and_then_only_now_and_the
     assert window.receive(b"peer", 5, now=PATIENCE + 0.01) == report
 
 
-def test_a_message_that_was_taken_before_is_acknowledged_again_each_time():
+def test_a_message_that_was_received_before_is_acknowledged_again_each_time():
     window = ReceiveWindow(Position(), size=8)
     window.receive(b"peer", 1, now=0.0)
     window.acknowledge(Position(1, version=4))
@@ -290,7 +290,7 @@ def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_pati
     assert not window.must_ask(200.0)
 
 
-def test_who_asks_while_all_is_stored_is_answered_at_once_and_otherwise_waits_for_the_owner():
+def test_a_position_request_is_answered_at_once_if_all_is_stored_and_otherwise_by_the_owner():
     window = ReceiveWindow(Position(), size=4)
     assert window.hello(b"one") == [Reply(b"one", Position())]
     window.receive(b"one", 1, now=0.0)
@@ -308,7 +308,7 @@ def test_of_a_flood_of_peers_that_ask_only_some_are_remembered():
     assert len(window.answer(Position(1))) == 64
 
 
-def test_acknowledgements_go_to_the_peer_whose_message_was_taken_last():
+def test_acknowledgements_go_to_the_peer_of_the_newest_received_message():
     window = ReceiveWindow(Position(), size=4)
     assert window.acknowledge(Position()) == [], "nobody has sent anything"
     window.receive(b"old", 1, now=0.0)
@@ -325,7 +325,7 @@ def test_a_message_that_no_sender_can_have_in_flight_is_rejected():
     ]
 
 
-def test_the_end_and_a_broken_connection_are_noticed_and_a_new_message_takes_them_back():
+def test_the_end_and_a_broken_connection_are_noticed_and_reset_by_a_new_message():
     window = ReceiveWindow(Position(), size=4)
     assert (window.connected, window.ended) == (False, False)
     window.receive(b"peer", 1, now=0.0)
@@ -335,7 +335,7 @@ def test_the_end_and_a_broken_connection_are_noticed_and_a_new_message_takes_the
     assert (window.connected, window.ended) == (True, True)
 
 
-@pytest.mark.parametrize("late", [Stored(1, 3), Stored(2, 2)], ids=["stored less", "taken less"])
+@pytest.mark.parametrize("late", [Stored(1, 3), Stored(2, 2)], ids=["stored less", "received less"])
 def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late):
     window = filled(size=4, count=4)
     window.receive(Stored(2, 3), now=0.0)
@@ -346,7 +346,7 @@ def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late
     assert window.must_ask(50.0), "it is no sign of life"
 
 
-def test_what_a_full_disk_keeps_in_memory_is_acknowledged_and_does_not_count_as_stored():
+def test_messages_kept_in_memory_by_a_full_disk_are_acknowledged_and_do_not_count_as_stored():
     window = filled(size=4, count=3)
     window.receive(Stored(3, 3, unsaved=2), now=0.0)
     assert (window.acknowledged, window.stored, window.full) == (3, 1, False)
@@ -354,7 +354,7 @@ def test_what_a_full_disk_keeps_in_memory_is_acknowledged_and_does_not_count_as_
         window.receive(Position(1), now=0.0)
 
 
-def test_a_receiver_of_another_stream_is_noticed_and_what_an_earlier_sender_had_in_flight_is_not_one():
+def test_a_receiver_of_another_stream_is_detected_and_messages_of_an_earlier_sender_are_accepted():
     window = SendWindow("features", 4, now=0.0)
     window.resume(3, known=5)
     window.receive(Stored(9, 9), now=0.0)

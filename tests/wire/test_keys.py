@@ -183,14 +183,14 @@ def test_a_client_cannot_impersonate_the_pipeline(place):
 
 
 @pytest.mark.parametrize("name", WATCHED)
-def test_who_may_watch_hears(name, place, listener, until):
+def test_a_client_that_may_watch_receives_messages(name, place, listener, until):
     turn, heard = listener(name), []
     with Subscriber(CHANNELS[name], place("watcher")) as reader:
         until(lambda: heard, lambda: (turn(), heard.extend(reader.receive_all())))
     assert heard
 
 
-def test_who_may_steer_is_answered(place, until):
+def test_a_client_that_may_steer_receives_answers(place, until):
     with Responder(place()) as detector, Requester(place("helm")) as helm:
         answers = []
 
@@ -275,7 +275,7 @@ def test_a_client_that_is_allowed_later_needs_no_restart(keys, place, until):
             until(lambda: heard, lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())))
 
 
-def test_while_the_clients_cannot_be_read_nobody_comes_in_and_afterwards_they_do(keys, place, until):
+def test_clients_are_rejected_while_their_keys_cannot_be_read_and_accepted_afterwards(keys, place, until):
     heard, before = [], rejected("unreadable")
     good = (keys / "clients" / "helm").read_bytes()
     (keys / "clients" / "helm").write_bytes(b"role = ")
@@ -317,7 +317,7 @@ def test_sockets_with_keys_come_and_go_as_they_like(place, until):
 
 
 @pytest.mark.parametrize("attach", ["subscribe", "control"])
-def test_a_client_without_keys_is_told_that_the_pipeline_asks_for_them(place, listener, attach, until):
+def test_a_client_without_keys_gets_an_error_if_the_pipeline_requires_them(place, listener, attach, until):
     listens = listener("tracks" if attach == "subscribe" else "control")
     endpoint = str(place("none"))
 

@@ -108,7 +108,7 @@ def test_every_channel_has_its_row(channel):
 
 
 @pytest.mark.parametrize("kind", MESSAGES, ids=lambda kind: kind.__name__.lower())
-def test_the_table_of_a_message_is_what_its_schema_says(kind):
+def test_the_table_of_a_message_agrees_with_its_schema(kind):
     assert section(kind).search(PAGE)[2] == table(kind), "docs/protocol.md is not the schema: run `make protocol`"
 
 
@@ -123,7 +123,7 @@ def test_the_limits_are_those_of_the_codec():
     assert LARGEST_INTEGER == 2**53
 
 
-def test_the_example_in_bytes_is_what_travels():
+def test_the_example_in_bytes_agrees_with_the_encoded_message():
     example = re.search(r"^```\n((?:[0-9a-f]{2}[ \n])+)```", PAGE, re.MULTILINE)[1]
     assert bytes.fromhex(example) == codec.encode(Stored(5, 7, 2))
     assert f"`{codec.opening(End).hex(' ')}` for `end`" in PAGE
@@ -134,7 +134,7 @@ def test_the_address_of_the_example_is_that_of_the_channel(text):
     assert Endpoint.parse(text).address(CHANNELS["tracks"]) in block("python")
 
 
-def test_the_subscriber_of_the_page_hears_every_track(endpoint, until):
+def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
     address = endpoint.address(CHANNELS["tracks"])
     with (
         Publisher(TRACKS, endpoint) as tracks,

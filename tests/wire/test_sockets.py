@@ -94,7 +94,7 @@ def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
     assert taken == [1]
 
 
-def test_a_sender_that_asked_a_slow_receiver_still_learns_what_it_has_taken(endpoint, until):
+def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint, until):
     taken = []
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
 
@@ -129,7 +129,7 @@ def test_a_sender_knows_which_sample_its_messages_led_to(endpoint, until):
     assert led_to == [0, 1, 1, 2, 2, 3, 3]
 
 
-def test_a_full_window_takes_no_more(endpoint, until):
+def test_a_full_window_accepts_no_more_messages(endpoint, until):
     taken = []
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         assert [sender.send(track(seq)) for seq in range(1, WINDOW + 2)] == [True] * WINDOW + [False]
@@ -172,7 +172,7 @@ def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
     assert again == list(range(4, 21))
 
 
-def test_a_restarted_sender_repeats_nothing_that_was_taken(endpoint, until):
+def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
     taken = []
     with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
         with Sender(RESULTS, endpoint, 10) as sender:
@@ -205,7 +205,7 @@ def test_a_restarted_sender_repeats_nothing_that_was_taken(endpoint, until):
     assert taken == list(range(1, 10))
 
 
-def test_a_restarted_sender_may_hear_that_more_was_stored_since_it_asked(endpoint, until):
+def test_a_restarted_sender_accepts_a_later_position_than_it_asked_for(endpoint, until):
     taken, found = [], []
     with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
         with Sender(RESULTS, endpoint, 10) as sender:
@@ -230,7 +230,7 @@ def test_a_restarted_sender_may_hear_that_more_was_stored_since_it_asked(endpoin
     assert taken == list(range(1, 10))
 
 
-def test_a_receiver_that_is_asked_stores_what_it_has_taken_in_a_step_of_its_own(endpoint, until):
+def test_a_receiver_stores_its_messages_in_a_separate_step_if_the_position_is_requested(endpoint, until):
     taken, found = [], []
     with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
 
@@ -250,7 +250,7 @@ def test_a_receiver_that_is_asked_stores_what_it_has_taken_in_a_step_of_its_own(
     assert found[-1] == Position(5, version=7)
 
 
-def test_a_message_that_comes_again_is_answered_as_it_was_before(endpoint, stranger, until):
+def test_a_repeated_message_receives_the_same_answer(endpoint, stranger, until):
     told = []
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
         sender = stranger(zmq.DEALER, "results")
@@ -350,7 +350,7 @@ def test_a_message_above_the_limit_is_not_even_read(endpoint, stranger, until):
     assert not receiver.rejected
 
 
-def test_a_reader_that_never_reads_holds_nobody_up(endpoint, until):
+def test_a_reader_that_never_reads_blocks_nobody(endpoint, until):
     messages, long = 8000, "x" * 4000  # more than all buffers on the way hold
     with Publisher(TRACKS, endpoint) as tracks, Subscriber(TRACKS, endpoint) as idle:
         heard = []
@@ -362,7 +362,7 @@ def test_a_reader_that_never_reads_holds_nobody_up(endpoint, until):
     assert 0 < len(rest) < messages, "what does not fit is lost, and seq tells"
 
 
-def test_where_the_newest_counts_a_slow_reader_skips_the_older(endpoint, until):
+def test_a_slow_reader_of_models_skips_to_the_newest(endpoint, until):
     with Publisher(MODELS, endpoint) as models, Subscriber(MODELS, endpoint) as reader:
         until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))
         for version in range(2, 101):
@@ -377,7 +377,7 @@ def test_where_the_newest_counts_a_slow_reader_skips_the_older(endpoint, until):
     assert len(seen) < 100
 
 
-def test_who_comes_late_gets_the_last_model(endpoint, until):
+def test_a_late_subscriber_receives_the_last_model(endpoint, until):
     with Publisher(MODELS, endpoint) as models:
         models.send(model(1))
         models.send(model(2))
@@ -387,7 +387,7 @@ def test_who_comes_late_gets_the_last_model(endpoint, until):
     assert late.weights.tolist() == [2] * 5
 
 
-def test_who_comes_late_gets_no_old_tracks(endpoint, until):
+def test_a_late_subscriber_receives_no_old_tracks(endpoint, until):
     with Publisher(TRACKS, endpoint) as tracks:
         tracks.send(track(1))
         with Subscriber(TRACKS, endpoint) as late:
@@ -403,7 +403,7 @@ def test_who_comes_late_gets_no_old_tracks(endpoint, until):
     assert got[0] > 1
 
 
-def test_all_three_processes_are_heard_on_one_channel(endpoint, until):
+def test_one_channel_receives_from_all_three_processes(endpoint, until):
     with ExitStack() as stack:
         names = CHANNELS["health"].senders
         publishers = {name: stack.enter_context(Publisher(HEALTH, endpoint, name)) for name in names}
@@ -418,13 +418,13 @@ def test_all_three_processes_are_heard_on_one_channel(endpoint, until):
         until(lambda: heard == set(names), turn)
 
 
-def test_the_end_comes_through_like_any_other_message(endpoint, until):
+def test_the_end_is_received_like_any_other_message(endpoint, until):
     with Publisher(SAMPLES, endpoint) as samples:
         samples.send(End(1, "the source came to its end"))
         assert first(samples, endpoint, until).reason == "the source came to its end"
 
 
-def test_what_was_sent_last_arrives_though_its_sender_closes_at_once(endpoint, until):
+def test_the_last_message_arrives_even_if_its_sender_closes_at_once(endpoint, until):
     tree, loss = (Summary(np.ones((200, d), np.float32), np.ones(d, np.float32), 200, (0,)) for d in (2000, 2002))
     large = Sample(1, 0, {"object": tree, "background": tree, "loss": loss}, np.empty((0, 2)))
 
@@ -464,7 +464,7 @@ def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_on
     ],
     ids=["receiver", "publisher"],
 )
-def test_a_second_one_at_the_same_address_is_refused(endpoint, bind):
+def test_a_second_socket_at_the_same_address_is_rejected(endpoint, bind):
     with bind(endpoint):
         with pytest.raises(ServiceError, match="another pipeline may be running"):
             bind(endpoint)

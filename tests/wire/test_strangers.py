@@ -153,7 +153,7 @@ def test_a_message_with_many_parts_is_one_rejected_message(endpoint, stranger, u
         until(lambda: rejected("parts") == before + 1, lambda: receiver.receive(0.05))
 
 
-def test_an_acknowledgement_that_comes_again_takes_nothing_back(endpoint, until):
+def test_a_repeated_acknowledgement_does_not_undo_a_later_one(endpoint, until):
     before = rejected("acknowledgement")
     with zmq.Context.instance().socket(zmq.ROUTER) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         receiver.bind(endpoint.address(CHANNELS["results"]))

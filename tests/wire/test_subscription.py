@@ -140,7 +140,7 @@ def test_the_health_of_each_process_arrives_once(endpoint):
     assert sorted(heard) == sorted(names)
 
 
-def test_features_are_copied_to_anyone_with_what_is_missing_counted(endpoint, until):
+def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(endpoint, until):
     with (
         Publisher(TRAINING, endpoint, first_message=Run("0", {"coreset.size": "64"})) as training,
         catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
