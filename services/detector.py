@@ -53,7 +53,7 @@ def main(process: Process) -> None:
     """Track the object of the job to the last frame of its source."""
     process.source = _shown(process.job.source)
     learned = Learned.load(process.job.model) if process.job.model is not None else None
-    reason, failed = "the source came to its end", False
+    reason, failed = "the source has ended", False
     with ExitStack() as stack:
         loop = DetectorLoop(process, stack, learned)
         loop.wait_for_subscribers()

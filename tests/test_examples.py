@@ -74,7 +74,7 @@ def beside(request, demo_video, shown, tmp_path_factory):
     if not keys and missing("rerun_subscriber.py") is None:
         words["rerun_subscriber.py"] = ["--save", shown]
     with ExitStack() as stack:
-        # A window of one: the pipeline goes on only as its tracks are taken.
+        # A window of one: the pipeline continues only if its tracks are received.
         pipeline = stack.enter_context(
             Pipeline(str(source), boxes[0], Settings(run={"unstored_frames": 1, "keys": keys}))
         )
@@ -108,7 +108,7 @@ def test_the_rerun_subscriber_writes_a_file_for_the_viewer(beside, shown):
     code, printed = beside.printed["rerun_subscriber.py"]
     assert code == 0
     losses = r"(0 missed|(\d+) missed, \2 of them before this subscriber connected)"
-    assert re.fullmatch(rf"[1-9]\d* tracks, {losses}: the source came to its end\n", printed)
+    assert re.fullmatch(rf"[1-9]\d* tracks, {losses}: the source has ended\n", printed)
     data = shown.read_bytes()
     assert data.startswith(b"RRF2")
     for entity in (b"/camera/object", b"/score", b"/model", b"/state", b"Boxes2D"):
@@ -122,7 +122,7 @@ def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(beside, exa
     code, text = beside.printed[example]
     printed, norms = text.splitlines(), beside.norms
     assert code == 0
-    assert printed[-1] == "end: the source came to its end, 0 tracks missed"
+    assert printed[-1] == "end: the source has ended, 0 tracks missed"
     tracks = [text.split() for text in printed if text.startswith("track ")]
     assert [int(frame) for _, frame, *_ in tracks] == list(range(60 - len(tracks), 60))
     for _, frame, state, box, score in tracks:

@@ -33,7 +33,7 @@ class Measures:
     success          share of frames with the object whose overlap is above 0.5; a skipped frame has the last known box
     success_followed the same share of the tracked frames alone; None if there are none
     lag              reports of the number of messages that the compressor had not received: arrival time and number
-    sent, stored     number of features messages at the end; None if the stream did not come to its end
+    sent, stored     number of features messages at the end; None if the stream has not ended
     """
 
     due: np.ndarray

@@ -83,7 +83,7 @@ def test_a_recording_is_watched_like_a_pipeline(recorded, catstream, tmp_path):
     tracks = [json.loads(line)["frame"] for line in output.splitlines()]
     assert tracks == list(range(60 - len(tracks), 60))
     assert f"{60 - len(tracks)} missed" in errors
-    assert ": the source came to its end" in errors
+    assert ": the source has ended" in errors
 
 
 def holds_tracks(path):

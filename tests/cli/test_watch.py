@@ -22,7 +22,7 @@ SECONDS = 60  # that anything may take on a busy machine
 
 
 def pipeline(video):
-    """One that goes on only as its tracks are taken."""
+    """A pipeline that continues only if its tracks are received."""
     source, box = video
     return Pipeline(source, [float(side) for side in box.split(",")], Settings(run={"unstored_frames": 1}))
 
@@ -51,7 +51,7 @@ def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(v
     assert found[0].keys() == {field.name for field in dataclasses.fields(Track)}
     assert [track["frame"] for track in found] == list(range(60 - len(found), 60))
     assert errors.startswith(f"{len(found)} tracks, {60 - len(found)} missed"), "those before it came"
-    assert errors.endswith(": the source came to its end\n")
+    assert errors.endswith(": the source has ended\n")
     lines = shown.splitlines()
     assert len(lines) == 3
     assert all(word in lines[0] for word in ("frame ", "background ", "appearance ", "extent "))

@@ -39,7 +39,7 @@ def playing(endpoint):
 
 
 def test_a_subscriber_receives_all_recorded_messages_until_the_end(said, written, playing, endpoint):
-    end = End(51, "the source came to its end", totals={"sent": 50.0})
+    end = End(51, "the source has ended", totals={"sent": 50.0})
     playing(Recording(written([*said, end])))
     with catstream.subscribe(str(endpoint), "tracks", timeout=30) as tracks:
         heard = list(tracks)

@@ -44,7 +44,7 @@ const STATES = {
     trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, surprising: { measured: 0, frames: [] } },
   drawing: { ...all },
   stopping: {},
-  "the end": changed({ phase: "ended", reason: "the source came to its end" }),
+  "the end": changed({ phase: "ended", reason: "the source has ended" }),
   "the end, and of the server": { closed: true },
 };
 const doing = {

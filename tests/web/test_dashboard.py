@@ -62,10 +62,10 @@ def test_silence_and_the_end_are_different_phases(dashboard, facts):
     dashboard.mark_silent("nothing came")
     assert dashboard.updates(told)["status"]["phase"] == "silent"
     dashboard.take(facts.track(0), 10.0)
-    dashboard.take(End(2, "the source came to its end"), 11.0)
+    dashboard.take(End(2, "the source has ended"), 11.0)
     dashboard.mark_silent("nothing came")
     status = dashboard.updates(told)["status"]
-    assert (status["phase"], status["reason"]) == ("ended", "the source came to its end")
+    assert (status["phase"], status["reason"]) == ("ended", "the source has ended")
 
 
 def test_a_silent_process_is_not_listed(dashboard):
@@ -85,7 +85,7 @@ def test_a_silent_process_is_not_listed(dashboard):
 
 def test_the_last_health_report_of_a_pipeline_does_not_belong_to_the_next_one(dashboard):
     dashboard.take(Health("detector", 1.0, {"sent": 7.0}), 9.0)
-    dashboard.take(End(2, "the source came to its end"), 10.0)
+    dashboard.take(End(2, "the source has ended"), 10.0)
     dashboard.take(Health("detector", 1.0, {"sent": 8.0}), 10.5)
     dashboard.take(Health("compressor", 1.0, {}), 10.6)
     assert dashboard.phase == "ended"
@@ -94,7 +94,7 @@ def test_the_last_health_report_of_a_pipeline_does_not_belong_to_the_next_one(da
 
 
 def test_the_trees_of_the_last_health_report_are_shown_after_the_end(dashboard):
-    dashboard.take(End(2, "the source came to its end"), 10.0)
+    dashboard.take(End(2, "the source has ended"), 10.0)
     dashboard.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 200.0}), 10.1)
     dashboard.mark_silent("no pipeline is running")
     trees = dashboard.updates({})["trees"]
@@ -134,7 +134,7 @@ FIRST_SIGNS = {
 def test_all_state_is_dropped_when_another_pipeline_appears(dashboard, facts, endpoint, ended, sign):
     told = followed(dashboard, facts, "a")
     if ended:
-        dashboard.take(End(52, "the source came to its end"), 6.0)
+        dashboard.take(End(52, "the source has ended"), 6.0)
     dashboard.attach(endpoint)
     assert dashboard.endpoint == "a"
     assert not set(dashboard.updates(told)) - {"status"}, "nothing goes before the other one is seen"

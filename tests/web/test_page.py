@@ -64,7 +64,8 @@ def test_an_object_drawn_with_the_mouse_is_tracked_until_it_leaves_and_after_a_r
         for image, box in render(145, SIZE, begin=LEAVES - 120):
             video.write(image)
             boxes.append(box)
-    settings = Settings(run={"endpoint": str(folder), "unstored_frames": 4})  # it goes on only as its tracks are taken
+    # The pipeline continues only if its tracks are received.
+    settings = Settings(run={"endpoint": str(folder), "unstored_frames": 4})
     server = Server(str(folder), port=0)
     with server.in_background():
         with Pipeline(str(path), None, settings) as pipeline:

@@ -50,8 +50,8 @@ def check_another_pipeline(state):
 
 def check_end(before, last):
     """The page keeps what it showed, and says that its server ended too."""
-    assert before["overlay"] == "The end: the source came to its end. This page waits for the next pipeline."
-    assert last["overlay"].startswith("The end: the source came to its end. The server of this page has ended too")
+    assert before["overlay"] == "The end: the source has ended. This page waits for the next pipeline."
+    assert last["overlay"].startswith("The end: the source has ended. The server of this page has ended too")
     assert (last["pill"], last["frame"], last["frames"], last["trees"]) == (
         "ended",
         before["frame"],

@@ -53,7 +53,7 @@ TREES = {"object": summary(5), "background": summary(5), "loss": summary(7), "ex
 EXAMPLES = {
     "answer": Answer("7f", True, "followed from frame 9 on", 9, Box(4.5, 3.0, 20.0, 10.0), 4),
     "command": Command("7f", "set-box", Box(4.5, 3.0, 20.0, 10.0), True),
-    "end": End(8, "the source came to its end", False, {"sent": 7.0, "stored": 7.0}),
+    "end": End(8, "the source has ended", False, {"sent": 7.0, "stored": 7.0}),
     "features": Features(
         3,
         2,

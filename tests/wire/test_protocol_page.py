@@ -144,7 +144,7 @@ def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
         until(lambda: heard(reader.stdout), lambda: tracks.send(hello))
         for seq in range(2, 20):
             tracks.send(Track(seq, seq - 1, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 1))
-        tracks.send(End(20, "the source came to its end"))
+        tracks.send(End(20, "the source has ended"))
         lines = reader.communicate(timeout=60)[0].splitlines()
     assert reader.returncode == 0
     assert [line for line in lines if "present" in line] == [

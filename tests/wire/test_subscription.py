@@ -60,7 +60,7 @@ def test_tracks_arrive_in_order_until_the_end(endpoint, tracks):
     with attached(endpoint, tracks) as subscription:
         for seq in range(2, 50):
             tracks.send(track(seq))
-        tracks.send(End(50, "the source came to its end", totals={"sent": 49.0}))
+        tracks.send(End(50, "the source has ended", totals={"sent": 49.0}))
         assert list(subscription) == [track(seq) for seq in range(2, 50)]
         assert subscription.end.totals == {"sent": 49}
         assert subscription.missed == 0
@@ -71,7 +71,7 @@ def test_each_gap_is_counted_also_the_one_before_the_end(endpoint, tracks):
     with attached(endpoint, tracks) as subscription:
         for seq in (2, 5, 6, 10):
             tracks.send(track(seq))
-        tracks.send(End(13, "the source came to its end"))
+        tracks.send(End(13, "the source has ended"))
         assert [message.seq for message in subscription] == [2, 5, 6, 10]
         assert subscription.missed == 2 + 3 + 2
 
@@ -80,7 +80,7 @@ def test_repeated_numbers_of_a_restarted_detector_do_not_count_as_missed(endpoin
     with attached(endpoint, tracks) as subscription:
         for seq in (2, 3, 4, 2, 3, 4, 5):
             tracks.send(track(seq))
-        tracks.send(End(6, "the source came to its end"))
+        tracks.send(End(6, "the source has ended"))
         assert [message.seq for message in subscription] == [2, 3, 4, 2, 3, 4, 5]
         assert subscription.missed == 0
 
@@ -90,7 +90,7 @@ def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks)
     with attached(endpoint, tracks) as subscription:
         for seq in range(2, count):
             tracks.send(track(seq))
-        tracks.send(End(count, "the source came to its end"))
+        tracks.send(End(count, "the source has ended"))
         heard = [message.seq for message in subscription]
         assert 0 < len(heard) < count - 2, "this reader was too slow"
         assert len(heard) + subscription.missed == count - 2
@@ -106,7 +106,7 @@ def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(end
             while not ended.wait(0.01):
                 models.serve_late_joiners()
                 if seen:  # the subscriber is there
-                    tracks.send(End(2, "the source came to its end"))
+                    tracks.send(End(2, "the source has ended"))
 
         thread = threading.Thread(target=publish)
         thread.start()
@@ -118,7 +118,7 @@ def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(end
             ended.set()
             thread.join()
     assert seen == [2]
-    assert subscription.end.reason == "the source came to its end"
+    assert subscription.end.reason == "the source has ended"
 
 
 def test_the_health_of_each_process_arrives_once(endpoint):
@@ -148,7 +148,7 @@ def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(end
         until(lambda: training.has_subscribers, training.serve_late_joiners)
         for seq in (3, 4, 7):
             training.send(features(seq))
-        training.send(End(9, "the source came to its end"))
+        training.send(End(9, "the source has ended"))
         subscription.timeout = 20
         heard = list(subscription)
     assert [message.seq for message in heard] == [3, 4, 7]
@@ -191,7 +191,7 @@ def test_async_for_gives_the_same(endpoint, tracks):
         for seq in range(2, 40):
             tracks.send(track(seq))
             await asyncio.sleep(0)
-        tracks.send(End(42, "the source came to its end"))
+        tracks.send(End(42, "the source has ended"))
         return await reading
 
     with attached(endpoint, tracks) as subscription:
@@ -223,7 +223,7 @@ def test_subscribing_to_a_channel_with_one_receiver_is_an_error(endpoint, channe
 def test_a_subscriber_that_receives_only_the_end_has_missed_all(endpoint, tracks, until):
     with catstream.subscribe(str(endpoint), "tracks", timeout=20) as subscription:
         until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
-        tracks.send(End(61, "the source came to its end"))
+        tracks.send(End(61, "the source has ended"))
         assert list(subscription) == []
         assert (subscription.missed, subscription.missed_before) == (60, 60)
 
