@@ -136,10 +136,10 @@ class Pipeline:
     ) -> None:
         if state is not None and resume is not None:
             raise SettingsError("state starts a new run, and resume continues one: give one of them")
-        self._kept = Job.load(Path(resume)) if resume is not None else None
+        self._resumed_job = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         given = settings.changed() if isinstance(settings, Settings) else settings or {}
-        job = _with_object(self._kept or Job(started=time.time()), box, model)
+        job = _with_object(self._resumed_job or Job(started=time.time()), box, model)
         job = replace(
             job,
             source=without_scheme(str(source)) if source is not None else job.source,
@@ -147,7 +147,7 @@ class Pipeline:
             settings=job.settings.but(given),
             results=results if results is not None else job.results,
         )
-        _check(job, _path(record), is_new=self._kept is None)
+        _check(job, _path(record), is_new=self._resumed_job is None)
         # The source is closed here, because the detector opens it, and a camera can be open in one program only.
         image_rate, skip_damaged = job.settings.run.image_rate, job.settings.run.skip_damaged
         with open_source(job.source, part=job.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
@@ -157,8 +157,8 @@ class Pipeline:
             job.box.validated(*self.size)
         path = job.source if self.live else str(Path(job.source).absolute())
         self._job = replace(job, source=path, size=self.size, settings=job.settings.for_length(self.frames))
-        if self._kept is not None and self._state is not None:
-            self._kept.check_fits(self._job, self._state)
+        if self._resumed_job is not None and self._state is not None:
+            self._resumed_job.check_fits(self._job, self._state)
         self._record, self._save_model = _path(record), _path(save_model)
         self._after, self._box = after, job.box
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
@@ -200,8 +200,8 @@ class Pipeline:
             endpoint = stack.enter_context(meeting_place(settings.run.endpoint, folder, settings.run.keys, shown))
             start = Position()
             if self._state is not None:
-                stack.enter_context(_begun(self._state, self._kept, self._job))
-                start = self._start(self._state) if self._kept is not None else start
+                stack.enter_context(_begun(self._state, self._resumed_job, self._job))
+                start = self._start(self._state) if self._resumed_job is not None else start
             self._box = start.box or self._box
             self._incoming = stack.enter_context(Receiver(RESULTS, endpoint, start, settings.run.unstored_frames))
             self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
@@ -220,7 +220,7 @@ class Pipeline:
             owned=True,
             record=self._record,
             state=self._state and self._state.absolute(),
-            resume=self._kept is not None,
+            resume=self._resumed_job is not None,
             since=time.monotonic() - max(0.0, time.time() - self._job.started),
         )
 
@@ -355,12 +355,12 @@ class Pipeline:
     @property
     def waits(self) -> bool:
         """Whether a new run waits for a box, because it has neither box nor model; false for a resumed run."""
-        return self._box is None and self._job.model is None and self._kept is None
+        return self._box is None and self._job.model is None and self._resumed_job is None
 
     @property
     def complete(self) -> bool:
         """Whether the run to resume has already tracked all frames; valid before the start."""
-        if self._kept is None or self._state is None or self.frames is None or self.live:
+        if self._resumed_job is None or self._state is None or self.frames is None or self.live:
             return False
         return self._start(self._state).seq >= self.frames
 

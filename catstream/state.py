@@ -44,7 +44,7 @@ def position(folder: Path, settings: Settings) -> Position:
 
 
 def learned(folder: Path, settings: Settings) -> Learned:
-    """What was learned of the object, by the newest whole checkpoint: the sample in it gives its model once more.
+    """The model, sample and box of the newest valid checkpoint; the model is trained again from the sample.
 
     Raises
     ------

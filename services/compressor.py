@@ -99,10 +99,10 @@ class CompressorLoop:
         before, seq, run = self._progress, self._compressor.seq, self._process.settings.run
         end = message if isinstance(message, End) else None
         urgent = self._checkpoints is None or end is not None or before.is_urgent(seq, run.unstored_frames)
-        urgent = urgent or self._features.asked
+        urgent = urgent or self._features.position_requested
         if (urgent and seq > before.stored) or before.is_due(seq, time.monotonic(), run.checkpoint_seconds):
             self._store(urgent)
-        if self._features.asked:
+        if self._features.position_requested:
             self._features.answer(self._progress.position)
         if message is not None or self._progress.position is not before.position:
             self._features.acknowledge(self._progress.acknowledgement(self._compressor.sampled, end))

@@ -1,1 +1,1 @@
-"""What belongs to the paper alone, kept to compare with: its first tracker and its classifier."""
+"""The parts that only the paper has, for comparison: its first tracker and its classifier."""

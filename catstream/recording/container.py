@@ -154,7 +154,7 @@ def entry_at(file: BinaryIO, place: int) -> Entry | None:
 
 
 def end_of_data(file: BinaryIO) -> int | None:
-    """Where the entries of a file end, as its footer says; None if the file was not closed."""
+    """The place after the last entry of a file, read from its footer; None if the file was not closed."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - _FOOTER_SIZE - len(MAGIC)))
     footer = file.read()

@@ -128,7 +128,7 @@ class Sender(ChannelSocket[Message]):
                 self._window.transmitted()
 
     def _say_hello(self) -> None:
-        self._window.asked(monotonic())
+        self._window.position_requested(monotonic())
         with contextlib.suppress(zmq.Again):  # no receiver is connected yet: it is asked again
             self._socket.send(HELLO, zmq.NOBLOCK)
 
@@ -136,12 +136,12 @@ class Sender(ChannelSocket[Message]):
 class Receiver(ChannelSocket[Message]):
     """The receiving side of an acknowledged channel; it binds.
 
-    Receiving stores nothing. If a sender asks for the position while more was received than is stored, `asked` becomes
-    true; the owner then stores what it has, and calls `answer`. In a loop:
+    Receiving stores nothing. If a sender asks for the position while more was received than is stored,
+    `position_requested` becomes true; the owner then stores what it has, and calls `answer`. In a loop:
 
         message = receiver.receive(0.1)
         ...                                     # process the message
-        if receiver.asked:
+        if receiver.position_requested:
             receiver.answer(store())
         elif message is not None:
             receiver.acknowledge(position)
@@ -171,9 +171,9 @@ class Receiver(ChannelSocket[Message]):
         return self._window.taken
 
     @property
-    def asked(self) -> bool:
+    def position_requested(self) -> bool:
         """Whether a sender waits for `answer`."""
-        return self._window.asked
+        return self._window.position_requested
 
     @property
     def has_sender(self) -> bool:

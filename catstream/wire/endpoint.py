@@ -332,6 +332,6 @@ def notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | N
 
 
 def homes() -> list[Path]:
-    """Where private folders are made, the preferred one first; a pipeline started by a timer has no runtime folder."""
+    """The parent folders of private folders, preferred first; a pipeline started by a timer has no runtime folder."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     return [Path(home) for home in (runtime, tempfile.gettempdir()) if os.access(home, os.W_OK)]

@@ -118,10 +118,10 @@ class SendWindow:
         """Whether to send a hello now: messages wait, and the last reply or hello is PATIENCE seconds ago."""
         if not self._unacknowledged or now - self._last_reply <= PATIENCE:
             return False
-        self.asked(now)
+        self.position_requested(now)
         return True
 
-    def asked(self, now: float) -> None:
+    def position_requested(self, now: float) -> None:
         """Note that a hello was sent."""
         self._last_reply = now
 
@@ -203,7 +203,7 @@ class ReceiveWindow:
         self._gap_reported = -math.inf  # when a missing message was last reported
 
     @property
-    def asked(self) -> bool:
+    def position_requested(self) -> bool:
         """Whether a sender waits for `answer`: it asked for the position, and more was delivered than is stored."""
         return bool(self._asking)
 

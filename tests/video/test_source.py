@@ -249,7 +249,7 @@ def test_patterns_of_both_kinds(images, pattern):
     assert numbers(source) == list(range(7))
 
 
-def test_a_pattern_takes_only_the_names_it_fits(images):
+def test_a_pattern_selects_only_the_names_that_match_it(images):
     folder = images("walk", ["left1.png", "left2.png", "right1.png", "right2.png"])
     assert numbers(open_source(folder / "right%d.png")) == [2, 3]
 

@@ -114,7 +114,7 @@ def test_an_invalid_command_is_counted_and_the_next_one_is_answered(endpoint, ra
     assert responder.rejected == 1
 
 
-def test_a_flood_of_commands_is_bounded_and_those_that_were_dropped_may_come_again(endpoint, raw, until):
+def test_a_flood_of_commands_is_bounded_and_dropped_commands_may_be_repeated(endpoint, raw, until):
     with Responder(endpoint) as responder:
         heard = []
         for number in range(60):

@@ -141,11 +141,11 @@ class Histories(RuleBasedStateMachine):
         self.store()
         self.reply(self.receiver.acknowledge(self.position))
 
-    @precondition(lambda self: self.receiver.asked)
+    @precondition(lambda self: self.receiver.position_requested)
     @rule()
     def receiver_answers(self):
         self.reply(self.receiver.answer(self.store()))
-        assert not self.receiver.asked
+        assert not self.receiver.position_requested
 
     @rule()
     def receiver_dies(self):
@@ -206,7 +206,7 @@ class Histories(RuleBasedStateMachine):
             while self.to_receiver or self.to_sender:
                 if self.to_receiver:
                     self.frame_arrives(twice=False)
-                if self.receiver.asked:
+                if self.receiver.position_requested:
                     self.receiver_answers()
                 if self.to_sender:
                     self.reply_arrives(twice=False)
@@ -295,9 +295,9 @@ def test_a_position_request_is_answered_at_once_if_all_is_stored_and_otherwise_b
     assert window.hello(b"one") == [Reply(b"one", Position())]
     window.receive(b"one", 1, now=0.0)
     assert window.hello(b"one") == window.hello(b"two") == window.hello(b"one") == []
-    assert window.asked
+    assert window.position_requested
     assert window.answer(Position(1)) == [Reply(b"one", Position(1)), Reply(b"two", Position(1))]
-    assert not window.asked
+    assert not window.position_requested
 
 
 def test_of_a_flood_of_peers_that_ask_only_some_are_remembered():

@@ -37,7 +37,7 @@ def take(receiver, taken, *, store):
     if message is not None:
         taken.append(message.seq)
         receiver.acknowledge(Position(message.seq if store else 0))
-    if receiver.asked:
+    if receiver.position_requested:
         receiver.answer(Position(receiver.taken if store else 0))
 
 
@@ -205,7 +205,7 @@ def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
     assert taken == list(range(1, 10))
 
 
-def test_a_restarted_sender_accepts_a_later_position_than_it_asked_for(endpoint, until):
+def test_a_restarted_sender_accepts_a_position_that_advanced_after_its_request(endpoint, until):
     taken, found = [], []
     with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
         with Sender(RESULTS, endpoint, 10) as sender:
@@ -237,9 +237,9 @@ def test_a_receiver_stores_its_messages_in_a_separate_step_if_the_position_is_re
         def turn():
             found.append(sender.ask_position())
             assert receiver.receive(0) is None
-            if receiver.asked:
+            if receiver.position_requested:
                 receiver.answer(Position(len(taken), version=7))
-                assert not receiver.asked
+                assert not receiver.position_requested
 
         with Sender(RESULTS, endpoint, 10) as sender:
             for seq in range(1, 6):
@@ -420,8 +420,8 @@ def test_one_channel_receives_from_all_three_processes(endpoint, until):
 
 def test_the_end_is_received_like_any_other_message(endpoint, until):
     with Publisher(SAMPLES, endpoint) as samples:
-        samples.send(End(1, "the source came to its end"))
-        assert first(samples, endpoint, until).reason == "the source came to its end"
+        samples.send(End(1, "the source has ended"))
+        assert first(samples, endpoint, until).reason == "the source has ended"
 
 
 def test_the_last_message_arrives_even_if_its_sender_closes_at_once(endpoint, until):

@@ -129,11 +129,11 @@ def test_acknowledgements_are_sent_only_to_the_sender_of_the_accepted_message(en
         def turn():
             if (message := receiver.receive(0.01)) is not None:
                 taken.append(message.seq)
-            if receiver.asked:
+            if receiver.position_requested:
                 receiver.answer(Position())
             sender.poll(0)
 
-        sender.send(End(1, "the source came to its end"))
+        sender.send(End(1, "the source has ended"))
         until(lambda: taken == [1], turn)
         other.send(b"")
         until(lambda: other.poll(0), turn)
