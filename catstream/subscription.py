@@ -18,7 +18,7 @@ from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.wire.announced import Announcement
-from catstream.wire.channels import CHANNELS, TRACKS
+from catstream.wire.channels import CHANNELS, HEALTH, TRACKS
 from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.newest import Subscriber
 from catstream.wire.readable import readable
@@ -270,6 +270,10 @@ def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_T
     SilenceError
         If no report arrives in time.
     """
-    with subscribe(endpoint, "health", timeout=seconds, keys=keys) as health:
-        next(health, None)
-        return Endpoint.parse(health.endpoint, health.keys)
+    place, deadline = find(endpoint, keys), monotonic() + seconds
+    # Not a `Subscription`: it subscribes to the end of the tracks, too, and a replay waits for a subscriber to tracks.
+    with Subscriber(HEALTH, place) as reports:
+        while reports.receive(min(_CONNECTION_CHECK_SECONDS, seconds)) is None:
+            if monotonic() >= deadline:
+                raise SilenceError(f"no health arrived from {place} within {seconds:g} s: is a pipeline running there?")
+    return place

@@ -15,6 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
+import hypothesis
 import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
@@ -24,6 +25,9 @@ from catstream.threads import one_thread
 from catstream.video.demo import write
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
+
+hypothesis.settings.register_profile("catstream", deadline=None)  # no time is a pass mark
+hypothesis.settings.load_profile("catstream")
 
 #: Which of the processes that share the tests (pytest-xdist) this is, and of how many.
 WORKER, WORKERS = (
