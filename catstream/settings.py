@@ -68,7 +68,7 @@ class _Group:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(_Group):
-    """How a pipeline runs; nothing here changes what is learned from a frame."""
+    """How a pipeline runs: its endpoint, its pace, its seed, and how it reads the source."""
 
     group = "run"
 

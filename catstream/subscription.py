@@ -266,7 +266,7 @@ def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_T
     Raises
     ------
     ServiceError
-        If `endpoint` is empty and not exactly one pipeline runs.
+        If `endpoint` is empty and not exactly one pipeline runs, or the pipeline rejects the keys.
     SilenceError
         If no report arrives in time.
     """

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
@@ -60,7 +60,6 @@ def test_nothing_is_dropped_if_the_rank_fits(rng):
     assert_allclose(kept.T @ kept, exact.T @ exact, atol=ROUNDING * energy(rows))
 
 
-@settings(deadline=None)
 @given(matrices, st.integers(1, 14))
 def test_rows_are_orthogonal_and_the_strongest_is_first(rows, size):
     kept = reduce(rows, size).astype(np.float64)
@@ -70,7 +69,6 @@ def test_rows_are_orthogonal_and_the_strongest_is_first(rows, size):
     assert np.all(np.diff(np.diag(gram)) <= slack)
 
 
-@settings(deadline=None)
 @given(matrices, st.integers(1, 14))
 def test_every_direction_points_towards_the_sum(rows, size):
     assert np.all(reduce(rows, size) @ rows.sum(axis=0) >= -ROUNDING * energy(rows) - 1e-30)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -21,7 +21,6 @@ def grown(rows: np.ndarray, size: int = SIZE) -> CoresetTree:
     return tree
 
 
-@settings(deadline=None)
 @given(st.integers(0, 600), st.sampled_from([1, 2, 5, 16]))
 def test_a_sample_has_at_most_2n_rows(count, size):
     summary = grown(np.ones((count, 3)), size).sample()
@@ -65,7 +64,6 @@ def test_every_row_lies_within_the_span_of_the_data():
     assert np.all(rows.mean(axis=1) > 3)
 
 
-@settings(deadline=None)
 @given(st.integers(1, 20), st.integers(0, 2**32 - 1))
 def test_spreading_is_a_rotation(count, seed):
     rows = reduce(np.random.default_rng(seed).normal(size=(count, 12)).astype(np.float32), count)

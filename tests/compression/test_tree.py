@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -80,7 +80,6 @@ def test_a_stream_that_stands_still_loses_nothing(rng):
     assert_allclose(tree.nodes[0].rows[0], np.sqrt(len(rows)) * rows[0], rtol=ROUNDING)
 
 
-@settings(deadline=None)
 @given(counts, seeds)
 def test_sums_and_counts_are_exact(count, seed):
     rows = whole_numbers(count, seed)
@@ -89,7 +88,6 @@ def test_sums_and_counts_are_exact(count, seed):
     assert_array_equal(tree.sum, rows.sum(axis=0, dtype=np.float64) if count else 0)
 
 
-@settings(deadline=None)
 @given(counts, seeds)
 def test_a_node_stands_for_consecutive_rows(count, seed):
     rows = whole_numbers(count, seed)
@@ -102,7 +100,6 @@ def test_a_node_stands_for_consecutive_rows(count, seed):
 # --- what it costs ---------------------------------------------------------------------------------
 
 
-@settings(deadline=None)
 @given(st.integers(0, 300), seeds)
 def test_levels_strictly_fall_from_oldest_to_newest(count, seed):
     levels = [node.level for node in grown(whole_numbers(count, seed), size=4).nodes]
@@ -123,7 +120,6 @@ def test_memory_grows_with_the_logarithm_of_the_rows(rng):
 # --- the same, however it comes ------------------------------------------------------------------------
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(0, 20), max_size=12), seeds)
 def test_same_rows_same_bits_however_they_are_cut(cuts, seed):
     rows = np.random.default_rng(seed).normal(size=(sum(cuts), 33)).astype(np.float32)
@@ -148,7 +144,6 @@ def test_two_trees_merged_are_one_tree_within_the_bound(stream, subspaces, squar
     assert_within_the_bound(tree, stream, subspaces, squared_distance)
 
 
-@settings(deadline=None)
 @given(counts, counts, seeds)
 def test_merging_keeps_the_form_of_a_tree(count, other_count, seed):
     rows, others = whole_numbers(count, seed), whole_numbers(other_count, seed + 1)
@@ -198,7 +193,6 @@ def test_an_incomplete_file_is_an_error(stream, share, tmp_path):
         CoresetTree.load(path)
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4))
 def test_a_damaged_file_is_rejected_unless_the_tree_in_it_is_intact(tmp_path_factory, damage):
     path, tree = tmp_path_factory.mktemp("damaged") / "tree", grown(whole_numbers(14, seed=0), size=4)

@@ -12,9 +12,10 @@ from catstream.box import Box
 from catstream.messages import End, Features, Health, Model, Track
 from catstream.recording.file import Recording
 from catstream.recording.player import Player
-from catstream.wire.channels import TRACKS, TRAINING
+from catstream.subscription import wait_until_running
+from catstream.wire.channels import HEALTH, TRACKS, TRAINING
 from catstream.wire.codec import encode
-from catstream.wire.newest import Subscriber
+from catstream.wire.newest import Publisher, Subscriber
 
 
 @pytest.fixture
@@ -36,6 +37,23 @@ def playing(endpoint):
     for thread in threads:
         thread.join(30)
         assert not thread.is_alive()
+
+
+def test_waiting_for_a_pipeline_is_no_subscription_to_its_tracks(endpoint, until):
+    found = []
+    with Publisher(TRACKS, endpoint) as tracks, Publisher(HEALTH, endpoint, "detector") as health:
+        waits = threading.Thread(target=lambda: found.append(wait_until_running(str(endpoint), seconds=30)))
+        waits.start()
+
+        def turn():
+            health.send(Health("detector", time.time()))
+            tracks.serve_late_joiners()
+            assert not tracks.has_subscribers, "a replay that waits for a subscriber would begin now"
+            time.sleep(0.01)
+
+        until(lambda: found, turn)
+        waits.join(30)
+    assert str(found[0]) == str(endpoint)
 
 
 def test_a_subscriber_receives_all_recorded_messages_until_the_end(said, written, playing, endpoint):

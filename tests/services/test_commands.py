@@ -91,7 +91,7 @@ class Steering(RuleBasedStateMachine):
 
 
 TestSteering = Steering.TestCase
-TestSteering.settings = settings(max_examples=30, stateful_step_count=12, deadline=None)
+TestSteering.settings = settings(max_examples=30, stateful_step_count=12)
 
 
 def test_a_handler_that_is_released_forgets_that_it_was_stopped():

@@ -73,7 +73,7 @@ EXAMPLES = {
 }
 MESSAGES = pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
 ALL = tuple(KINDS.values())
-FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+FUZZ = settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
 
 
 def packed(kind: str, **changes: object) -> bytes:
