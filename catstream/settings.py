@@ -131,6 +131,14 @@ class CoresetSettings(_Group):
     share: Annotated[
         float, _about("n as a share of the video's frames, as in the paper (0: coreset.size is used).", ge=0, le=0.5)
     ] = 0.0
+    reduction: Annotated[
+        Literal["svd", "frequent-directions"],
+        _about(
+            "How rows are reduced: the tree of the paper, which keeps the n strongest directions of each node and "
+            "grows with the logarithm of the video's length (svd), or one frequent-directions sketch of n rows, whose "
+            "size is constant (frequent-directions)."
+        ),
+    ] = "svd"
     sample_interval: Annotated[
         int,
         _about(

@@ -12,7 +12,7 @@ import numpy as np
 from catstream import storage
 from catstream.arrays import Bool, Float32
 from catstream.box import Box
-from catstream.compression.tree import CoresetTree
+from catstream.compression.tree import TREES, CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.heads import HEADS, Head
 from catstream.messages import DetectorState, Features, Position, Sample, TrainingRows
@@ -22,7 +22,7 @@ from catstream.storage import Arrays, Metadata
 
 __all__ = ["Compressor"]
 
-_KIND = "compressor 2"  # and the version of what a checkpoint holds
+_KIND = "compressor 3"  # and the version of what a checkpoint holds
 _GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between
 
 
@@ -34,7 +34,7 @@ class Compressor:
 
     Parameters
     ----------
-    tree : class of its trees
+    tree : class of its trees; None for that of the setting `coreset.reduction`
 
     Attributes
     ----------
@@ -42,14 +42,14 @@ class Compressor:
     detector : the detector state in the last message: a restarted detector continues from it
     """
 
-    def __init__(self, settings: Settings, tree: type[CoresetTree] = CoresetTree) -> None:
+    def __init__(self, settings: Settings, tree: type[CoresetTree] | None = None) -> None:
         if settings.coreset.share:
             raise SettingsError(
                 f"coreset.share={settings.coreset.share:g} is a share of a video's length: "
                 "call Settings.for_length first, or set coreset.size"
             )
         self.settings = settings
-        self._tree = tree
+        self._tree = tree or TREES[settings.coreset.reduction]
         self.seq = 0
         self.frame = -1
         self.last_sample: Sample | None = None
@@ -69,7 +69,7 @@ class Compressor:
         """A compressor whose trees are made from a sample of an earlier stream, one node each; versions continue."""
         self = cls(settings)
         for name, summary in sample.trees.items():
-            self.trees[name] = CoresetTree.from_summary(summary, settings.coreset.size)
+            self.trees[name] = self._tree.from_summary(summary, settings.coreset.size)
         self.last_sample, self.centres, self._sampled_leaves = sample, sample.centres, self.leaves
         return self
 
@@ -198,6 +198,11 @@ class Compressor:
             self = cls.from_state(arrays, metadata, settings)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
+        if others := {tree.reduction for tree in self.trees.values()} - {settings.coreset.reduction}:
+            raise SettingsError(
+                f"{path} holds trees of coreset.reduction={max(others)}, the settings say "
+                f"{settings.coreset.reduction}: continue with the same settings"
+            )
         if sizes := {tree.size for tree in self.trees.values()} - {settings.coreset.size}:
             raise SettingsError(
                 f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset.size}: "
@@ -223,8 +228,8 @@ class Compressor:
         return self
 
     def _leaves(self) -> dict[str, int]:
-        """Leaves of each tree: the levels of its nodes are the binary digits of this number that are 1."""
-        return {name: sum(1 << node.level for node in tree.nodes) for name, tree in self.trees.items()}
+        """Number of leaves of each tree."""
+        return {name: tree.leaves for name, tree in self.trees.items()}
 
     def _follow(self, box: Box | None) -> None:
         """Append the centre of a box. Samples have complete blocks only, so that motion is trained once a block."""

@@ -1,12 +1,12 @@
 """The coreset tree: a summary of all inserted rows in logarithmic memory.
 
 Every n rows become a leaf. Whenever the two newest nodes have the same level, their 2n rows are reduced to n, and
-become a node one level up (paper, "Coreset Tree Implementation").
+become a node one level up (paper, "Coreset Tree Implementation"). `FrequentDirections` keeps a single node instead.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from catstream import storage
 from catstream.arrays import Float64
 from catstream.compression import sampling
 from catstream.compression.node import Node
-from catstream.compression.reduce import energy, reduce
+from catstream.compression.reduce import energy, reduce, shrink
 from catstream.errors import ProtocolError
 from catstream.messages import Summary
 from catstream.storage import Arrays, Metadata
@@ -22,7 +22,7 @@ from catstream.storage import Arrays, Metadata
 if TYPE_CHECKING:
     import os
 
-__all__ = ["CoresetTree"]
+__all__ = ["TREES", "CoresetTree", "FrequentDirections"]
 
 _LEVELS = 64  # no stream has 2**64 leaves
 
@@ -39,11 +39,17 @@ class CoresetTree:
     ----------
     size : number of rows of a node, n in the paper
 
+    Attributes
+    ----------
+    reduction : name of this kind of tree in the setting `coreset.reduction`
+
     >>> tree = CoresetTree(size=4)
     >>> tree.insert(np.eye(13, 5, dtype=np.float32))
     >>> [node.level for node in tree.nodes], len(tree.pending), tree.rows_seen
     ([1, 0], 1, 13)
     """
+
+    reduction: ClassVar[str] = "svd"
 
     def __init__(self, size: int) -> None:
         if size < 1:
@@ -53,7 +59,7 @@ class CoresetTree:
         self.pending = np.empty((0, 0), np.float32)
 
     @classmethod
-    def from_summary(cls, summary: Summary, size: int) -> CoresetTree:
+    def from_summary(cls, summary: Summary, size: int) -> Self:
         """A tree of one node with the weight and the mean of everything that a sample of another tree summarises.
 
         The count is rounded down to n * 2**level. If it is less than a leaf, the rows of the sample are pending rows.
@@ -82,6 +88,11 @@ class CoresetTree:
     def rows_seen(self) -> int:
         """Number of inserted rows, p in the paper."""
         return sum(node.count for node in self.nodes) + len(self.pending)
+
+    @property
+    def leaves(self) -> int:
+        """Number of leaves that were inserted: complete groups of `size` rows."""
+        return sum(node.count for node in self.nodes) // self.size
 
     @property
     def sum(self) -> np.ndarray:
@@ -123,6 +134,11 @@ class CoresetTree:
 
         The bound holds for both streams together. The other tree is not changed.
         """
+        if other.reduction != self.reduction:
+            raise ProtocolError(
+                f"a tree of coreset.reduction={self.reduction} cannot merge one of {other.reduction}: "
+                "build both with the same setting"
+            )
         if other.size != self.size:
             raise ProtocolError(
                 f"a tree of size {self.size} cannot merge one of size {other.size}: build both with the same size"
@@ -139,8 +155,8 @@ class CoresetTree:
         self.nodes = []
         while carried:
             node = carried.pop()
-            if carried and carried[-1].level == node.level:
-                carried.append(carried.pop().merged(node))
+            if carried and self._to_merge(carried[-1], node):
+                carried.append(self._merged(carried.pop(), node))
                 carried.sort(key=lambda node: -node.level)
             else:
                 self.nodes.insert(0, node)
@@ -160,8 +176,8 @@ class CoresetTree:
         """Write the tree to a safetensors file, atomically."""
         storage.write(path, *self.state())
 
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> CoresetTree:
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> CoresetTree:
         """Read a tree back, bit for bit.
 
         Raises
@@ -169,7 +185,7 @@ class CoresetTree:
         ProtocolError
             If the file is damaged, or not a consistent tree.
         """
-        return cls.from_state(*storage.read(path))
+        return CoresetTree.from_state(*storage.read(path))
 
     def state(self) -> tuple[Arrays, Metadata]:
         """Arrays and metadata that `from_state` restores."""
@@ -178,13 +194,13 @@ class CoresetTree:
             arrays[f"rows.{i}"] = node.rows
             arrays[f"sum.{i}"] = node.sum
         nodes = [{"level": node.level, "count": node.count, "energy": node.energy.hex()} for node in self.nodes]
-        return arrays, {"size": self.size, "nodes": nodes}
+        return arrays, {"reduction": self.reduction, "size": self.size, "nodes": nodes}
 
-    @classmethod
-    def from_state(cls, arrays: Arrays, metadata: Metadata) -> CoresetTree:
-        """The tree that `state` described; ProtocolError if it is something else."""
+    @staticmethod
+    def from_state(arrays: Arrays, metadata: Metadata) -> CoresetTree:
+        """The tree that `state` described, of its own class; ProtocolError if it is something else."""
         try:
-            tree = cls(int(metadata["size"]))
+            tree = TREES[metadata["reduction"]](int(metadata["size"]))
             for i, node in enumerate(metadata["nodes"]):
                 rows, total, whole = arrays[f"rows.{i}"], arrays[f"sum.{i}"], float.fromhex(node["energy"])
                 tree.nodes.append(Node(int(node["level"]), rows, int(node["count"]), total, whole))
@@ -196,9 +212,20 @@ class CoresetTree:
 
     def _push(self, node: Node) -> None:
         self.nodes.append(node)
-        while len(self.nodes) > 1 and self.nodes[-2].level == self.nodes[-1].level:
+        while len(self.nodes) > 1 and self._to_merge(self.nodes[-2], self.nodes[-1]):
             newer, older = self.nodes.pop(), self.nodes.pop()
-            self.nodes.append(older.merged(newer))
+            self.nodes.append(self._merged(older, newer))
+
+    def _to_merge(self, older: Node, newer: Node) -> bool:
+        """Whether two neighbouring nodes are merged into one."""
+        return older.level == newer.level
+
+    def _merged(self, older: Node, newer: Node) -> Node:
+        return older.merged(newer)
+
+    def _is_count(self, count: int, level: int) -> bool:
+        """Whether a node of this level can summarise so many rows."""
+        return count == self.size << level
 
     def _checked(self, rows: np.ndarray) -> np.ndarray:
         rows = np.asarray(rows, np.float32)
@@ -221,7 +248,40 @@ class CoresetTree:
             whole = node.rows.shape == (self.size, self.width) and node.sum.shape == (self.width,)
             if not whole or node.rows.dtype != np.float32 or node.sum.dtype != np.float64:
                 raise ValueError(f"a node of {node.rows.dtype} {node.rows.shape}")
-            if not 0 <= node.level < _LEVELS or node.count != self.size << node.level:
+            if not 0 <= node.level < _LEVELS or not self._is_count(node.count, node.level):
                 raise ValueError(f"a node of level {node.level} and {node.count} rows")
             if not (np.isfinite(node.rows).all() and np.isfinite(node.sum).all() and np.isfinite(node.energy)):
                 raise ValueError(f"a node of level {node.level} with numbers that are not finite")
+
+
+class FrequentDirections(CoresetTree):
+    """A sketch of a stream of rows in constant memory (Liberty 2013; Ghashami et al. 2016).
+
+    It keeps one node of n rows and fewer than n pending ones: each new leaf is stacked below the node, and the 2n rows
+    are shrunk to n, see `catstream.compression.reduce.shrink`. In addition to the bound of a tree, for every unit
+    vector y, `0 <= ||A y||^2 - ||C y||^2 <= c / (n + 1) <= ||A||^2 / (n + 1)`, for one stream and for merged ones. Here
+    c is `dropped_energy`, which is larger than that of a tree because all directions are shrunk.
+
+    >>> sketch = FrequentDirections(size=4)
+    >>> sketch.insert(np.eye(13, 5, dtype=np.float32))
+    >>> [node.count for node in sketch.nodes], len(sketch.pending), sketch.rows_seen
+    ([12], 1, 13)
+    """
+
+    reduction = "frequent-directions"
+
+    def _to_merge(self, *_: Node) -> bool:
+        return True
+
+    def _merged(self, older: Node, newer: Node) -> Node:
+        total, count = older.sum + newer.sum, older.count + newer.count
+        rows = shrink(np.vstack([older.rows, newer.rows]), self.size, towards=total)
+        return Node((count // self.size).bit_length() - 1, rows, count, total, older.energy + newer.energy)
+
+    def _is_count(self, count: int, level: int) -> bool:
+        leaves, rest = divmod(count, self.size)
+        return not rest and leaves.bit_length() == level + 1
+
+
+#: The class of a tree, by the value of the setting `coreset.reduction`.
+TREES: dict[str, type[CoresetTree]] = {kind.reduction: kind for kind in (CoresetTree, FrequentDirections)}

@@ -13,7 +13,7 @@ from catstream import storage
 from catstream.box import Box, Window
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
-from catstream.compression.tree import CoresetTree
+from catstream.compression.tree import TREES, CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.heads import APPEARANCE, EXTENT, HEADS
 from catstream.messages import DetectorState, Features, Motion, Sample, TrainingRows
@@ -22,9 +22,10 @@ from catstream.settings import Settings
 WIDTH = 20
 
 
-@pytest.fixture
-def settings() -> Settings:
-    return Settings(coreset={"size": 8, "sample_interval": 4}, search={"motion_frames": 10})
+@pytest.fixture(params=TREES)
+def settings(request: pytest.FixtureRequest) -> Settings:
+    coreset = {"size": 8, "sample_interval": 4, "reduction": request.param}
+    return Settings(coreset=coreset, search={"motion_frames": 10})
 
 
 @pytest.fixture
@@ -234,7 +235,7 @@ def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path)
 
 def test_a_tree_is_no_compressor(settings, tmp_path):
     Compressor(settings).trees["object"].save(tmp_path / "tree")
-    with pytest.raises(ServiceError, match="is of kind None, this catstream reads 'compressor 2'"):
+    with pytest.raises(ServiceError, match="is of kind None, this catstream reads 'compressor 3'"):
         Compressor.load(tmp_path / "tree", settings)
 
 
@@ -243,7 +244,7 @@ def test_a_checkpoint_of_another_version_is_rejected_with_one_line(settings, mes
     take(compressor, messages, 37)
     arrays, metadata = compressor.state()
     storage.write(path, arrays, metadata | {"kind": "compressor 1"})
-    with pytest.raises(ServiceError, match="is of kind 'compressor 1', this catstream reads 'compressor 2'") as error:
+    with pytest.raises(ServiceError, match="is of kind 'compressor 1', this catstream reads 'compressor 3'") as error:
         CheckpointStore(tmp_path).load(settings)
     assert "\n" not in str(error.value)
 
@@ -254,3 +255,12 @@ def test_a_state_of_another_coreset_size_is_rejected(settings, messages, tmp_pat
     compressor.save(tmp_path / "state")
     with pytest.raises(SettingsError, match="same settings"):
         Compressor.load(tmp_path / "state", settings.but({"coreset.size": 16}))
+
+
+def test_a_state_of_another_reduction_is_rejected(settings, messages, tmp_path):
+    compressor = Compressor(settings)
+    take(compressor, messages, 37)
+    compressor.save(tmp_path / "state")
+    (other,) = TREES.keys() - {settings.coreset.reduction}
+    with pytest.raises(SettingsError, match=r"holds trees of coreset.reduction=.*same settings"):
+        Compressor.load(tmp_path / "state", settings.but({"coreset.reduction": other}))

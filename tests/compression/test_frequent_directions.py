@@ -1,0 +1,124 @@
+"""Laws of the frequent-directions sketch: one node of n rows, and an error of at most c / (n + 1) in each direction.
+
+Let A be all rows, C the rows in memory, s_i the singular values of A, and c = ||A||^2 - ||C||^2. For every unit vector
+y and every k <= n (Ghashami et al. 2016),
+
+    0 <= ||A y||^2 - ||C y||^2 <= c / (n + 1) <= ||A||^2 / (n + 1),   and
+    max_y (||A y||^2 - ||C y||^2) <= (s_(k+1)^2 + s_(k+2)^2 + ...) / (n + 1 - k).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from catstream.compression.reduce import energy, shrink
+from catstream.compression.tree import CoresetTree, FrequentDirections
+from catstream.errors import ProtocolError
+
+SIZE = 16
+ROUNDING = 1e-5  # of float32, relative to ||A||^2
+
+counts = st.integers(0, 90)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def sketched(rows: np.ndarray, size: int = SIZE) -> FrequentDirections:
+    sketch = FrequentDirections(size)
+    sketch.insert(rows)
+    return sketch
+
+
+def in_memory(sketch: FrequentDirections) -> np.ndarray:
+    """All rows in memory, C."""
+    return np.vstack([*(node.rows for node in sketch.nodes), sketch.pending])
+
+
+def assert_within_the_bound(sketch: FrequentDirections, rows: np.ndarray) -> None:
+    kept, slack = in_memory(sketch).astype(np.float64), ROUNDING * energy(rows)
+    exact = rows.astype(np.float64)
+    errors = np.linalg.eigvalsh(exact.T @ exact - kept.T @ kept)  # of all unit vectors y: from the least to the largest
+    assert -slack <= errors[0]
+    assert errors[-1] <= sketch.dropped_energy / (SIZE + 1) + slack
+    assert sketch.dropped_energy <= energy(rows) * (1 + ROUNDING)
+    squares = np.linalg.svd(exact, compute_uv=False) ** 2
+    assert errors[-1] <= min(squares[k:].sum() / (SIZE + 1 - k) for k in range(SIZE + 1)) + slack
+
+
+def test_the_error_of_each_direction_stays_within_the_bound(stream):
+    assert_within_the_bound(sketched(stream), stream)
+
+
+def test_two_sketches_merged_are_one_sketch_within_the_bound(stream):
+    sketch, other = sketched(stream[:75]), sketched(stream[75:])
+    sketch.merge(other)
+    assert (sketch.rows_seen, len(sketch.nodes)) == (len(stream), 1)
+    assert_allclose(sketch.sum, stream.sum(axis=0, dtype=np.float64), atol=ROUNDING * len(stream))
+    assert_within_the_bound(sketch, stream)
+
+
+def test_a_rank_below_n_loses_nothing(rng):
+    rows = (rng.normal(size=(20 * SIZE, SIZE)) @ rng.normal(size=(SIZE, 60))).astype(np.float32)
+    assert_allclose(sketched(rows).dropped_energy, 0, atol=ROUNDING * energy(rows))
+
+
+@given(counts, seeds)
+def test_sums_counts_and_leaves_are_exact(count, seed):
+    rows = np.random.default_rng(seed).integers(-9, 10, (count, 6)).astype(np.float32)
+    sketch = sketched(rows, size=4)
+    assert (sketch.rows_seen, sketch.leaves) == (count, count // 4)
+    assert_array_equal(sketch.sum, rows.sum(axis=0, dtype=np.float64) if count else 0)
+
+
+def test_memory_does_not_grow_with_the_rows(rng):
+    sketch, sizes = FrequentDirections(4), set()
+    for _ in range(300):
+        sketch.insert(rng.normal(size=(4, 7)))
+        sizes.add(sketch.nbytes)
+    assert len(sizes) == 1
+
+
+@given(st.lists(st.integers(0, 20), max_size=12), seeds)
+def test_same_rows_same_bits_however_they_are_cut(cuts, seed):
+    rows = np.random.default_rng(seed).normal(size=(sum(cuts), 33)).astype(np.float32)
+    sketch = FrequentDirections(4)
+    for part in np.split(rows, np.cumsum(cuts)):
+        sketch.insert(part)
+    assert_array_equal(in_memory(sketch), in_memory(sketched(rows, size=4)))
+
+
+@pytest.mark.parametrize("count", [0, 3, 64, 103])
+def test_a_saved_sketch_continues_bit_for_bit_as_a_sketch(stream, count, tmp_path):
+    sketch = sketched(stream[:count])
+    sketch.save(tmp_path / "sketch")
+    loaded = CoresetTree.load(tmp_path / "sketch")
+    assert type(loaded) is FrequentDirections
+    for each in (sketch, loaded):
+        each.insert(stream[count:])
+    assert_array_equal(in_memory(loaded), in_memory(sketch))
+    assert (loaded.rows_seen, loaded.dropped_energy) == (sketch.rows_seen, sketch.dropped_energy)
+
+
+def test_a_count_that_is_not_that_of_its_level_is_rejected(stream):
+    arrays, metadata = sketched(stream).state()
+    metadata["nodes"][0]["count"] += 1
+    with pytest.raises(ProtocolError, match="not the state of a coreset tree"):
+        CoresetTree.from_state(arrays, metadata)
+
+
+def test_a_sketch_and_a_tree_are_not_merged(stream):
+    tree = CoresetTree(SIZE)
+    tree.insert(stream)
+    with pytest.raises(ProtocolError, match=r"coreset.reduction=svd cannot merge one of frequent-directions"):
+        tree.merge(sketched(stream))
+
+
+@given(seeds, st.integers(1, 7))
+def test_shrinking_takes_the_same_energy_from_each_direction(seed, size):
+    rows = np.random.default_rng(seed).normal(size=(8, 12)).astype(np.float32)
+    squares = np.linalg.svd(rows.astype(np.float64), compute_uv=False) ** 2
+    kept = np.sum(shrink(rows, size).astype(np.float64) ** 2, axis=1)
+    assert_allclose(kept, squares[:size] - squares[size], atol=ROUNDING * energy(rows))
