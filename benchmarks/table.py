@@ -19,7 +19,7 @@ from catstream.evaluation.provenance import provenance
 from catstream.settings import Settings
 from catstream.threads import one_thread
 
-__all__ = ["Table", "command", "publish", "text"]
+__all__ = ["Cell", "Table", "command", "publish", "text"]
 
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")
