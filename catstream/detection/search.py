@@ -24,6 +24,7 @@ __all__ = [
     "Detection",
     "ScoreMap",
     "find",
+    "fitted",
     "local",
     "non_maximum_suppression",
     "searched",
@@ -143,7 +144,7 @@ def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings:
     if settings.search.mode == "full":
         doubtful = not state.trusted or state.level == "lost"
         best = whole(frame, confident if doubtful else state.window, model)
-        best = _fitted(frame, best, state.first_window, model, settings.extent)
+        best = fitted(frame, best, state.first_window, model, settings.extent)
         return replace(best, redetected=not best.window.overlap(state.window))
     near = _near(frame, state.window, state, model, settings)
     level = belief.level_of(near.score, state.trusted, settings.belief)
@@ -177,7 +178,7 @@ def seek(
     )
     if state.sightings < settings.belief.sighting_frames:
         return state, best
-    found = _fitted(frame, best, best.window, model, settings.extent)
+    found = fitted(frame, best, best.window, model, settings.extent)
     return replace(state, window=best.window, first_window=best.window), replace(found, redetected=True)
 
 
@@ -219,12 +220,10 @@ def _sought(frame: Pyramid, window: Window, factors: tuple[float, ...], model: M
 def _near(frame: Pyramid, window: Window, state: DetectorState, model: Model, settings: Settings) -> Detection:
     """The best window near another, at its best size and aspect ratio."""
     best = local(frame, window, model, settings.search)
-    return _fitted(frame, best, state.first_window, model, settings.extent)
+    return fitted(frame, best, state.first_window, model, settings.extent)
 
 
-def _fitted(
-    frame: Pyramid, found: Detection, first: Window | None, model: Model, settings: ExtentSettings
-) -> Detection:
+def fitted(frame: Pyramid, found: Detection, first: Window | None, model: Model, settings: ExtentSettings) -> Detection:
     """A detection moved by at most a cell, at the size and then the aspect ratio with the highest value.
 
     The value is the score, plus `weight` times what the extent head says, less the cost of the change.

@@ -67,17 +67,35 @@ class Cells:
         return features
 
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
-        """Score of every window, float32 (rows - 7, columns - 7): one matrix product and shifted sums.
+        """Score of every window, float32 (rows - 7, columns - 7).
 
         Parameters
         ----------
         weights : float32 (d,)
         """
+        scores = self._places(weights, bias)
+        colours.add_scores(self.shades, weights[COLOURS], scores)
+        return scores
+
+    def respond_above(self, weights: np.ndarray, bias: float, least: float) -> np.ndarray:
+        """The same scores, but -inf for every window whose score is below `least`.
+
+        The colours of a window are not counted if its score would be below `least` with any histogram of colours: this
+        takes a third of the time of `respond` if few windows score that high.
+        """
+        reach = least - colours.highest_score(weights[COLOURS])
+        scores = self._places(weights, bias)
+        hopeless = scores < reach
+        colours.add_scores(self.shades, weights[COLOURS], scores, reach)
+        scores[hopeless | (scores < least)] = -np.inf
+        return scores
+
+    def _places(self, weights: np.ndarray, bias: float) -> np.ndarray:
+        """Score of every window without its histogram of colours: one matrix product and shifted sums."""
         rows, columns = self.shape
         parts = self.grid.reshape(-1, CHANNELS) @ weights[:_PLACES].reshape(-1, CHANNELS).T
         scores = np.full((rows - WINDOW + 1, columns - WINDOW + 1), bias, np.float32)
         _add_shifted(parts.reshape(rows, columns, WINDOW * WINDOW), scores)
-        colours.add_scores(self.shades, weights[COLOURS], scores)
         return scores
 
 

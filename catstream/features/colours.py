@@ -17,7 +17,7 @@ from catstream.arrays import Float32, UInt8, UInt16
 from catstream.features.compiled import kernel
 from catstream.features.hog import CELL, WINDOW
 
-__all__ = ["SHADES", "SIDE", "add_scores", "histogram", "shades"]
+__all__ = ["SHADES", "SIDE", "add_scores", "highest_score", "histogram", "shades"]
 
 SIDE = CELL // 2  #: shades a cell is wide and high
 _LIGHT, _CHROMA, _CHROMA_STEP = 8, 6, 10  # levels of lightness, of a and of b; Lab units from one of these to the next
@@ -26,6 +26,7 @@ SHADES = _LIGHT * _CHROMA * _CHROMA  #: how many are distinguished
 _WEIGHT = 3.0  # length of a histogram as features; that of a window's HOG is about 9
 _EDGE = SIDE  # shades of a window's first cell, which is not counted
 _COUNTED = WINDOW * SIDE - 2 * _EDGE  # shades along a side of the middle
+_LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with infinity
 
 
 def shades(image: np.ndarray) -> np.ndarray:
@@ -52,17 +53,27 @@ def histogram(found: np.ndarray, row: int, column: int, features: np.ndarray) ->
     _histogram(found, row * SIDE + _EDGE, column * SIDE + _EDGE, _ROOTS, features)
 
 
-def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray) -> None:
-    """Add what the histogram of each window scores, in constant time a window.
+def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray, least: float = _LOWEST) -> None:
+    """Add the score of the histogram of each window, in constant time a window.
 
     Parameters
     ----------
     found : uint16, as `shades` gives them
     weights : float32 (SHADES,)
     scores : float32 (rows - 7, columns - 7), of the window whose first cell is there
+    least : windows with a lower score are left out, and their score stays as it is
     """
     # Weights that came over the wire cannot be written, and a kernel takes none of those.
-    _add_scores(found, np.require(weights, requirements="W"), _STEPS, scores)
+    _add_scores(found, np.require(weights, requirements="W"), _STEPS, least, scores)
+
+
+def highest_score(weights: np.ndarray) -> float:
+    """The highest score that the histogram of any window can have.
+
+    A histogram has no negative features and a constant length, so this is the length times that of the positive weights
+    (Cauchy-Schwarz).
+    """
+    return _WEIGHT * float(np.linalg.norm(np.maximum(weights, 0)))
 
 
 def _table() -> np.ndarray:
@@ -107,29 +118,34 @@ def _histogram(found: UInt16, top: int, left: int, roots: Float32, features: Flo
         features[shade] = roots[counts[shade]]
 
 
-@kernel("void(uint16[:,::1], float32[::1], float32[::1], float32[:,::1])")
-def _add_scores(found: UInt16, weights: Float32, steps: Float32, scores: Float32) -> None:
+@kernel("void(uint16[:,::1], float32[::1], float32[::1], float32, float32[:,::1])")
+def _add_scores(found: UInt16, weights: Float32, steps: Float32, least: float, scores: Float32) -> None:
     counts = np.empty(len(weights), np.int64)
     for row in range(scores.shape[0]):
-        for shade in range(len(counts)):
-            counts[shade] = 0
-        total = 0.0
-        for y in range(row * SIDE + _EDGE, row * SIDE + _EDGE + _COUNTED):
-            for x in range(_EDGE, _EDGE + _COUNTED):
-                shade = found[y, x]
-                total += weights[shade] * steps[counts[shade]]
-                counts[shade] += 1
-        scores[row, 0] += total
-        for column in range(1, scores.shape[1]):
-            # The window moves on by a cell: its first column of shades goes, the one beside it comes.
+        top, last, total = row * SIDE + _EDGE, -2, 0.0
+        for column in range(scores.shape[1]):
+            if scores[row, column] < least:
+                continue
             left = column * SIDE
-            for y in range(row * SIDE + _EDGE, row * SIDE + _EDGE + _COUNTED):
-                for x in range(left, left + SIDE):
-                    shade = found[y, x]
-                    counts[shade] -= 1
-                    total -= weights[shade] * steps[counts[shade]]
-                for x in range(left + _COUNTED, left + _COUNTED + SIDE):
-                    shade = found[y, x]
-                    total += weights[shade] * steps[counts[shade]]
-                    counts[shade] += 1
+            if last < column - 1:
+                for shade in range(len(counts)):
+                    counts[shade] = 0
+                total = 0.0
+                for y in range(top, top + _COUNTED):
+                    for x in range(left + _EDGE, left + _EDGE + _COUNTED):
+                        shade = found[y, x]
+                        total += weights[shade] * steps[counts[shade]]
+                        counts[shade] += 1
+            else:
+                # The window moves by one cell: its first column of shades leaves, and the one beside it enters.
+                for y in range(top, top + _COUNTED):
+                    for x in range(left, left + SIDE):
+                        shade = found[y, x]
+                        counts[shade] -= 1
+                        total -= weights[shade] * steps[counts[shade]]
+                    for x in range(left + _COUNTED, left + _COUNTED + SIDE):
+                        shade = found[y, x]
+                        total += weights[shade] * steps[counts[shade]]
+                        counts[shade] += 1
+            last = column
             scores[row, column] += total

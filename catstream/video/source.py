@@ -42,13 +42,24 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.stream import Stream
 
-__all__ = ["ALL_FRAMES", "image_files", "is_live", "natural_order", "open_source", "without_scheme"]
+__all__ = [
+    "ALL_FRAMES",
+    "IMAGES",
+    "VIDEOS",
+    "image_files",
+    "is_live",
+    "natural_order",
+    "open_source",
+    "read_image",
+    "without_scheme",
+]
 
 #: All frames of a source.
 ALL_FRAMES = slice(None)
 
-_IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
-_VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
+#: Suffixes of the files that are read as images, and as videos.
+IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
+VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
 _FOLDERS = ("img", "imgs", "color", "rgb")
 _EXPECTED = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
 _LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+")
@@ -225,7 +236,7 @@ def image_files(path: Path) -> list[Path]:
         If there are no images.
     """
     if path.is_dir():
-        files = [file for file in path.iterdir() if file.suffix.lower() in _IMAGES]
+        files = [file for file in path.iterdir() if file.suffix.lower() in IMAGES]
     elif number := re.search(r"%0?(\d*)d", path.name):
         digits = rf"\d{{{number[1]},}}" if number[1] else r"\d+"
         name = re.escape(path.name[: number.start()]) + digits + re.escape(path.name[number.end() :])
@@ -234,7 +245,7 @@ def image_files(path: Path) -> list[Path]:
         files = list(path.parent.glob(path.name))
     files = [file for file in files if not file.name.startswith(".")]
     if not files:
-        kinds = ", ".join(sorted(suffix[1:] for suffix in _IMAGES))
+        kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGES))
         raise VideoError(f"there are no images at {str(path)!r}: {_EXPECTED} (images are {kinds})")
     return sorted(files, key=natural_order)
 
@@ -247,9 +258,9 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
 def _open_folder(path: Path, images: Callable[..., Source], video: Callable[..., Source]) -> Source:
     name = path.resolve().name
     for folder in (*(path / inner for inner in _FOLDERS), path):
-        if folder.is_dir() and any(file.suffix.lower() in _IMAGES for file in folder.iterdir()):
+        if folder.is_dir() and any(file.suffix.lower() in IMAGES for file in folder.iterdir()):
             return images(name, image_files(folder))
-    videos = sorted(file for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
+    videos = sorted(file for file in path.iterdir() if file.suffix.lower() in VIDEOS)
     if len(videos) == 1:
         return video(videos[0])
     content = f"{len(videos)} videos" if videos else "neither images nor a video"
@@ -264,7 +275,7 @@ def _open_images(name: str, files: list[Path], *, part: slice, start: int, rate:
 def _read_images(files: list[Path], wanted: range, start: int, rate: float) -> Iterator[Frame]:
     shape: tuple[int, ...] | None = None
     for count, number in enumerate(wanted[start:], start):
-        image = _read_image(files[number])
+        image = read_image(files[number])
         if image is None:
             raise VideoError(f"cannot read the image {str(files[number])!r} (frame {number}): replace or remove it")
         if shape is not None and image.shape != shape:
@@ -276,7 +287,7 @@ def _read_images(files: list[Path], wanted: range, start: int, rate: float) -> I
         yield Frame(count, number / rate, image)
 
 
-def _read_image(path: Path) -> np.ndarray | None:
+def read_image(path: Path) -> np.ndarray | None:
     """Return an image as uint8 (h, w, 3), or None if it cannot be read; OpenCV's warnings are suppressed."""
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

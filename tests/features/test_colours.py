@@ -52,3 +52,20 @@ def test_scores_are_added_for_each_window(rng, writeable):
     colours.add_scores(colours.shades(image), weights, scores)
     expected = [[7 + colour_features(image, row, column) @ weights for column in range(9)] for row in range(5)]
     np.testing.assert_allclose(scores, expected, atol=1e-4)
+
+
+def test_no_histogram_scores_higher_than_the_highest_score(rng):
+    image = np.repeat(np.repeat(rng.integers(0, 256, (16, 16, 3), np.uint8), 4, axis=0), 4, axis=1)
+    for weights in rng.normal(size=(20, SHADES)).astype(np.float32):
+        assert colour_features(image) @ weights <= colours.highest_score(weights)
+    own = colour_features(image)
+    assert own @ own == pytest.approx(colours.highest_score(own), rel=1e-5)
+
+
+def test_windows_with_a_lower_score_are_left_out(rng):
+    image = np.repeat(np.repeat(rng.integers(0, 256, (24, 32, 3), np.uint8), 4, axis=0), 4, axis=1)
+    weights, given = rng.normal(size=SHADES).astype(np.float32), rng.normal(size=(5, 9)).astype(np.float32)
+    every, some = given.copy(), given.copy()
+    colours.add_scores(colours.shades(image), weights, every)
+    colours.add_scores(colours.shades(image), weights, some, 0.0)
+    np.testing.assert_allclose(some, np.where(given < 0, given, every), atol=1e-4)
