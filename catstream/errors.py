@@ -11,6 +11,7 @@ __all__ = [
     "CommandRejectedError",
     "FrameError",
     "MissingExtraError",
+    "ObjectError",
     "ProtocolError",
     "RecordingError",
     "ServiceError",
@@ -35,6 +36,10 @@ class MissingExtraError(CatstreamError, ImportError):
 
 class BoxError(CatstreamError, ValueError):
     """A box is outside the frame, far larger than the frame, has no area, or is not four finite numbers."""
+
+
+class ObjectError(CatstreamError, ValueError):
+    """The name of an object is not valid, is in use, or belongs to no object; or there are too many objects."""
 
 
 class FrameError(CatstreamError, ValueError):

@@ -1,4 +1,4 @@
-"""The job of a run: its source, object, settings and files.
+"""The job of a run: its source, objects, settings and files.
 
 Whoever starts a run writes its job to one file, and every process of the run reads it there. A run with a state
 folder keeps a copy of the job in that folder, from which it is resumed.
@@ -14,6 +14,7 @@ from typing import Any
 from catstream import storage
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.names import check_count, listed
 from catstream.settings import Settings
 from catstream.storage import Metadata
 
@@ -52,8 +53,8 @@ class Job:
     """Everything that the processes of a run have to agree on.
 
     source    the text that `catstream.video.source.open_source` takes
-    box       the object in the first frame; None if the model finds it, or if a command will give the box
-    model     file that `catstream save` wrote, in which case the object is searched for
+    boxes     the objects in the first frame, by name; without a box or a model, the run waits for the box of a command
+    models    file that `catstream save` wrote of each object that is searched for, by name
     part      the frames of the source that are followed
     settings  all settings
     size      width and height of a frame, None if that is not known yet
@@ -71,8 +72,8 @@ class Job:
     """
 
     source: str = field(default="", repr=False)  # it may contain a password
-    box: Box | None = None
-    model: Path | None = None
+    boxes: dict[str, Box] = field(default_factory=dict)
+    models: dict[str, Path] = field(default_factory=dict)
     part: slice = field(default_factory=lambda: slice(None))
     settings: Settings = field(default_factory=Settings)
     size: tuple[int, int] | None = None
@@ -86,8 +87,12 @@ class Job:
     since: float | None = None
 
     def __post_init__(self) -> None:
-        if self.box is not None and self.model is not None:
-            raise SettingsError("a box gives the position of the object, and a model searches for it: give one of them")
+        if both := self.boxes.keys() & self.models.keys():
+            raise SettingsError(
+                f"{listed(sorted(both))}: a box gives the position of an object, and a model searches for it: give one of "
+                "them"
+            )
+        check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
 
     def save(self, folder: Path) -> Path:
         """Write the job to a folder, readable by its owner only: the source may contain a password.
@@ -171,6 +176,8 @@ def _plain(value: object) -> object:
             return {name: _plain(item) for name, item in asdict(value).items()}
         case tuple():
             return [_plain(item) for item in value]
+        case dict():
+            return {name: _plain(item) for name, item in value.items()}
         case _:
             return value
 
@@ -181,8 +188,8 @@ def _path(text: str | None) -> Path | None:
 
 #: Functions that convert a JSON value back to the type of a field, for fields of other types.
 _READERS: dict[str, Callable[[Any], object]] = {
-    "box": lambda box: box and Box(*box),
-    "model": _path,
+    "boxes": lambda boxes: {name: Box(*box) for name, box in boxes.items()},
+    "models": lambda models: {name: Path(file) for name, file in models.items()},
     "part": lambda part: slice(*part),
     "settings": Settings.from_values,
     "size": lambda size: size and tuple(size),

@@ -6,8 +6,8 @@ A message is frozen and complete by itself. In one process the stages pass the o
 The annotations are the schema (see `catstream.schema`), and the docstrings describe the fields. The checks, the files
 of `catstream.packing`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
 
-`d` is the length of a feature row (`catstream.features.cells.row_length`), `n`
-the coreset size, frames count from 0.
+`d` is the length of a feature row (`catstream.features.cells.row_length`), `n` the coreset size, frames count from 0.
+The objects of a stream have names (`catstream.names`); an object that is alone may have the name "".
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from catstream.box import Box, Window
 from catstream.heads import GROUPS, HEADS
-from catstream.schema import Array, Bytes, Named, OnlyWith, Whole
+from catstream.schema import Array, ByObject, Bytes, Name, Named, OnlyWith, Whole
 
 __all__ = [
     "Answer",
@@ -33,6 +33,8 @@ __all__ = [
     "Level",
     "Model",
     "Motion",
+    "ObjectFeatures",
+    "ObjectPosition",
     "Position",
     "Preview",
     "Run",
@@ -41,6 +43,7 @@ __all__ = [
     "Stored",
     "Summary",
     "Track",
+    "Tracks",
     "TrainingRows",
     "Verb",
 ]
@@ -49,7 +52,10 @@ State = Literal["bootstrapping", "present", "absent"]
 
 Level = Literal["lost", "redetected", "weak", "confident"]
 
-Verb = Literal["set-box", "pause", "resume", "save", "stop"]
+Verb = Literal["set-box", "forget", "pause", "resume", "save", "stop"]
+
+#: The name of an object.
+ObjectName = Annotated[str, Name()]
 
 _COLUMNS = {name: head.more_columns for name, head in HEADS.items()}
 _REQUIRED = frozenset(name for name, head in HEADS.items() if head.adds_to_score)
@@ -130,21 +136,15 @@ class TrainingRows:
 
 
 @dataclass(frozen=True, slots=True)
-class Features:
-    """The training rows of one frame, detector -> compressor.
+class ObjectFeatures:
+    """The part of `Features` for one object.
 
-    seq       number of the message: 1, 2, 3 ... without a gap, one message a frame
-    frame     number of the frame that the rows were cut from
-    time      seconds since the start of the source, or of the run if the source is live
     box       the object's box, None if it was not found
     training  training rows of each group of `catstream.heads`; a group without rows is left out
     detector  state of the detector after this frame, from which a restarted detector continues; None before it has one
-    begins    whether a new object is tracked from this frame on: the trees begin anew
+    begins    whether a new object is tracked under this name from this frame on: its trees begin anew
     """
 
-    seq: int
-    frame: int
-    time: float
     box: Box | None
     training: Annotated[dict[str, TrainingRows], Named(dict.fromkeys(GROUPS, 0))] = field(default_factory=dict)
     detector: DetectorState | None = None
@@ -152,39 +152,70 @@ class Features:
 
 
 @dataclass(frozen=True, slots=True)
+class Features:
+    """The training rows of one frame, detector -> compressor.
+
+    seq      number of the message: 1, 2, 3 ... without a gap, one message a frame
+    frame    number of the frame that the rows were cut from
+    time     seconds since the start of the source, or of the run if the source is live
+    objects  the part of each object that is tracked, by name; the trees of all other objects are dropped
+    """
+
+    seq: int
+    frame: int
+    time: float
+    objects: Annotated[dict[str, ObjectFeatures], ByObject()]
+
+
+@dataclass(frozen=True, slots=True)
 class Stored:
     """Acknowledges the messages of an acknowledged channel, receiver -> sender.
 
-    seq      all messages up to this one are stored, except for the last `unsaved` ones: the sender drops them
-    taken    all messages up to this one have been processed by the receiver
-    version  version of the newest Sample, 0 before the first
-    unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    seq       all messages up to this one are stored, except for the last `unsaved` ones: the sender drops them
+    taken     all messages up to this one have been processed by the receiver
+    versions  version of the newest Sample of each object that has one, by name
+    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """
 
     seq: int
     taken: int
-    version: int = 0
+    versions: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
     unsaved: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectPosition:
+    """The part of `Position` for one object.
+
+    box       box in which it was last found
+    version   version of its newest Sample, 0 before the first
+    detector  its detector state of message `seq`, None if it had none
+    """
+
+    box: Box | None = None
+    version: int = 0
+    detector: DetectorState | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
     """The position at which a stream continues: the answer of a receiver to each new connection.
 
-    seq       the last message that is stored, 0 in a new stream: the sender continues with the next one
-    frame     number of its frame
-    box       box in which the object was last found, None in a new stream
-    version   version of the newest Sample, 0 before the first
-    detector  the detector state of message `seq`, None if it had none
-    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    seq      the last message that is stored, 0 in a new stream: the sender continues with the next one
+    frame    number of its frame
+    objects  the part of each object of that message, by name; empty in a new stream
+    unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """
 
     seq: int = 0
     frame: int = 0
-    box: Box | None = None
-    version: int = 0
-    detector: DetectorState | None = None
+    objects: Annotated[dict[str, ObjectPosition], ByObject()] = field(default_factory=dict)
     unsaved: int = 0
+
+    @property
+    def versions(self) -> dict[str, int]:
+        """Version of the newest Sample of each object that has one, by name."""
+        return {name: each.version for name, each in self.objects.items() if each.version}
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,18 +236,20 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A training sample of all frames so far, compressor -> trainer; only the newest is used.
+    """A training sample of all frames so far, compressor -> trainer; only the newest of each object is used.
 
-    version  1, 2, 3 ... in the order in which they are made
+    version  1, 2, 3 ... in the order in which the samples of all objects are made
     frame    number of the newest frame that it summarises
     trees    the summary of each tree of `catstream.heads`; a tree without a leaf is left out
     centres  centre of the object in each frame of the last complete block of frames, pixels; NaN while absent
+    object   name of the object
     """
 
     version: int
     frame: int
     trees: Annotated[dict[str, Summary], Named(_COLUMNS, _REQUIRED)]
     centres: Annotated[np.ndarray, Array("float64", ("m", 2), may_be_nan=True)]
+    object: ObjectName = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,6 +263,7 @@ class Model:
     motion   parameters of the Kalman filter, None until there are enough centres for EM
     heads    vector of each head that does not add to the score, once it is trained. The best fitting size and aspect
              at a place maximise (weights + heads["extent"]) @ row
+    object   name of the object
     """
 
     version: int
@@ -240,16 +274,17 @@ class Model:
     heads: Annotated[dict[str, Annotated[np.ndarray, Array("float32", ("d",))]], Named(_NOT_IN_THE_SCORE)] = field(
         default_factory=dict
     )
+    object: ObjectName = ""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Track:
-    """The object in one frame, detector -> anyone.
+    """An object in one frame, detector -> anyone.
 
     Attributes
     ----------
     seq : int
-        1, 2, 3 ...: a gap means that this subscriber missed messages.
+        1, 2, 3 ... for each object, from the run's first frame on: a gap means that this subscriber missed messages.
     frame : int
         Number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted.
     time : float
@@ -265,6 +300,8 @@ class Track:
         Version of the model that scored it, 0 before the first.
     pts : float or None
         Time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file.
+    object : str
+        Name of the object; "" if it has none.
 
     Examples
     --------
@@ -280,11 +317,13 @@ class Track:
     score: float
     model_version: int
     pts: float | None = None
+    object: ObjectName = ""
 
     def __repr__(self) -> str:
+        name = f"object={self.object!r}, " if self.object else ""
         box = None if self.box is None else f"({', '.join(f'{side:.1f}' for side in self.box)})"
         return (
-            f"Track(frame={self.frame}, time={self.time:.3f}, state={self.state!r}, box={box}, score={self.score:.2f}, "
+            f"Track({name}frame={self.frame}, time={self.time:.3f}, state={self.state!r}, box={box}, score={self.score:.2f}, "
             f"model_version={self.model_version})"
         )
 
@@ -307,7 +346,22 @@ class Track:
             "score": float(self.score),
             "model_version": int(self.model_version),
             "pts": None if self.pts is None else float(self.pts),
+            "object": self.object,
         }
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """The tracks of one frame, detector -> the owner of the run.
+
+    seq     number of the message: 1, 2, 3 ... without a gap, one message a frame
+    frame   number of the frame
+    tracks  the track of each object, by name
+    """
+
+    seq: int
+    frame: int
+    tracks: Annotated[dict[str, Track], ByObject()]
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,14 +371,14 @@ class Preview:
     frame   number of the frame
     width   width of the frame in pixels; the picture may be smaller
     height  height of the frame in pixels
-    box     box of the object, in pixels of the frame; None while it is absent, or before a box was given
+    boxes   box of each object that is present, in pixels of the frame, by name
     jpeg    the picture as a JPEG file, with the frame's aspect ratio
     """
 
     frame: int
     width: Annotated[int, Whole(low=1)]
     height: Annotated[int, Whole(low=1)]
-    box: Box | None
+    boxes: Annotated[dict[str, Box], ByObject()]
     jpeg: Annotated[bytes, Bytes("a JPEG", longest=1 << 19, begin=b"\xff\xd8\xff")]
 
 
@@ -337,6 +391,7 @@ class Health:
     counters  counters of the process, by name
     trouble   description of a problem of the process, empty if there is none
     source    the video source without user and password; empty except for the detector
+    objects   counters of each object, by name
     """
 
     process: str
@@ -344,6 +399,7 @@ class Health:
     counters: dict[str, float] = field(default_factory=dict)
     trouble: str = ""
     source: str = ""
+    objects: Annotated[dict[str, dict[str, float]], ByObject()] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -383,17 +439,19 @@ class End:
 class Command:
     """A control command to a running pipeline, anyone -> detector.
 
-    id    unique for each command: a command that is received twice is executed once and answered twice
-    verb  the action
-    box   for "set-box": box of the object in the next frame that is tracked, in pixels; during a pause of a file, in
-          the frame that is held
-    keep  for "set-box": whether it is the same object, so that everything learned about it is kept
+    id      unique for each command: a command that is received twice is executed once and answered twice
+    verb    the action
+    box     for "set-box": box of the object in the next frame that is tracked, in pixels; during a pause of a file, in
+            the frame that is held
+    keep    for "set-box": whether it is the same object, so that everything learned about it is kept
+    object  for "set-box", "forget" and "save": name of the object
     """
 
     id: str
     verb: Verb
     box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
     keep: bool = False
+    object: ObjectName = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,6 +464,7 @@ class Answer:
     frame    number of the newest frame that was processed
     box      last box of the object, None if there is none
     version  version of the newest model of this object, 0 before the first
+    object   name of the object that the command was for
     """
 
     id: str
@@ -414,3 +473,4 @@ class Answer:
     frame: int = 0
     box: Box | None = None
     version: int = 0
+    object: ObjectName = ""

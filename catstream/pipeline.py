@@ -1,7 +1,7 @@
 """The pipeline: detector, compressor and trainer as processes of this machine, and their tracks in order.
 
-for track in catstream.Pipeline("walk.mp4", (120, 80, 64, 48)):
-    print(track.frame, track.state, track.box)
+for track in catstream.Pipeline("walk.mp4", {"anna": (120, 80, 64, 48), "ben": (300, 90, 60, 150)}):
+    print(track.object, track.frame, track.state, track.box)
 """
 
 from __future__ import annotations
@@ -11,19 +11,20 @@ import logging
 import os
 import time
 import warnings
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
-from catstream.box import Box
 from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
 from catstream.features import COMPILING
 from catstream.job import Job, Results
 from catstream.learned import Learned
-from catstream.messages import End, Health, Position, Track
+from catstream.messages import End, Health, ObjectPosition, Position, Track, Tracks
+from catstream.names import UNNAMED, Boxes, boxes_by_name, check_name
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.state import began, learned, locked, position
@@ -42,13 +43,16 @@ _EXIT_SECONDS = 12.0  # time for the detector to exit after the end of the strea
 _TURN_SECONDS = 0.01
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
+#: Files of saved models: of one object without a name, or by name.
+Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
+
 _CLOSED = ExitStack()  # marks a pipeline that was closed
 
 _log = logging.getLogger(__name__)
 
 
 class Pipeline:
-    """Tracks an object with three processes, and yields exactly one `Track` for each frame.
+    """Tracks objects with three processes, and yields exactly one `Track` for each object and frame.
 
     Iterate over it with `for` or `async for`: the processes are started, and stopped at the end of the loop. Use it in
     a `with` or `async with` to read its endpoint and its counters too, and to iterate over it in parts. A pipeline runs
@@ -63,13 +67,13 @@ class Pipeline:
     source : str
         A video file, a folder of images, a pattern such as `images/%05d.png`, a camera (`0`), or a stream
         (`rtsp://...`).
-    box : str or four numbers
-        x, y, w, h of the object in the first frame, in pixels: `(120, 80, 64, 48)` or `"120,80,64,48"`. Without a
-        box or a model, the run waits for the box that `catstream.control` gives: a file stays at its first frame, a
-        live source continues.
+    box : str, four numbers, or a mapping of names to such boxes
+        x, y, w, h of the object in the first frame, in pixels: `(120, 80, 64, 48)` or `"120,80,64,48"`; of several
+        objects by name: `{"anna": (120, 80, 64, 48), "ben": (300, 90, 60, 150)}`. Without a box or a model, the run
+        waits for the box that `catstream.control` gives: a file stays at its first frame, a live source continues.
     settings : Settings or mapping of str
         The settings that differ from the defaults, or from those of the run that is resumed.
-    model : path
+    model : path, or a mapping of names to paths
         File that `catstream save` wrote. The object is searched for, and absent until it is found; learning continues
         from the file.
     part : slice
@@ -104,8 +108,9 @@ class Pipeline:
 
     Raises
     ------
-    BoxError, VideoError
-        From the constructor, if the box is not in the frame or the source cannot be read.
+    BoxError, ObjectError, VideoError
+        From the constructor, if a box is not in the frame, a name is not valid, there are too many objects, or the source
+        cannot be read.
     RecordingError
         From the constructor, if the file to record to exists.
     SettingsError
@@ -122,10 +127,10 @@ class Pipeline:
     def __init__(
         self,
         source: str | None = None,
-        box: str | Iterable[float] | None = None,
+        box: Boxes | None = None,
         settings: Settings | Mapping[str, object] | None = None,
         *,
-        model: str | os.PathLike[str] | None = None,
+        model: Models | None = None,
         part: slice = ALL_FRAMES,
         record: str | os.PathLike[str] | None = None,
         state: str | os.PathLike[str] | None = None,
@@ -139,7 +144,7 @@ class Pipeline:
         self._resumed_job = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         given = settings.changed() if isinstance(settings, Settings) else settings or {}
-        job = _with_object(self._resumed_job or Job(started=time.time()), box, model)
+        job = _with_objects(self._resumed_job or Job(started=time.time()), box, model)
         job = replace(
             job,
             source=without_scheme(str(source)) if source is not None else job.source,
@@ -153,14 +158,16 @@ class Pipeline:
         with open_source(job.source, part=job.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
-        if job.box is not None:
-            job.box.validated(*self.size)
+        for each in job.boxes.values():
+            each.validated(*self.size)
         path = job.source if self.live else str(Path(job.source).absolute())
         self._job = replace(job, source=path, size=self.size, settings=job.settings.for_length(self.frames))
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
         self._record, self._save_model = _path(record), _path(save_model)
-        self._after, self._box = after, job.box
+        self._after = after
+        self._found = {name: ObjectPosition(each) for name, each in job.boxes.items()}  # where each object was last
+        self._waiting: deque[Track] = deque()  # that were received and not returned yet
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
         self._supervisor: Supervisor | None = None
@@ -202,7 +209,7 @@ class Pipeline:
             if self._state is not None:
                 stack.enter_context(_begun(self._state, self._resumed_job, self._job))
                 start = self._start(self._state) if self._resumed_job is not None else start
-            self._box = start.box or self._box
+            self._found |= start.objects
             self._incoming = stack.enter_context(Receiver(RESULTS, endpoint, start, settings.run.unstored_frames))
             self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
             if self._save_model is not None:  # from the compressor's last checkpoint
@@ -264,25 +271,45 @@ class Pipeline:
             async for track in self._tracks_async():
                 yield track
 
-    def _tracks(self) -> Iterator[Track]:
-        """The tracks that arrive from now on."""
+    def by_frame(self) -> Iterator[dict[str, Track]]:
+        """Iterate over the frames: the track of each object, by name. The pipeline must be used in a `with`.
+
+        Raises
+        ------
+        ServiceError
+            If the pipeline was not started, or runs no more.
+        """
         while not self._over():
-            if (track := self._take(_CHECK_SECONDS)) is not None:
-                yield track
+            if (tracks := self._take(_CHECK_SECONDS)) is not None:
+                yield tracks.tracks
         for _ in self._wait_for_exit():
             time.sleep(_TURN_SECONDS)
         self._raise_failure()
 
+    def _tracks(self) -> Iterator[Track]:
+        """The tracks that arrive from now on."""
+        yield from self._rest()
+        for tracks in self.by_frame():
+            self._waiting.extend(tracks.values())
+            yield from self._rest()
+
     async def _tracks_async(self) -> AsyncIterator[Track]:
         """The same for an event loop, without blocking it."""
-        while not self._over():
-            if (track := self._take(0)) is not None:
+        while not self._over() or self._waiting:
+            for track in self._rest():
                 yield track
+            if (tracks := self._take(0)) is not None:
+                self._waiting.extend(tracks.tracks.values())
             elif self._end is None:
                 await readable([self._incoming], _CHECK_SECONDS)
         for _ in self._wait_for_exit():
             await asyncio.sleep(_TURN_SECONDS)
         self._raise_failure()
+
+    def _rest(self) -> Iterator[Track]:
+        """The tracks that were received and not returned yet: the loop before may have ended within a frame."""
+        while self._waiting:
+            yield self._waiting.popleft()
 
     def _over(self) -> bool:
         """Whether the end of the stream was received."""
@@ -290,19 +317,22 @@ class Pipeline:
             raise ServiceError(_ONCE)
         return self._end is not None
 
-    def _take(self, seconds: float) -> Track | None:
-        """The next track, None if none arrives in time; checks the processes now and then."""
+    def _take(self, seconds: float) -> Tracks | None:
+        """The tracks of the next frame, None if none arrive in time; checks the processes now and then."""
         message = self._incoming.receive(seconds)
-        if isinstance(message, Track):
-            self._incoming.acknowledge(Position(message.seq, message.frame, message.box or self._box))
-            self._box = message.box or self._box
+        if isinstance(message, Tracks):
+            self._found = {
+                name: ObjectPosition(each.box) if each.box is not None else self._found.get(name, ObjectPosition())
+                for name, each in message.tracks.items()
+            }
+            self._incoming.acknowledge(Position(message.seq, message.frame, self._found))
         elif isinstance(message, End):
             self._incoming.acknowledge(Position(message.seq))
             self._end = message
         if time.monotonic() - self._checked > _CHECK_SECONDS:
             self._checked = time.monotonic()
             self._watch()
-        return message if isinstance(message, Track) else None
+        return message if isinstance(message, Tracks) else None
 
     def _raise_failure(self) -> None:
         """Raise VideoError if the source failed."""
@@ -355,7 +385,7 @@ class Pipeline:
     @property
     def waits(self) -> bool:
         """Whether a new run waits for a box, because it has neither box nor model; false for a resumed run."""
-        return self._box is None and self._job.model is None and self._resumed_job is None
+        return not self._found and not self._job.models and self._resumed_job is None
 
     @property
     def complete(self) -> bool:
@@ -417,14 +447,15 @@ def _path(path: str | os.PathLike[str] | None) -> Path | None:
     return None if path is None else Path(path)
 
 
-def _with_object(job: Job, box: str | Iterable[float] | None, model: str | os.PathLike[str] | None) -> Job:
-    """The job with another object, if one is given."""
+def _with_objects(job: Job, box: Boxes | None, model: Models | None) -> Job:
+    """The job with other objects, if any are given."""
     if box is None and model is None:
         return job
+    files = model if isinstance(model, Mapping) else {} if model is None else {UNNAMED: model}
     return replace(
         job,
-        box=None if box is None else Box.parse(box),
-        model=None if model is None else Path(model).absolute(),
+        boxes={} if box is None else boxes_by_name(box),
+        models={check_name(name): Path(file).absolute() for name, file in files.items()},
     )
 
 
@@ -432,8 +463,8 @@ def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
     """Raise an error if a run cannot start, before anything is opened."""
     if not job.source:
         raise SettingsError("a new run needs a source: give one")
-    if job.model is not None:
-        Learned.load(job.model)
+    for file in job.models.values():
+        Learned.load(file)
     if job.settings.run.lockstep and is_live(job.source):
         raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
     if record is not None and record.exists() and is_new:

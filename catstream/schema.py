@@ -21,8 +21,10 @@ __all__ = [
     "LONGEST_LIST",
     "LONGEST_TEXT",
     "Array",
+    "ByObject",
     "Bytes",
     "Field",
+    "Name",
     "Named",
     "OnlyWith",
     "Whole",
@@ -93,6 +95,16 @@ class Named:
 
     columns: Mapping[str, int]
     required: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """The text is the name of an object: see `catstream.names`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ByObject:
+    """The names of the map are those of objects."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -115,6 +115,10 @@ class RunSettings(_Group):
         int,
         _about("Features messages that may be sent and not yet stored by the compressor.", ge=1, le=65536),
     ] = 256
+    objects_most: Annotated[
+        int,
+        _about("Objects that a stream may have at most: each takes memory and time of its own.", ge=1, le=256),
+    ] = 32
     checkpoint_seconds: Annotated[
         float,
         _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600),

@@ -17,10 +17,11 @@ from pathlib import Path
 
 from catstream import storage
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.errors import ServiceError
+from catstream.errors import ObjectError, ServiceError
 from catstream.job import Job
 from catstream.learned import Learned
 from catstream.messages import Position
+from catstream.names import UNNAMED, listed
 from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
@@ -43,16 +44,21 @@ def position(folder: Path, settings: Settings) -> Position:
     return CheckpointStore(folder / TREES).load(settings).position
 
 
-def learned(folder: Path, settings: Settings) -> Learned:
-    """The model, sample and box of the newest valid checkpoint; the model is trained again from the sample.
+def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
+    """The model, sample and box of an object in the newest valid checkpoint; the model is trained again from the sample.
 
     Raises
     ------
+    ObjectError
+        If there is no such object.
     ServiceError
         If there is no checkpoint, or nothing was learned before the newest one.
     """
-    compressor = CheckpointStore(folder / TREES).load(settings)
-    if compressor.last_sample is None or compressor.box is None or not compressor.sampled:
+    forest = CheckpointStore(folder / TREES).load(settings)
+    if forest.compressors and name not in forest.compressors:
+        raise ObjectError(f"there is no object {name!r}: the objects are {listed(forest.compressors)}")
+    compressor = forest.compressors.get(name)
+    if compressor is None or compressor.last_sample is None or compressor.box is None:
         raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
     trainer = Trainer(settings)
     with one_thread():  # as the pipeline's own trainer: the model has the same bits

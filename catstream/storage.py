@@ -131,6 +131,11 @@ def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
     return arrays, metadata
 
 
+def with_prefix(arrays: Arrays, prefix: str) -> Arrays:
+    """The arrays whose names begin with a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
 def _sync(folder: Path) -> None:
     """Write the directory entries of a folder to disk."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -1,39 +1,21 @@
-"""The tracker: detector, compressor and trainer in one process, one after the other.
-
-The paper's three components in the order of its system figure: each frame is
-searched with the last model, what it teaches is added to the coreset trees, and
-a model is learned whenever they have grown. `catstream.pipeline` runs the same
-three side by side.
-"""
+"""The tracker of one object in one process; `catstream.multi` follows several."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from importlib.metadata import version
-from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from catstream import kalman, storage
 from catstream.box import Box
-from catstream.compression.compressor import Compressor
-from catstream.detection.detector import Detector
-from catstream.errors import BoxError, FrameError, ProtocolError, ServiceError
-from catstream.features.cells import row_length
-from catstream.image import as_bgr
-from catstream.messages import Features, Model, Track
-from catstream.packing import pack, unpack
+from catstream.errors import ObjectError
+from catstream.messages import Track
+from catstream.multi import MultiTracker
+from catstream.names import UNNAMED
 from catstream.settings import Settings
-from catstream.storage import Arrays, Metadata
-from catstream.threads import one_thread
-from catstream.training.trainer import Trainer
-from catstream.wire.checks import check_message
 
 __all__ = ["Tracker"]
-
-_KIND = "tracker 2"  # and the version of what the file holds
 
 
 class Tracker:
@@ -49,7 +31,7 @@ class Tracker:
     Parameters
     ----------
     settings : Settings or mapping of str
-        Those that are not to have their default.
+        The settings that differ from the defaults.
 
     Examples
     --------
@@ -62,8 +44,12 @@ class Tracker:
     """
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
-        self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
-        self._track: Track | None = None
+        self._objects = MultiTracker(settings)
+
+    @property
+    def settings(self) -> Settings:
+        """All settings."""
+        return self._objects.settings
 
     @property
     def track(self) -> Track:
@@ -74,9 +60,7 @@ class Tracker:
         BoxError
             Before `init`.
         """
-        if self._track is None:
-            raise BoxError("nothing is tracked yet: call init with a frame and a box first")
-        return self._track
+        return self._objects.tracks[UNNAMED]
 
     def init(self, frame: np.ndarray, box: str | Iterable[float], time: float = 0.0) -> None:
         """Start on a box, and forget all before.
@@ -97,15 +81,7 @@ class Tracker:
         FrameError
             For an array that is not a frame.
         """
-        image, start = as_bgr(frame), Box.parse(box)
-        compressor, trainer = Compressor(self.settings), Trainer(self.settings)
-        detector = Detector(self.settings)
-        detector.prepare()  # a library is held to one thread if it is there when a call begins
-        with one_thread():
-            first = detector.init(image, start, time)  # if the box is refused, nothing changes
-            self.detector, self.compressor, self.trainer = detector, compressor, trainer
-            self._size = image.shape[:2]
-            self._learn(*first)
+        self._objects.init(frame, {UNNAMED: box}, time)
 
     def update(self, frame: np.ndarray, time: float = 0.0) -> tuple[bool, Box | None]:
         """Find the object in the next frame, and learn from it.
@@ -124,17 +100,8 @@ class Tracker:
         FrameError
             For an array that is not a frame, or is of another size than those before.
         """
-        _ = self.track
-        image = as_bgr(frame)
-        if image.shape[:2] != self._size:
-            (height, width), (first_height, first_width) = image.shape[:2], self._size
-            raise FrameError(
-                f"this frame is {width}x{height} pixels, those before it {first_width}x{first_height}: "
-                "resize it, or call init to begin anew"
-            )
-        with one_thread():
-            self._learn(*self.detector.step(image, time))
-        return self.track.box is not None, self.track.box
+        track = self._objects.update(frame, time)[UNNAMED]
+        return track.box is not None, track.box
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all that was learned to one file, whole or not at all: `Tracker.load` continues from there.
@@ -146,24 +113,7 @@ class Tracker:
         ServiceError
             If it cannot be written.
         """
-        track = self.track
-        arrays, metadata = self.compressor.state()
-        model, model_metadata = pack(self.detector.model, "model")
-        start, start_metadata = self.detector.scm_state()
-        whole: Metadata = {
-            "kind": _KIND,
-            "program": version("catstream"),
-            "settings": self.settings.texts(),
-            "size": list(self._size),
-            "track": pack(track, "track")[1],
-            "compressor": metadata,
-            "model": model_metadata,
-            "bootstrap": start_metadata,
-        }
-        try:
-            storage.write(path, arrays | model | start, whole)
-        except OSError as error:
-            raise ServiceError(f"cannot write {str(path)!r} ({error}): give another file") from None
+        self._objects.save(path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -175,45 +125,12 @@ class Tracker:
             If there is no such file, or it cannot be read.
         ProtocolError
             If it is damaged, another file, or of a catstream with other features.
+        ObjectError
+            If several objects are saved in it.
         """
-        if not Path(path).is_file():
-            raise ServiceError(f"there is no saved tracker {str(path)!r}: `Tracker.save` writes one")
-        arrays, metadata = storage.read(path)
-        try:
-            if metadata.get("kind") != _KIND:
-                raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")
-            return cls._of(arrays, metadata)
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ProtocolError(f"{path} is not a saved tracker ({error}): `Tracker.save` writes one") from None
-
-    @classmethod
-    def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
-        self = cls(Settings.from_values(metadata["settings"]))
-        self.compressor = Compressor.from_state(arrays, metadata["compressor"], self.settings)
-        self.trainer, self.detector = Trainer(self.settings), Detector(self.settings)
-        model = unpack(Model, arrays, metadata["model"], "model")
-        if len(model.weights) != row_length():
-            raise ValueError(
-                f"its model has {len(model.weights)} weights, the features of this catstream are {row_length()}: "
-                f"catstream {metadata['program']} wrote it"
-            )
-        seq, state = self.compressor.seq, self.compressor.detector
-        if state is None:
-            raise ValueError("it does not say where the object was")
-        self.detector.resume(seq, state, model)
-        self.detector.resume_scm(arrays, metadata["bootstrap"])
-        height, width = metadata["size"]
-        self._size = int(height), int(width)
-        self._track = unpack(Track, arrays, metadata["track"], "track")
-        for message in (model, self._track):
-            check_message(message)
-        kalman.prepare()
+        objects = MultiTracker.load(path)
+        if list(objects.tracks) != [UNNAMED]:
+            raise ObjectError(f"{path} has objects with names: load it with MultiTracker.load")
+        self = cls()
+        self._objects = objects
         return self
-
-    def _learn(self, track: Track, features: Features) -> None:
-        self._track = track
-        sample = self.compressor.take(features)
-        if sample is not None:
-            self.detector.adopt(self.trainer.train(sample))
-        if track.frame >= self.settings.search.motion_frames // 2:
-            kalman.prepare()  # so many more, and a sample brings the centres

@@ -10,12 +10,13 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 
-from catstream.box import Box
-from catstream.detection.detector import Detector
-from catstream.errors import BoxError
-from catstream.messages import Answer, Command, Features, Track
+from catstream.detection.detector import Result
+from catstream.detection.objects import Detectors
+from catstream.errors import BoxError, ObjectError
+from catstream.features.pyramid import Pyramid
+from catstream.messages import Answer, Command
+from catstream.names import UNNAMED, listed
 from catstream.services.desired import DesiredState
-from catstream.video.frames import Frame
 
 __all__ = ["STOPPED", "CommandHandler"]
 
@@ -28,7 +29,7 @@ class CommandHandler:
 
     Parameters
     ----------
-    detector : the detector that the commands are for
+    detectors : the detectors that the commands are for
     desired : the desired state at the start
 
     Attributes
@@ -37,10 +38,10 @@ class CommandHandler:
     end_reason : reason for which no more frames are tracked; empty while frames are tracked
     """
 
-    def __init__(self, detector: Detector, desired: DesiredState) -> None:
+    def __init__(self, detectors: Detectors, desired: DesiredState) -> None:
         self.desired, self.end_reason = desired, STOPPED if desired.stopped else ""
-        self._detector = detector
-        self._boxes: deque[tuple[Command, Box]] = deque()  # to be applied to the next frame
+        self._detectors = detectors
+        self._boxes: deque[Command] = deque()  # to be applied to the next frame
 
     @property
     def has_box(self) -> bool:
@@ -50,7 +51,7 @@ class CommandHandler:
     @property
     def counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
-        return {"paused": float(self.desired.paused), "waiting": float(self.desired.box is None)}
+        return {"paused": float(self.desired.paused), "waiting": float(not self.desired.objects)}
 
     def carry_out(self, commands: Iterable[Command]) -> list[Answer]:
         """Carry out commands; return the answers. The answers to boxes follow from `begin`, with the next frame."""
@@ -58,41 +59,60 @@ class CommandHandler:
         for command in commands:
             if self.end_reason and command.verb != "save":
                 answers.append(self._answer(command, False, f"the pipeline is ending: {self.end_reason}"))
-            elif command.verb == "set-box" and command.box is not None:
-                self._boxes.append((command, command.box))
+            elif command.verb == "set-box":
+                self._boxes.append(command)
             else:
-                answers.append(self._answer(command, *self._apply(command)))
+                try:
+                    answers.append(self._answer(command, *self._apply(command)))
+                except ObjectError as error:
+                    answers.append(self._answer(command, False, str(error)))
                 answers += self.reject_boxes(f"the pipeline is ending: {self.end_reason}") if self.end_reason else []
         return answers
 
-    def begin(self, frame: Frame) -> tuple[tuple[Track, Features] | None, list[Answer]]:
-        """Start the detector on a frame, if a command has set a box.
+    def begin(self, frame: Pyramid, time: float) -> tuple[dict[str, Result], list[Answer]]:
+        """Start the detectors of the objects whose boxes commands have set, in the next frame.
+
+        Of two boxes for one name, the second one waits for the frame after it.
 
         Returns
         -------
-        the first track and features, None if there is no valid box, and the answers
+        the result of each object whose box is valid, by name, and the answers
         """
+        given: dict[str, Result] = {}
         answers = []
+        later: deque[Command] = deque()
         while self._boxes:
-            command, box = self._boxes.popleft()
-            keeps = command.keep and self._detector.model.version > 0
-            first = self.desired.box is None
+            command = self._boxes.popleft()
             try:
-                begin = self._detector.correct if keeps else self._detector.init
-                first_result = begin(frame.image, box, frame.time)
-            except BoxError as error:
+                name = self._name(command)
+                if name in given:
+                    later.append(command)
+                    continue
+                given[name], effect = self._begun(name, command, frame, time)
+                answers.append(self._answer(command, True, effect, self._detectors.seq, name))
+            except (BoxError, ObjectError) as error:
                 answers.append(self._answer(command, False, str(error)))
-                continue
-            if not keeps:
-                self.desired = replace(self.desired, box=box, begins=first_result[0].seq)
-            what = "the same object continues" if keeps else "the object begins" if first else "another object begins"
-            answers.append(self._answer(command, True, f"{what} at {box} in frame {first_result[0].frame}"))
-            return first_result, answers
-        return None, answers
+        self._boxes = later
+        return given, answers
+
+    def _begun(self, name: str, command: Command, frame: Pyramid, time: float) -> tuple[Result, str]:
+        """The result of an object at the box of a command, and the effect."""
+        detectors, box, number = self._detectors, command.box, self._detectors.seq
+        if box is None:
+            raise BoxError("no box was given")
+        known = detectors.detectors.get(name)
+        of_name = f" {name}" if name else ""
+        if command.keep and known is not None and known.model.version:
+            result = detectors.correct(name, frame, box, time)
+            return result, f"the same object{of_name} continues at {box} in frame {number}"
+        result = detectors.begin(name, frame, box, time)
+        what = f"the object{of_name} begins" if name not in self.desired.objects else f"another object{of_name} begins"
+        self.desired = self.desired.begun(name, box, result[0].seq)
+        return result, f"{what} at {box} in frame {number}"
 
     def reject_boxes(self, reason: str) -> list[Answer]:
         """Reject the boxes that wait for a frame, because there is none."""
-        answers = [self._answer(command, False, reason) for command, _ in self._boxes]
+        answers = [self._answer(command, False, reason) for command in self._boxes]
         self._boxes.clear()
         return answers
 
@@ -107,7 +127,8 @@ class CommandHandler:
 
     def _apply(self, command: Command) -> tuple[bool, str]:
         """Carry out a command that needs no frame; return whether it was done, and its effect or the error."""
-        after = f"after frame {self._detector.seq - 1}" if self._detector.seq else "before the first frame"
+        seq = self._detectors.seq
+        after = f"after frame {seq - 1}" if seq else "before the first frame"
         if command.verb == "pause":
             self.desired = replace(self.desired, paused=True)
             return True, f"paused {after}"
@@ -117,11 +138,38 @@ class CommandHandler:
         if command.verb == "stop":
             self.desired, self.end_reason = replace(self.desired, stopped=True), STOPPED
             return True, f"the stream ends {after}"
-        if not self._detector.model.version or self._detector.box is None:
+        name = self._known(command)
+        if command.verb == "forget":
+            self.desired = self.desired.without(name)
+            self._detectors.detectors.pop(name, None)
+            waits = "" if self.desired.objects else ": no object is left, so the run waits for a box"
+            return True, f"{listed([name])} is followed no more {after}{waits}"
+        detector = self._detectors.detectors.get(name)
+        if detector is None or not detector.model.version or detector.box is None:
             return False, "nothing was learned of the object yet: try again once there is a model (catstream status)"
-        return True, f"model {self._detector.model.version} {after}"
+        return True, f"model {detector.model.version} {after}"
 
-    def _answer(self, command: Command, done: bool, reason: str) -> Answer:
-        detector = self._detector
-        frame, version = max(detector.seq - 1, 0), detector.model.version
-        return Answer(command.id, done, reason, frame, detector.box, version)
+    def _known(self, command: Command) -> str:
+        """The name of an object that a command is for; ObjectError if there is none."""
+        name = self._name(command)
+        if name not in self.desired.objects:
+            raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.desired.objects)}")
+        return name
+
+    def _name(self, command: Command) -> str:
+        """The name of the object that a command is for: without a name, the object that has none, or the only one."""
+        names = self.desired.objects
+        if command.object or not names or UNNAMED in names:
+            return command.object
+        if len(names) > 1:
+            raise ObjectError(f"which object? This run has {listed(names)}: give a name")
+        return next(iter(names))
+
+    def _answer(
+        self, command: Command, done: bool, reason: str, frame: int | None = None, name: str | None = None
+    ) -> Answer:
+        name = command.object if name is None else name
+        detector = self._detectors.detectors.get(name)
+        frame = max(self._detectors.seq - 1, 0) if frame is None else frame
+        box, version = (detector.box, detector.model.version) if detector is not None else (None, 0)
+        return Answer(command.id, done, reason, frame, box, version, name)

@@ -9,6 +9,7 @@ from pathlib import Path
 from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
 from catstream.job import Job
 from catstream.learned import Learned
 from catstream.messages import End, Features
@@ -51,14 +52,14 @@ def main(process: Process) -> None:
 
 
 class CompressorLoop:
-    """A compressor, its checkpoints, its recording, and the sockets that it is connected to."""
+    """A forest, its checkpoints, its recording, and the sockets that it is connected to."""
 
     def __init__(self, process: Process, stack: ExitStack) -> None:
         job, settings, endpoint = process.job, process.settings, process.endpoint
         self._process = process
         self._checkpoints = _checkpoints(job, stack)
-        self._compressor = _compressor(job, self._checkpoints)
-        position = self._compressor.position
+        self._forest = _forest(job, self._checkpoints)
+        position = self._forest.position
         self._progress = Progress(position, position.seq, time.monotonic())
         self._recorder = None
         if job.record is not None:
@@ -69,8 +70,8 @@ class CompressorLoop:
             Receiver(FEATURES, endpoint, position, settings.run.unstored_frames, check=self._check)
         )
         self._samples = stack.enter_context(Publisher(SAMPLES, endpoint))
-        if self._compressor.last_sample is not None:
-            self._samples.send(self._compressor.last_sample)
+        for sample in self._forest.last_samples:
+            self._samples.send(sample)
 
     @property
     def must_stop(self) -> bool:
@@ -90,13 +91,15 @@ class CompressorLoop:
         """Insert features into the trees, and send the sample if there is a new one."""
         if self._recorder is not None:  # before a checkpoint: the recording then contains all of its features
             self._recorder.write(features)
-        sample = self._compressor.take(features)
-        if sample is not None:
+        before = self._forest.compressors.keys()
+        for sample in self._forest.take(features):
             self._samples.send(sample)
+        if self._forest.compressors.keys() != before:
+            self._samples.keep_only(self._forest.compressors)
 
     def store_and_acknowledge(self, message: Features | End | None) -> None:
         """Write a checkpoint if one is due, then answer position requests and acknowledge the message."""
-        before, seq, run = self._progress, self._compressor.seq, self._process.settings.run
+        before, seq, run = self._progress, self._forest.seq, self._process.settings.run
         end = message if isinstance(message, End) else None
         urgent = self._checkpoints is None or end is not None or before.is_urgent(seq, run.unstored_frames)
         urgent = urgent or self._features.position_requested
@@ -105,19 +108,19 @@ class CompressorLoop:
         if self._features.position_requested:
             self._features.answer(self._progress.position)
         if message is not None or self._progress.position is not before.position:
-            self._features.acknowledge(self._progress.acknowledgement(self._compressor.sampled, end))
+            self._features.acknowledge(self._progress.acknowledgement(self._forest.position, end))
 
     def _store(self, urgent: bool) -> None:
         """Write a checkpoint, or count all messages as stored if there are none (started by hand without --state)."""
         self._process.allow(_STORE_SECONDS)
-        saved = self._checkpoints is None or self._checkpoints.save(self._compressor)
-        self._progress = self._progress.after(self._compressor.position, time.monotonic(), saved=saved, urgent=urgent)
+        saved = self._checkpoints is None or self._checkpoints.save(self._forest)
+        self._progress = self._progress.after(self._forest.position, time.monotonic(), saved=saved, urgent=urgent)
 
     def publish_health(self, *, last: bool = False) -> None:
         """Serve late joiners and publish the health."""
         self._samples.serve_late_joiners()
         self._process.trouble = self._checkpoints.trouble if self._checkpoints is not None else ""
-        self._process.beat(self._counters, now=last)
+        self._process.beat(self._counters, self._forest.object_counters, now=last)
 
     def end(self, end: End) -> None:
         """Send the end of the stream, and wait for the end of the tracks if they are recorded."""
@@ -126,25 +129,25 @@ class CompressorLoop:
         while self._recorder is not None and self._recorder.end is None and time.monotonic() < deadline:
             self._features.receive(0.02)  # a detector that did not receive the last acknowledgement asks again
             self._recorder.receive()
-            self._process.beat(self._counters)
+            self._process.beat(self._counters, self._forest.object_counters)
 
     def stop(self) -> None:
         """Store all received messages; the sender continues with the next compressor."""
-        if self._compressor.seq > self._progress.stored:
+        if self._forest.seq > self._progress.stored:
             self._store(urgent=False)
             self._features.acknowledge(self._progress.position)
 
     def _check(self, message: Features | End) -> None:
         """Raise ProtocolError for features of another stream."""
         if isinstance(message, Features):
-            self._compressor.check_features(message)
+            self._forest.check_features(message)
 
     def _counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
         own: dict[str, float] = {"stored": self._progress.stored}
         if self._recorder is not None:
             own |= {"recorded": self._recorder.written, "unrecorded": float(self._recorder.failed != "")}
-        return self._compressor.counters() | own
+        return self._forest.counters() | own
 
 
 def _checkpoints(job: Job, stack: ExitStack) -> CheckpointStore | None:
@@ -152,12 +155,13 @@ def _checkpoints(job: Job, stack: ExitStack) -> CheckpointStore | None:
     return None if job.state is None else CheckpointStore(stack.enter_context(locked(job.state / TREES, _LOCK_SECONDS)))
 
 
-def _compressor(job: Job, checkpoints: CheckpointStore | None) -> Compressor:
-    """A compressor that continues from the newest checkpoint or from a saved model, or a new one."""
-    compressor = checkpoints.load(job.settings) if checkpoints is not None else Compressor(job.settings)
-    if job.model is not None and not compressor.seq:
-        return Compressor.from_sample(Learned.load(job.model).sample, job.settings)
-    return compressor
+def _forest(job: Job, checkpoints: CheckpointStore | None) -> Forest:
+    """A forest that continues from the newest checkpoint or from saved models, or a new one."""
+    forest = checkpoints.load(job.settings) if checkpoints is not None else Forest(job.settings)
+    if not forest.seq:
+        for name, file in job.models.items():
+            forest.add(Compressor.from_sample(Learned.load(file).sample, job.settings, name))
+    return forest
 
 
 def reading_seconds(file: Path) -> float:

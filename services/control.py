@@ -6,10 +6,11 @@ import logging
 from collections.abc import Iterable
 from pathlib import Path
 
-from catstream.messages import Answer, Features, Track
+from catstream.detection.detector import Result
+from catstream.features.pyramid import Pyramid
+from catstream.messages import Answer
 from catstream.services.commands import CommandHandler
 from catstream.services.desired import DesiredState
-from catstream.video.frames import Frame
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint
 
@@ -41,11 +42,11 @@ class CommandChannel(Responder):
         self._conclude(self._handler.carry_out(commands))
         return bool(commands)
 
-    def begin(self, frame: Frame) -> tuple[Track, Features] | None:
-        """Return the first track and features, if a command has set a box for this frame."""
-        found, answers = self._handler.begin(frame)
+    def begin(self, frame: Pyramid, time: float) -> dict[str, Result]:
+        """Return the results of the objects whose boxes commands have set for this frame, by name."""
+        given, answers = self._handler.begin(frame, time)
         self._conclude(answers)
-        return found
+        return given
 
     def reject_boxes(self, reason: str) -> None:
         """Reject the boxes that wait for a frame."""

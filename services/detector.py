@@ -1,4 +1,4 @@
-"""The process that tracks the object in each frame with the newest model, and sends tracks and features.
+"""The process that tracks the objects in each frame with their newest models, and sends tracks and features.
 
 `main` shows the order of events, and `DetectorLoop` connects them to sockets. The decisions are pure functions in
 `resume`, `pacing`, `delivery` and `commands`.
@@ -14,14 +14,16 @@ from dataclasses import replace
 from typing import TypeVar
 
 from catstream import kalman
-from catstream.detection.detector import Detector
+from catstream.detection.detector import Detector, Result
+from catstream.detection.objects import Detectors
 from catstream.errors import ProtocolError, VideoError
+from catstream.features.pyramid import Pyramid
 from catstream.learned import Learned
-from catstream.messages import End, Features, Model, Position, Track
+from catstream.messages import End, Features, Model, Position, Tracks
 from catstream.services.commands import CommandHandler
 from catstream.services.control import CommandChannel
 from catstream.services.delivery import Step, next_step
-from catstream.services.desired import DesiredState
+from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.loop import Process
 from catstream.services.outputs import DataSender, Outputs
 from catstream.services.pacing import Awaited, awaited
@@ -35,7 +37,7 @@ from catstream.wire.newest import Subscriber
 
 __all__ = ["main", "opening_seconds"]
 
-Message = TypeVar("Message", Features | End, Track | End)
+Message = TypeVar("Message", Features | End, Tracks | End)
 
 _FILE = "desired_state.json"  # in the folder of the state
 _COMPRESSOR_SECONDS = 10.0  # time for the compressor to store the end, once the process was asked to end
@@ -50,17 +52,16 @@ _log = logging.getLogger(__name__)
 
 
 def main(process: Process) -> None:
-    """Track the object of the job to the last frame of its source."""
+    """Track the objects of the job to the last frame of its source."""
     process.source = _shown(process.job.source)
-    learned = Learned.load(process.job.model) if process.job.model is not None else None
+    learned = {name: Learned.load(file) for name, file in process.job.models.items()}
     reason, failed = "the source has ended", False
     with ExitStack() as stack:
         loop = DetectorLoop(process, stack, learned)
         loop.wait_for_subscribers()
         if process.job.resume:
-            loop.resume(learned)
-        elif learned is not None:
-            loop.detector.seek(learned.model, learned.box)
+            loop.resume()
+        loop.seek()
         frames = loop.open(stack)
         try:
             for frame in frames:
@@ -80,23 +81,27 @@ def main(process: Process) -> None:
 
 
 class DetectorLoop:
-    """A detector, and the sockets that it is connected to.
+    """The detectors, and the sockets that they are connected to.
+
+    Parameters
+    ----------
+    learned : the saved model of each object that is searched for, by name
 
     Every method that waits does so in turns: see `turn`.
     """
 
-    def __init__(self, process: Process, stack: ExitStack, learned: Learned | None) -> None:
+    def __init__(self, process: Process, stack: ExitStack, learned: dict[str, Learned]) -> None:
         state = process.job.state
         file = state / _FILE if state is not None else None
-        self.detector = Detector(process.settings)
-        self._process = process
-        self._commands = CommandHandler(self.detector, _desired(process, learned))
+        self.detectors = Detectors(process.settings)
+        self._process, self._learned = process, learned
+        self._commands = CommandHandler(self.detectors, _desired(process, learned))
         self._control = stack.enter_context(CommandChannel(process.endpoint, self._commands, file))
         self._outputs = stack.enter_context(Outputs(process))
         self._models = stack.enter_context(Subscriber(MODELS, process.endpoint))
         self._source: Source | None = None
         self._skipped = 0  # frames that were skipped while the run was paused or waited for a box
-        self._version = 0  # of the model of the last track
+        self._tracks = Tracks(0, 0, {})  # the last ones
 
     @property
     def end_reason(self) -> str:
@@ -115,7 +120,7 @@ class DetectorLoop:
         """Serve late joiners, carry out the commands that have arrived, and publish the health."""
         self._outputs.serve_late_joiners()
         commanded = self._control.carry_out()
-        self._process.beat(self._counters, now=commanded)
+        self._process.beat(self._counters, self._object_counters, now=commanded)
 
     def wait_for_subscribers(self) -> None:
         """Wait for the recorder without a time-out, and for announced subscribers for a few seconds."""
@@ -127,24 +132,28 @@ class DetectorLoop:
             self._outputs.poll(self._outputs.features)
             self._serve_or_exit()
 
-    def resume(self, learned: Learned | None) -> None:
+    def resume(self) -> None:
         """Continue after the last message that all receivers have stored."""
         kalman.prepare()  # while the others answer
-        model: Model | None = None
+        models: dict[str, Model] = {}
+        commands = self._commands
         positions = [self._position(sender) for sender in self._outputs.senders]
-        while not agree(positions[0], model):
-            model = self._models.receive(_TURN_SECONDS) or model
+        while not agree(positions[0], models, commands.desired):
+            if (model := self._models.receive(_TURN_SECONDS)) is not None:
+                models[model.object] = model
             positions = [self._position(sender) for sender in self._outputs.senders]
-        desired, detector = self._commands.desired, self.detector
-        begin = start(positions, model, desired, detector.state_at)
-        if begin.detector is not None and begin.model is not None:
-            detector.resume(begin.seq, begin.detector, begin.model)
-        else:
-            detector.seq = begin.seq
-            if learned is not None and not desired.begins:
-                detector.seek(learned.model, learned.box)
+        begin = start(positions, models, commands.desired, Detector(self._process.settings).state_at)
+        self.detectors.seq, commands.desired = begin.seq, begin.desired
+        for name, (state, model) in begin.objects.items():
+            self.detectors.add(name).resume(state, model)
         for sender, position in zip(self._outputs.senders, positions, strict=True):
             sender.resume(begin.seq, position.seq)
+
+    def seek(self) -> None:
+        """Search for the objects of saved models that were not found yet, unless a command gave them a box."""
+        for name, each in self._commands.desired.objects.items():
+            if not each.begins and name not in self.detectors.detectors:
+                self.detectors.add(name).seek(self._learned[name].model, self._learned[name].box)
 
     def _position(self, sender: DataSender) -> Position:
         """The position that a receiver reports; there is no time-out."""
@@ -161,7 +170,7 @@ class DetectorLoop:
     def open(self, stack: ExitStack) -> Iterator[Frame]:
         """Open the source at the frame before the next one, which always exists."""
         job, settings = self._process.job, self._process.settings
-        first = max(self.detector.seq - 1, 0)
+        first = max(self.detectors.seq - 1, 0)
         once, each = opening_seconds(job.part, first)
         self._process.allow(once)
         self._process.allow_each(each)
@@ -185,96 +194,107 @@ class DetectorLoop:
             self._control.reject_boxes("the source is lost, so there is no frame for a box: try again once it is back")
         return bool(self.end_reason)
 
-    def track(self, frame: Frame) -> tuple[Track, Features] | None:
-        """The track and the features of a frame; None if it is skipped."""
-        if frame.number < self.detector.seq:
+    def track(self, frame: Frame) -> tuple[Tracks, Features] | None:
+        """The tracks and the features of a frame; None if it is skipped."""
+        if frame.number < self.detectors.seq:
             return None
         self.turn()
-        result = self._begin(frame) or self._hold(frame)
-        if result is not None or self.end_reason:
-            return result
-        if self._commands.desired.holds:
+        pyramid = Pyramid.of(frame.image)
+        given = self._given(pyramid, frame) or self._hold(pyramid, frame)
+        if not given and self.end_reason:
+            return None
+        if not given and self._commands.desired.holds:
             self._skipped += 1
             return None
-        return self._step(frame)
+        return self._step(pyramid, frame, given)
 
-    def _hold(self, frame: Frame) -> tuple[Track, Features] | None:
-        """Keep a frame while the run is paused or has no box; frames of a live source are not kept."""
+    def _hold(self, pyramid: Pyramid, frame: Frame) -> dict[str, Result]:
+        """Keep a frame while the run is paused or has no box; frames of a live source are not kept.
+
+        Returns
+        -------
+        the results of the objects whose boxes commands have set for it
+        """
         if self._commands.desired.holds:
-            self._outputs.show(self.detector.seq, frame.image, None)
+            self._outputs.show(self.detectors.seq, frame.image, {})
         live = self._source is not None and self._source.live
         while self._commands.desired.holds and not self.end_reason and not live:
             time.sleep(_TURN_SECONDS)
             self.turn()
-            if (result := self._begin(frame)) is not None:
-                return result
-        return None
+            if given := self._given(pyramid, frame):
+                return given
+        return {}
 
-    def _begin(self, frame: Frame) -> tuple[Track, Features] | None:
-        """The track and the features of a frame for which a command has set the box."""
+    def _given(self, pyramid: Pyramid, frame: Frame) -> dict[str, Result]:
+        """The results of the objects whose boxes commands have set for a frame, by name."""
         if self._commands.has_box:
             self._process.allow(_OPEN_SECONDS)
-        return self._control.begin(frame)
+        return self._control.begin(pyramid, frame.time)
 
-    def _step(self, frame: Frame) -> tuple[Track, Features]:
-        """The track and the features of a frame, which may be repeated after a restart."""
-        detector, desired, seq = self.detector, self._commands.desired, self.detector.seq + 1
+    def _step(self, pyramid: Pyramid, frame: Frame, given: dict[str, Result]) -> tuple[Tracks, Features]:
+        """The tracks and the features of a frame, which may be repeated after a restart."""
+        detectors, seq = self.detectors, self.detectors.seq + 1
         for model in self._models.receive_all():
-            detector.adopt(model)
-        if seq <= max(desired.begins, 1):
-            self._process.allow(_OPEN_SECONDS)
-        if seq < desired.begins:  # a frame of the previous object: only its track is missing, at the owner
-            return detector.miss(frame.time)
-        if seq == desired.begins and desired.box is not None:
-            return detector.init(frame.image, desired.box, frame.time)
-        return detector.step(frame.image, frame.time)
+            detectors.adopt(model)
+        for name, each in self._commands.desired.objects.items():
+            if name in given:
+                continue
+            if seq <= max(each.begins, 1):
+                self._process.allow(_OPEN_SECONDS)
+            if seq == each.begins:
+                given[name] = detectors.begin(name, pyramid, each.box, frame.time)
+            elif (
+                each.since <= seq < each.begins
+            ):  # another object had the name: only its track is missing, at the owner
+                given[name] = detectors.add(name).miss(seq, frame.time)
+        return detectors.step(pyramid, frame.time, given)
 
-    def send(self, frame: Frame, track: Track, features: Features) -> None:
-        """Send the track and the features of a frame; wait while a window is full."""
-        track = replace(track, pts=frame.pts)
-        self._version = track.model_version
-        self._outputs.publish_track(track)
+    def send(self, frame: Frame, tracks: Tracks, features: Features) -> None:
+        """Send the tracks and the features of a frame; wait while a window is full."""
+        tracks = replace(tracks, tracks={name: replace(each, pts=frame.pts) for name, each in tracks.tracks.items()})
+        self._tracks = tracks
+        self._outputs.publish_tracks(tracks)
         if (results := self._outputs.results) is not None:
-            self._deliver(results, track)
+            self._deliver(results, tracks)
             # In lockstep the owner is never behind: after a crash, all continue after the same message.
             while (
-                self._process.settings.run.lockstep and results.taken < track.seq and not self._process.stop_requested
+                self._process.settings.run.lockstep and results.taken < tracks.seq and not self._process.stop_requested
             ):
                 self.turn(results)
         self._outputs.publish_features(features)
         self._deliver(self._outputs.features, features)
-        self._outputs.show(track.frame, frame.image, track)
-        if track.frame >= self._process.settings.search.motion_frames // 2:
+        self._outputs.show(tracks.frame, frame.image, tracks.tracks)
+        if tracks.frame >= self._process.settings.search.motion_frames // 2:
             kalman.prepare()  # a model contains the motion after twice as many frames
 
     def wait_for_model(self) -> None:
-        """Wait until the model is recent enough: see `catstream.services.pacing`."""
+        """Wait until the models are recent enough: see `catstream.services.pacing`."""
         settings, features = self._process.settings, self._outputs.features
         due = features.sent - (0 if settings.run.lockstep else settings.run.lag_frames)
         live = self._source is not None and self._source.live
         while not live and not self.end_reason:
-            match awaited(due, features.taken, features.sample_of(due), self.detector.newest_version):
+            match awaited(due, features.taken, features.samples_of(due), self.detectors.newest_versions(due)):
                 case Awaited.NOTHING:
                     return
                 case Awaited.TAKEN:
                     self.turn(features)
                 case Awaited.MODEL:  # `turn` retransmits features to a restarted compressor
                     if (model := self._models.receive(_TURN_SECONDS)) is not None:
-                        self.detector.adopt(model)
+                        self.detectors.adopt(model)
                     self.turn()
 
     def end(self, reason: str, failed: bool) -> None:
         """Send the end of the stream, and wait until it is stored; with a time-out if the process was asked to end."""
         self._control.end(reason)
-        features, results, seq = self._outputs.features, self._outputs.results, self.detector.seq
+        features, results, seq = self._outputs.features, self._outputs.results, self.detectors.seq
         self._deliver(features, End(seq + 1, reason, failed), _COMPRESSOR_SECONDS, stored=True)
         end = End(seq + 1, reason, failed, {"sent": float(seq), "stored": float(min(features.stored, seq))})
         if results is not None:
             self._deliver(results, end, _OWNER_SECONDS, stored=True)
         self._control.clear_stop()
-        self._outputs.publish_track(end)
+        self._outputs.publish_tracks(end)
         self._outputs.publish_features(end)
-        self._process.beat(self._counters, now=True)
+        self._process.beat(self._counters, self._object_counters, now=True)
 
     def _deliver(
         self, sender: Sender[Message], message: Message, patience: float = 0.0, *, stored: bool = False
@@ -312,9 +332,18 @@ class DetectorLoop:
             "sent": features.sent,
             "taken": features.taken,
             "stored": features.stored,
-            "model_version": self._version,
+            "model_version": max((each.model_version for each in self._tracks.tracks.values()), default=0),
+            "objects": len(self._commands.desired.objects),
         }
         return own | self._commands.counters | counters
+
+    def _object_counters(self) -> dict[str, dict[str, float]]:
+        """The counters of each object, by name, for the health of the process."""
+        return {
+            name: {"model_version": each.model_version, "score": each.score, "present": float(each.box is not None)}
+            for name, each in self._tracks.tracks.items()
+            if name in self._commands.desired.objects
+        }
 
 
 def opening_seconds(part: slice, first: int) -> tuple[float, float]:
@@ -323,7 +352,7 @@ def opening_seconds(part: slice, first: int) -> tuple[float, float]:
     return _OPEN_SECONDS + ((part.start or 0) + first * step) * _SKIP_SECONDS, (step - 1) * _SKIP_SECONDS
 
 
-def _desired(process: Process, learned: Learned | None) -> DesiredState:
+def _desired(process: Process, learned: dict[str, Learned]) -> DesiredState:
     """The desired state at the start: the stored one if the run is resumed, otherwise that of the job."""
     job = process.job
     if job.resume and job.state is not None and (job.state / _FILE).exists():
@@ -332,9 +361,8 @@ def _desired(process: Process, learned: Learned | None) -> DesiredState:
         except ProtocolError as error:  # the checkpoints are not affected, so the run continues
             process.trouble = str(error)
             _log.warning("%s", error)
-    if job.box is not None:
-        return DesiredState(job.box, begins=1)
-    return DesiredState(learned.box if learned is not None else None)
+    boxes = {name: DesiredObject(box, begins=1, since=1) for name, box in job.boxes.items()}
+    return DesiredState(boxes | {name: DesiredObject(each.box) for name, each in learned.items()})
 
 
 def _shown(source: str) -> str:

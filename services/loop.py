@@ -89,14 +89,25 @@ class Process:
         """Whether a signal asked the process to end at least `seconds` ago."""
         return self.seconds_since_stop >= seconds
 
-    def beat(self, counters: Callable[[], dict[str, float]], now: bool = False) -> None:
-        """Reset the watchdog, and publish the health once a second or `now`; call it in each turn of a loop."""
+    def beat(
+        self,
+        counters: Callable[[], dict[str, float]],
+        objects: Callable[[], dict[str, dict[str, float]]],
+        now: bool = False,
+    ) -> None:
+        """Reset the watchdog, and publish the health once a second or `now`; call it in each turn of a loop.
+
+        Parameters
+        ----------
+        counters, objects : return the counters of the process, and those of each object
+        """
         self._watchdog.beat()
         if now:  # this may be the last turn, and closing the sockets may take long
             self._watchdog.allow(_CLOSE_SECONDS)
         if now or time.monotonic() - self._reported >= _HEALTH_SECONDS:
             self._reported = time.monotonic()
-            self._health.send(Health(self.name, time.time(), counters() | rejects(), self.trouble, self.source))
+            own = counters() | rejects()
+            self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects()))
         else:
             self._health.serve_late_joiners()
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Self
 
 import numpy as np
 
-from catstream.messages import End, Features, Run, Track
+from catstream.messages import End, Features, Run, Track, Tracks
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
 from catstream.wire.acknowledged import Sender
@@ -18,7 +19,7 @@ from catstream.wire.newest import Publisher
 __all__ = ["DataSender", "Outputs"]
 
 #: Sends one of the two streams that are received without a loss.
-DataSender = Sender[Features | End] | Sender[Track | End]
+DataSender = Sender[Features | End] | Sender[Tracks | End]
 
 _TURN_SECONDS = 0.02  # the longest wait for an acknowledgement in one turn of a loop
 
@@ -73,17 +74,19 @@ class Outputs:
             publisher.serve_late_joiners()
         self._previews.turn()
 
-    def publish_track(self, track: Track | End) -> None:
-        """Send a track, or the end, to all subscribers."""
-        self._tracks.send(track)
+    def publish_tracks(self, tracks: Tracks | End) -> None:
+        """Send the tracks of a frame, one message an object, or the end to all subscribers."""
+        for each in tracks.tracks.values() if isinstance(tracks, Tracks) else (tracks,):
+            self._tracks.send(each)
 
     def publish_features(self, features: Features | End) -> None:
         """Send features, or the end, to all subscribers."""
         self._training.send(features)
 
-    def show(self, frame: int, image: np.ndarray, track: Track | None) -> None:
-        """Send a preview of a frame, with the box of its track, if one is due."""
-        self._previews.show(frame, image, track.box if track is not None else None)
+    def show(self, frame: int, image: np.ndarray, tracks: Mapping[str, Track]) -> None:
+        """Send a preview of a frame, with the boxes of its tracks, if one is due."""
+        boxes = {name: track.box for name, track in tracks.items() if track.box is not None}
+        self._previews.show(frame, image, boxes)
 
     def __enter__(self) -> Self:
         return self

@@ -23,19 +23,19 @@ class Previews(Publisher[Preview]):
 
     def __init__(self, endpoint: Endpoint) -> None:
         super().__init__(PREVIEWS, endpoint)
-        self._waiting: tuple[int, np.ndarray, Box | None] | None = None
+        self._waiting: tuple[int, np.ndarray, dict[str, Box]] | None = None
         self._shown = 0.0
 
-    def show(self, frame: int, image: np.ndarray, box: Box | None) -> None:
+    def show(self, frame: int, image: np.ndarray, boxes: dict[str, Box]) -> None:
         """Send a frame, unless a newer one arrives before it is due.
 
         Parameters
         ----------
         frame : number of the frame
         image : uint8 (h, w, 3) BGR, not to be changed afterwards
-        box : the object in the frame, or None
+        boxes : the objects in the frame, by name
         """
-        self._waiting = frame, image, box
+        self._waiting = frame, image, boxes
         self.turn()
 
     def turn(self) -> None:
@@ -43,6 +43,6 @@ class Previews(Publisher[Preview]):
         self.serve_late_joiners()
         if self._waiting is None or not self.has_subscribers or monotonic() - self._shown < _PERIOD:
             return
-        (frame, image, box), self._waiting, self._shown = self._waiting, None, monotonic()
+        (frame, image, boxes), self._waiting, self._shown = self._waiting, None, monotonic()
         height, width = image.shape[:2]
-        self.send(Preview(frame, width, height, box, jpeg(image)))
+        self.send(Preview(frame, width, height, boxes, jpeg(image)))

@@ -46,7 +46,7 @@ class Progress:
             return replace(self, tried=now)
         return Progress(replace(position, unsaved=position.seq - stored), stored, now)
 
-    def acknowledgement(self, version: int, end: End | None) -> Position:
+    def acknowledgement(self, now: Position, end: End | None) -> Position:
         """The position to acknowledge.
 
         A sample is acknowledged without a checkpoint, because in lockstep the detector waits for its model. The end of
@@ -54,10 +54,10 @@ class Progress:
 
         Parameters
         ----------
-        version : version of the newest sample
+        now : position of the newest received message, with the newest samples
         end : the end of the stream, if it was received
         """
-        position = replace(self.position, version=version)
+        position = replace(self.position, objects=now.objects)
         if end is None:
             return position
         return replace(position, seq=end.seq, unsaved=position.unsaved and position.unsaved + 1)

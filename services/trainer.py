@@ -11,26 +11,38 @@ from catstream.wire.newest import Publisher, Subscriber
 
 __all__ = ["main"]
 
+_NONE = {"version": 0.0, "trained": 0.0}
 _TRAIN_SECONDS = 60.0  # limit for training a model, and for the imports of the first one
 
 
 def main(process: Process) -> None:
-    """Train a model from each sample that arrives, until the stream ends."""
+    """Train a model from each sample that arrives, until the stream ends; the objects take turns."""
     trainer = Trainer(process.settings)
-    counters = {"version": 0.0, "trained": 0.0}
+    trained: dict[str, dict[str, float]] = {}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:
         while not process.stop_requested:
-            message = samples.receive(0.1)
+            message = samples.receive(0.1)  # of the object that has waited longest
             if isinstance(message, End):
                 process.source_failed = message.failed
-                process.beat(counters.copy, now=True)
+                process.beat(lambda: _totals(trained), lambda: trained, now=True)
                 return
             # An older version comes from a restarted compressor that lost the newer one; a detector may need its model.
-            if message is not None and message.version != counters["version"]:
+            if message is not None and message.version != trained.get(message.object, _NONE)["version"]:
                 process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
                 if message.frame >= process.settings.search.motion_frames // 2:
                     kalman.prepare()  # a sample contains the centres after twice as many frames
-                counters = {"version": float(message.version), "trained": counters["trained"] + 1}
+                count = trained.pop(message.object, _NONE)["trained"] + 1
+                trained[message.object] = {"version": float(message.version), "trained": count}
+                if len(trained) > process.settings.run.objects_most:  # the longest ago: it was forgotten
+                    del trained[next(iter(trained))]
             models.serve_late_joiners()
-            process.beat(counters.copy)
+            process.beat(lambda: _totals(trained), lambda: trained)
+
+
+def _totals(trained: dict[str, dict[str, float]]) -> dict[str, float]:
+    """The counters of all objects together."""
+    return {
+        "version": max((each["version"] for each in trained.values()), default=0.0),
+        "trained": sum(each["trained"] for each in trained.values()),
+    }

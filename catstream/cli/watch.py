@@ -69,15 +69,16 @@ def _sample(message: Sample) -> dict[str, str]:
 
 
 def _features(message: Features) -> dict[str, str]:
-    labels = message.training[APPEARANCE].labels if APPEARANCE in message.training else np.empty(0)
+    rows = [part.training for part in message.objects.values()]
+    labels = np.concatenate([np.empty(0), *(each[APPEARANCE].labels for each in rows if APPEARANCE in each)])
     objects, background = int((labels == 1).sum()), int((labels == 0).sum())
     return {
         "frame": f"{message.frame}",
-        "box": _sides(message.box),
+        "objects": f"{len(message.objects)}",
         "object": f"{objects}",
         "background": f"{background}",
         "near misses": f"{len(labels) - objects - background}",
-        **{name: f"{len(message.training.get(name, ()))}" for name in GROUPS},
+        **{name: f"{sum(len(each.get(name, ())) for each in rows)}" for name in GROUPS},
     }
 
 
@@ -85,7 +86,7 @@ def _preview(message: Preview) -> dict[str, str]:
     return {
         "frame": f"{message.frame}",
         "size": f"{message.width} x {message.height}",
-        "box": _sides(message.box),
+        "objects": " ".join(f"{name or '-'}:{_sides(box)}" for name, box in message.boxes.items()) or "-",
         "bytes": f"{len(message.jpeg)}",
     }
 

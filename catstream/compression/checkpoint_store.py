@@ -6,7 +6,7 @@ import logging
 import os
 from pathlib import Path
 
-from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
 from catstream.errors import ProtocolError
 from catstream.settings import Settings
 
@@ -45,8 +45,8 @@ class CheckpointStore:
     def trouble(self) -> str:
         return "; ".join(filter(None, (self._not_written, self._found_damaged)))
 
-    def load(self, settings: Settings) -> Compressor:
-        """A compressor from the newest undamaged checkpoint, a new one if there is none.
+    def load(self, settings: Settings) -> Forest:
+        """A forest from the newest undamaged checkpoint, a new one if there is none.
 
         Raises
         ------
@@ -55,26 +55,26 @@ class CheckpointStore:
         SettingsError
             If it was made with another coreset size.
         """
-        self._damaged, compressor = [], None
+        self._damaged, forest = [], None
         for path in reversed(self._files()):
             try:
-                compressor = Compressor.load(path, settings)
+                forest = Forest.load(path, settings)
                 break
             except (ProtocolError, OSError) as error:
                 _log.warning("a checkpoint cannot be used: %s", error)
                 self._damaged.append(path)
         if self._damaged:
-            instead = f"the one of frame {compressor.frame} was used" if compressor else "all is learned anew"
+            instead = f"the one of frame {forest.frame} was used" if forest else "all is learned anew"
             self._found_damaged = f"damaged checkpoints: {len(self._damaged)}, {instead}"
             _log.warning("%s", self._found_damaged)
-        return compressor or Compressor(settings)
+        return forest or Forest(settings)
 
-    def save(self, compressor: Compressor) -> bool:
+    def save(self, forest: Forest) -> bool:
         """Write a checkpoint, and remove the oldest; returns False and changes nothing if it cannot be written."""
         files = self._files()
         number = int(files[-1].stem) + 1 if files else 1
         try:
-            compressor.save(self._folder / f"{number:012d}.safetensors")
+            forest.save(self._folder / f"{number:012d}.safetensors")
         except OSError as error:
             why = f"no checkpoint can be written to {self._folder} ({error.strerror})"
             if why != self._not_written:

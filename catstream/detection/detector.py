@@ -1,4 +1,4 @@
-"""The detector: frames in, tracks and training rows out. It holds state and model from one frame to the next."""
+"""The detector of one object: frames in, tracks and training rows out. It holds state and model between the frames."""
 
 from __future__ import annotations
 
@@ -10,63 +10,58 @@ import numpy as np
 from catstream.box import Box, Window
 from catstream.detection import motion, teacher
 from catstream.detection.search import Detection, ScoreMap
-from catstream.detection.step import step, track_of
+from catstream.detection.step import looked, replaced, settled, taught, track_of
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import row_length
 from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.messages import DetectorState, Features, Model, Track
+from catstream.messages import DetectorState, Model, ObjectFeatures, Track
 from catstream.settings import Settings
 from catstream.storage import Arrays, Metadata
 
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel
 
-__all__ = ["Detector"]
+__all__ = ["Detector", "Result"]
+
+#: What a detector makes of one frame.
+Result = tuple[Track, ObjectFeatures]
 
 
 class Detector:
     """Follows one object with the newest model.
 
-    Call `init` with the first frame, or `seek` before it, then `step` for every other; `adopt` models as they arrive.
+    Call `init` with the first frame, or `seek` before it. For every other frame call `look`, then `settle`; `adopt` models
+    as they arrive.
 
     Attributes
     ----------
-    seq : of the last message
+    name : name of the object
     state : after the last frame, None before there is an object; with the model, and SCM if it is in use, all there is
     model : the one in use
     newest_version : of the models that arrived, in use or not
     """
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-        self.seq = 0
+    def __init__(self, settings: Settings, name: str = "") -> None:
+        self.settings, self.name = settings, name
         self.state: DetectorState | None = None
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
         self.newest_version = 0
         self._scm: SparseCollaborativeModel | None = None
 
-    def prepare(self) -> None:
-        """Import what `init` needs, if that takes long."""
-        if self.settings.teaching.bootstrap == "scm":
-            from catstream.paper import scm
-
-            scm.prepare()
-
     @property
     def box(self) -> Box | None:
         """The last box of the object, in pixels; None before the first frame."""
-        return self.state.window.box(self.settings.search.context) if self.seq and self.state else None
+        return self.state.window.box(self.settings.search.context) if self.state else None
 
-    def init(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
+    def init(self, frame: Pyramid, seq: int, time: float, box: Box) -> Result:
         """Start with the box of an object; another one before it is forgotten.
 
         Parameters
         ----------
-        image : uint8 (h, w, 3) BGR, or (h, w) grey
+        seq, time : of the frame's messages
         box : the object, in pixels of the frame
-        time : seconds since the start of the source
 
         Raises
         ------
@@ -74,17 +69,16 @@ class Detector:
             If tracking cannot start with the box in this frame (see `Box.validated`), or if the object looks like
             what is around it. The detector stays as it was.
         """
-        frame, scm = Pyramid.of(image), None
+        scm = None
         box = Box(*map(float, box)).validated(*frame.size)
-        window, rng = Window.around(box, self.settings.search.context), (self.settings.run.seed, self.seq)
+        window, rng = Window.around(box, self.settings.search.context), (self.settings.run.seed, seq - 1)
         if self.settings.teaching.bootstrap == "scm":
             from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
-            scm = SparseCollaborativeModel(image, box, np.random.default_rng(rng))
+            scm = SparseCollaborativeModel(frame.image, box, np.random.default_rng(rng))
         model, training = teacher.first_training(frame, window, np.random.default_rng(rng), self.settings)
-        self.state, self.model, self._scm = DetectorState(self.seq, "confident", window, window, window), model, scm
-        self.seq += 1
-        return self._messages(track_of(self.state, self.seq, time, 1.0, model, self.settings), training, begins=True)
+        self.state, self.model, self._scm = DetectorState(seq - 1, "confident", window, window, window), model, scm
+        return self._result(seq, time, 1.0, training, begins=True)
 
     def seek(self, model: Model, box: Box) -> None:
         """Start with a model: the object is absent until it is found, in whichever frame and size that is.
@@ -110,21 +104,30 @@ class Detector:
         self.state = DetectorState(0, "lost", window, window, None)
         self.model, self.newest_version = model, model.version
 
-    def step(self, image: np.ndarray, time: float = 0.0) -> tuple[Track, Features]:
-        """Find the object in the next frame."""
-        if self.state is None:
-            raise BoxError("there is no box to follow yet: call init with a frame and a box first")
-        frame = Pyramid.of(image)
-        self.seq += 1
-        found = None
-        if self._scm is not None:
-            score, box = self._scm.follow(image)
-            found = Detection(score, Window.around(box, self.settings.search.context).with_centre_in(*frame.size))
-        state = self.state
-        self.state, track, training = step(state, frame, self.seq, time, self.model, self.settings, found)
-        return self._messages(track, training)
+    def look(self, frame: Pyramid, seq: int) -> Detection:
+        """Search the object in the next frame. The state then has the place that was expected.
 
-    def correct(self, image: np.ndarray, box: Box, time: float = 0.0) -> tuple[Track, Features]:
+        Parameters
+        ----------
+        seq : of the frame's messages
+        """
+        if self._scm is not None:
+            score, box = self._scm.follow(frame.image)
+            return Detection(score, Window.around(box, self.settings.search.context).with_centre_in(*frame.size))
+        self.state, found = looked(self._known(), frame, seq, self.model, self.settings)
+        return found
+
+    def settle(self, found: Detection, frame: Pyramid, seq: int, time: float) -> Result:
+        """Take the detection of `look`, or another one of the same frame, and cut the training rows."""
+        state, model, settings = self._known(), self.model, self.settings
+        if self._scm is not None:
+            state = replaced(state, found, settings)
+        else:
+            state = settled(state, found, frame.size, model, settings)
+        self.state = state
+        return self._result(seq, time, found.score, taught(state, found, frame, seq, model, settings))
+
+    def correct(self, frame: Pyramid, seq: int, time: float, box: Box) -> Result:
         """Continue with the same object at another box, whatever a search would have found.
 
         Raises
@@ -132,33 +135,29 @@ class Detector:
         BoxError
             If there is no object yet, or as `init` does.
         """
-        if self.state is None:
-            raise BoxError("there is no box to follow yet: call init with a frame and a box first")
-        frame = Pyramid.of(image)
+        state = self._known()
         window = Window.around(Box(*map(float, box)).validated(*frame.size), self.settings.search.context)
-        self.seq += 1
         self.state = motion.observed(
             replace(
-                motion.expected(self.state),
+                motion.expected(state),
                 level="confident",
                 trusted=True,
                 window=window,
                 confident_window=window,
-                first_window=self.state.first_window or window,
+                first_window=state.first_window or window,
                 colour_centroid=None,  # this box shows anew where in it the colours are
             )
         )
         score = float(ScoreMap.around(frame, window, WINDOW, self.model).scores[0, 0])
-        training = teacher.training_at(frame, window, self.seq, self.model, self.settings)
-        return self._messages(track_of(self.state, self.seq, time, score, self.model, self.settings), training)
+        training = teacher.training_at(frame, window, seq, self.model, self.settings)
+        return self._result(seq, time, score, training)
 
-    def miss(self, time: float = 0.0) -> tuple[Track, Features]:
+    def miss(self, seq: int, time: float) -> Result:
         """Let a frame pass without a search: the object counts as absent."""
-        self.seq += 1
         if self.state is not None:
             self.state = replace(self.state, level="lost")
-        track = Track(self.seq, self.seq - 1, time, "absent", None, 0.0, self.model.version)
-        return self._messages(track, {})
+        track = Track(seq, seq - 1, time, "absent", None, 0.0, self.model.version, object=self.name)
+        return track, ObjectFeatures(None, {}, self.state)
 
     def adopt(self, model: Model) -> None:
         """Use a model from now on, unless it is older than the newest that arrived, or of an object before this one."""
@@ -170,18 +169,17 @@ class Detector:
             if model.motion is not None:
                 self.state = replace(self.state, motion=model.motion)
 
-    def resume(self, seq: int, state: DetectorState, model: Model) -> None:
-        """Continue after message `seq` of a stream that another detector began.
+    def resume(self, state: DetectorState, model: Model) -> None:
+        """Continue after a frame of a stream that another detector began.
 
         With the model that the other one had by then, it continues as that would have, bit for bit.
 
         Parameters
         ----------
-        seq : the last Features that is stored
-        state : that of this message, or `state_at` the box where the object was last
+        state : after that frame, or `state_at` the box where the object was last
         model : the newest there is
         """
-        self.seq, self.model, self.newest_version = seq, model, model.version
+        self.model, self.newest_version = model, model.version
         self.state = state if model.motion is None else replace(state, motion=model.motion)
 
     def state_at(self, box: Box, first: Box) -> DetectorState:
@@ -201,5 +199,12 @@ class Detector:
 
             self._scm = SparseCollaborativeModel.resumed(arrays, metadata)
 
-    def _messages(self, track: Track, training: Training, *, begins: bool = False) -> tuple[Track, Features]:
-        return track, Features(track.seq, track.frame, track.time, track.box, training, self.state, begins)
+    def _known(self) -> DetectorState:
+        if self.state is None:
+            raise BoxError("there is no box to follow yet: call init with a frame and a box first")
+        return self.state
+
+    def _result(self, seq: int, time: float, score: float, training: Training, *, begins: bool = False) -> Result:
+        state = self._known()
+        track = track_of(state, seq, time, score, self.model, self.settings, self.name)
+        return track, ObjectFeatures(track.box, training, state, begins)

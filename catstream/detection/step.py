@@ -1,6 +1,6 @@
-"""A step of the detector: from one frame to the next (paper, "Classification").
+"""The steps of a detector from one frame to the next: look, settle, teach (paper, "Classification").
 
-`step` is a pure function: the same state, frame, model and settings give the same result.
+These are pure functions: the same state, frame, model and settings give the same result.
 """
 
 from __future__ import annotations
@@ -15,42 +15,52 @@ from catstream.features.pyramid import Pyramid
 from catstream.messages import DetectorState, Model, State, Track
 from catstream.settings import Settings
 
-__all__ = ["step", "track_of"]
+__all__ = ["looked", "replaced", "settled", "taught", "track_of"]
 
 
-def step(
-    state: DetectorState,
-    frame: Pyramid,
-    seq: int,
-    time: float,
-    model: Model,
-    settings: Settings,
-    found: Detection | None = None,
-) -> tuple[DetectorState, Track, Training]:
-    """Find the object in the next frame, and cut the training rows that the belief in the detection allows.
+def looked(
+    state: DetectorState, frame: Pyramid, seq: int, model: Model, settings: Settings
+) -> tuple[DetectorState, Detection]:
+    """Search the object in the next frame.
 
     Costs the same for every frame: a few small patches around the object, and the whole frame if the belief is low (or
     always, if `search.mode` is "full").
 
+    Returns
+    -------
+    the state with the place that was expected, and the detection
+    """
+    return search.searched(frame, motion.expected(state), seq, model, settings)
+
+
+def settled(
+    state: DetectorState, found: Detection, size: tuple[int, int], model: Model, settings: Settings
+) -> DetectorState:
+    """The state after a detection: its belief in it, and the window moved as far as the belief allows.
+
     Parameters
     ----------
-    seq, time : of the frame's messages
-    found : what the paper's first tracker found, in place of a search; it never reports the object as absent
+    size : width and height of the frame
     """
-    if found is not None:
-        level = belief.level_of(max(found.score, settings.belief.weak_score), True, settings.belief)
-        state = replace(state, level=level, window=found.window)
-    else:
-        state = motion.expected(state)
-        state, found = search.searched(frame, state, seq, model, settings)
-        state = belief.updated(state, found.score, found.redetected, settings.belief)
-        if _policy(state, settings).report:
-            state = _followed(state, found, frame.size, model, settings)
-            state = motion.observed(state)
-    training = {}
-    if _policy(state, settings).teach:
-        training = teacher.training_of(frame, state.window, found.around, seq, model, settings)
-    return state, track_of(state, seq, time, found.score, model, settings), training
+    state = belief.updated(state, found.score, found.redetected, settings.belief)
+    if _policy(state, settings).report:
+        state = motion.observed(_followed(state, found, size, model, settings))
+    return state
+
+
+def replaced(state: DetectorState, found: Detection, settings: Settings) -> DetectorState:
+    """The state after a detection by the paper's first tracker, which never reports the object as absent."""
+    level = belief.level_of(max(found.score, settings.belief.weak_score), True, settings.belief)
+    return replace(state, level=level, window=found.window)
+
+
+def taught(
+    state: DetectorState, found: Detection, frame: Pyramid, seq: int, model: Model, settings: Settings
+) -> Training:
+    """The training rows of a frame, as far as the belief in its detection allows."""
+    if not _policy(state, settings).teach:
+        return {}
+    return teacher.training_of(frame, state.window, found.around, seq, model, settings)
 
 
 def _followed(
@@ -67,12 +77,14 @@ def _followed(
     return replace(state, window=window, confident_window=confident, colour_centroid=colours)
 
 
-def track_of(state: DetectorState, seq: int, time: float, score: float, model: Model, settings: Settings) -> Track:
+def track_of(
+    state: DetectorState, seq: int, time: float, score: float, model: Model, settings: Settings, name: str
+) -> Track:
     """The reported box of a state, unless the level of belief forbids it."""
     reported = _policy(state, settings).report
     box = state.window.box(settings.search.context) if reported else None
     present: State = "present" if model.version else "bootstrapping"
-    return Track(seq, seq - 1, time, present if reported else "absent", box, float(score), model.version)
+    return Track(seq, seq - 1, time, present if reported else "absent", box, float(score), model.version, object=name)
 
 
 def _policy(state: DetectorState, settings: Settings) -> belief.Policy:

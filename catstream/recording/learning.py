@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
 from catstream.errors import RecordingError
 from catstream.heads import APPEARANCE
-from catstream.messages import Features, Model
+from catstream.messages import Features, Model, ObjectFeatures
 from catstream.recording.file import Recording
 from catstream.settings import Settings
 from catstream.threads import one_thread
@@ -36,8 +36,8 @@ class Prequential:
     _errors: float = 0.0
     _weights: float = 0.0
 
-    def add(self, model: Model | None, features: Features) -> None:
-        """Test a model on the rows of one frame."""
+    def add(self, model: Model | None, features: ObjectFeatures) -> None:
+        """Test a model of an object on its rows of one frame."""
         training = features.training.get(APPEARANCE)
         if model is None or training is None:
             return
@@ -69,7 +69,7 @@ class Retraining:
     identical    how many of them equal the recorded model of the same version bit for bit
     seconds      of compression and training
     counters     of the compressor at the end
-    levels       of the nodes of the object's tree, oldest first
+    levels       of the nodes of each object's own tree, oldest first, by the name of the object
     prequential  evaluation of the models
     """
 
@@ -78,7 +78,7 @@ class Retraining:
     identical: int = 0
     seconds: float = 0.0
     counters: dict[str, float] = field(default_factory=dict)
-    levels: tuple[int, ...] = ()
+    levels: dict[str, tuple[int, ...]] = field(default_factory=dict)
     prequential: Prequential = field(default_factory=Prequential)
 
 
@@ -102,7 +102,7 @@ def learn(
     keep: Callable[[Model], None] | None = None,
     step: Callable[[], None] | None = None,
 ) -> Retraining:
-    """Feed the recorded features to a fresh compressor, and each sample to a fresh trainer.
+    """Feed the recorded features to a fresh forest, and each sample to a fresh trainer.
 
     A model depends on the settings and on the features up to its frame, not on the time of training. With the recorded
     settings each recorded model is therefore reproduced bit for bit under its version, whether or not the pipeline ran
@@ -122,34 +122,39 @@ def learn(
     """
     require_features(recording, incomplete=incomplete)
     recorded = {model.version: encode(model) for model in recording.models()}
-    compressor, trainer, result = Compressor(settings), Trainer(settings), Retraining(settings)
-    newest: Model | None = None
+    forest, trainer, result = Forest(settings), Trainer(settings), Retraining(settings)
+    newest: dict[str, Model] = {}
     for features in _numbered(recording):
-        result.prequential.add(newest, features)
+        for name, part in features.objects.items():
+            result.prequential.add(newest.get(name), part)
         started = time.perf_counter()
-        sample = compressor.take(features)
-        model = trainer.train(sample) if sample is not None else None
+        models = [trainer.train(sample) for sample in forest.take(features)]
         result.seconds += time.perf_counter() - started
-        if model is not None:
-            newest = model
+        for model in models:
+            newest[model.object] = model
             result.models += 1
             result.identical += encode(model) == recorded.get(model.version)
             if keep is not None:
                 keep(model)
         if step is not None:
             step()
-    result.counters = compressor.counters()
-    result.levels = tuple(node.level for node in compressor.trees["object"].nodes)
+    result.counters = forest.counters()
+    result.levels = {
+        name: tuple(node.level for node in compressor.trees["object"].nodes)
+        for name, compressor in forest.compressors.items()
+    }
     return result
 
 
 def prequential_of_recorded(recording: Recording) -> Prequential:
     """Evaluate the recorded models themselves."""
-    models = {model.frame: model for model in recording.models()}
-    prequential, newest = Prequential(), None
+    models = {(model.object, model.frame): model for model in recording.models()}
+    prequential, newest = Prequential(), dict[str, Model]()
     for features in recording.features():
-        prequential.add(newest, features)
-        newest = models.get(features.frame, newest)
+        for name, part in features.objects.items():
+            prequential.add(newest.get(name), part)
+            if (model := models.get((name, features.frame))) is not None:
+                newest[name] = model
     return prequential
 
 

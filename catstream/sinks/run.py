@@ -10,7 +10,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from catstream.errors import VideoError
-from catstream.messages import Position, Track
+from catstream.messages import ObjectPosition, Position, Track
 from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, file_exists, is_closed, open_sink, reader
 from catstream.storage import is_writable
 from catstream.video import results
@@ -93,8 +93,10 @@ class RunFiles:
             return None
         earlier = self._earlier()
         frames = min((count for count, _ in earlier), default=0)
-        boxes = [track.box for track in self._tracks(earlier, frames) if track.box is not None]
-        return Position(frames, max(frames - 1, 0), boxes[-1] if boxes else None)
+        found = {
+            track.object: ObjectPosition(track.box) for track in self._tracks(earlier, frames) if track.box is not None
+        }
+        return Position(frames, max(frames - 1, 0), found)
 
     @contextmanager
     def opened(self, *, resume: bool = False) -> Iterator[Callable[[Track, float], None]]:

@@ -55,7 +55,9 @@ class Trainer:
             )
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
         bias = -float(weights @ background_mean)
-        return Model(sample.version, sample.frame, weights, bias, motion, _residual_vectors(sample, weights))
+        return Model(
+            sample.version, sample.frame, weights, bias, motion, _residual_vectors(sample, weights), sample.object
+        )
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
@@ -102,6 +104,6 @@ def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | Non
     return direction / np.float32(contrast) if contrast > 0 else None
 
 
-@lru_cache(maxsize=1)  # all samples of a block have the same centres
+@lru_cache(maxsize=256)  # all samples of a block of one object have the same centres
 def _motion(centres: bytes) -> Motion | None:
     return learn_motion(np.frombuffer(centres, np.float64).reshape(-1, 2))

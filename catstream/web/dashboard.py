@@ -244,7 +244,7 @@ class Dashboard:
         if self.newest is None:
             return None
         preview = self.newest[0]
-        return {"frame": preview.frame, "width": preview.width, "height": preview.height, "box": preview.box}
+        return {"frame": preview.frame, "width": preview.width, "height": preview.height, "boxes": preview.boxes}
 
     def _points_part(self, new: int) -> list[list[float | None]]:
         return [[value if value is None else round(value, 3) for value in point] for point in list(self._points)[-new:]]
@@ -262,7 +262,7 @@ class Dashboard:
 
     def _surprising_part(self, _: int) -> dict[str, object]:
         frames = [
-            {"frame": one.frame, "time": one.time, "surprise": round(one.surprise, 3), "box": one.preview.box}
+            {"frame": one.frame, "time": one.time, "surprise": round(one.surprise, 3), "boxes": one.preview.boxes}
             | {"width": one.preview.width, "height": one.preview.height}
             for one in self.surprising.frames
         ]

@@ -51,25 +51,31 @@ class SurprisingFrames:
     def __init__(self) -> None:
         self.frames: list[SurprisingFrame] = []  #: in the order of the video
         self.measured = 0  #: number of measured frames
-        self._model: Model | None = None
+        self._models: dict[str, Model] = {}  # the newest of each object
         self._surprises: OrderedDict[int, tuple[float, float]] = OrderedDict()  # frame -> time, surprise
         self._pictures: OrderedDict[int, Preview] = OrderedDict()
 
     def adopt(self, model: Model) -> None:
         """Measure with this model from now on."""
-        self._model = model
+        self._models[model.object] = model
 
     def add_features(self, features: Features) -> bool:
         """Add the features of a frame; return whether the selection has changed."""
-        training = features.training.get(APPEARANCE)
-        if self._model is None or training is None or training.rows.shape[1] != len(self._model.weights):
+        surprises = [
+            surprise(training, model)
+            for name, part in features.objects.items()
+            if (model := self._models.get(name)) is not None
+            and (training := part.training.get(APPEARANCE)) is not None
+            and training.rows.shape[1] == len(model.weights)
+        ]
+        if not surprises:
             return False
-        self._keep(self._surprises, features.frame, (features.time, surprise(training, self._model)))
+        self._keep(self._surprises, features.frame, (features.time, max(surprises)))
         return self._match(features.frame)
 
     def add_preview(self, preview: Preview) -> bool:
         """Add the picture of a frame; return whether the selection has changed."""
-        if preview.box is None:
+        if not preview.boxes:
             return False
         self._keep(self._pictures, preview.frame, preview)
         return self._match(preview.frame)

@@ -69,13 +69,13 @@ class Sender(ChannelSocket[Message]):
         return self._window.stored
 
     @property
-    def version(self) -> int:
-        """Newest sample that the receiver has made."""
-        return self._window.version
+    def versions(self) -> dict[str, int]:
+        """Version of the newest sample of each object that the receiver has made, by name."""
+        return self._window.versions
 
-    def sample_of(self, seq: int) -> int:
-        """Newest sample that the messages up to `seq` led to: see `SendWindow.sample_of`."""
-        return self._window.sample_of(seq)
+    def samples_of(self, seq: int) -> dict[str, int]:
+        """Versions of the newest samples that the messages up to `seq` led to: see `SendWindow.samples_of`."""
+        return self._window.samples_of(seq)
 
     def ask_position(self) -> Position | None:
         """Ask once for the receiver's position; None if it does not answer in time."""

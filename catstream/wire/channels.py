@@ -2,11 +2,12 @@
 
     features   the training rows of each frame; every message is delivered exactly once: it is acknowledged, and
                retransmitted to a restarted receiver
-    samples    only the newest counts; a late joiner gets the last one at once
+    samples    only the newest of each object counts; a late joiner gets the last ones at once
     models     as samples
-    tracks     every message, to any number of subscribers; a slow one misses some, and sees by `seq` how many
-    results    the tracks again, acknowledged, for the process that started the pipeline, its owner; the files that it
-               writes are `catstream.job.Results`
+    tracks     every message, one for each object and frame, to any number of subscribers; a slow one misses some, and sees
+               by `seq` how many
+    results    the tracks again, one message a frame, acknowledged, for the process that started the pipeline, its owner;
+               the files that it writes are `catstream.job.Results`
     health     the newest of each process
     previews   small pictures of the newest frame; none is made while nobody subscribes
     control    commands and their answers; a command without an answer is sent again, and carried out once
@@ -22,7 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
-from catstream.messages import Answer, Command, End, Features, Health, Model, Preview, Run, Sample, Track
+from catstream.messages import Answer, Command, End, Features, Health, Model, Preview, Run, Sample, Track, Tracks
 
 __all__ = [
     "CHANNELS",
@@ -61,7 +62,7 @@ class Channel(Generic[Message]):
     port             offset from the first port; each further sender takes the next one
     megabytes        size of the largest message
     role             role that a peer which connects needs at least
-    high_water_mark  if every message counts: how many a subscriber may lag behind before it misses some
+    high_water_mark  how many messages a subscriber may lag behind before it misses some
     """
 
     name: str
@@ -91,16 +92,20 @@ FEATURES: Channel[Features | End] = Channel(
     "features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=64
 )
 SAMPLES: Channel[Sample | End] = Channel(
-    "samples", (Sample, End), ("compressor",), None, "newest", port=1, megabytes=512, role="watch"
+    "samples", (Sample, End), ("compressor",), None, "newest", port=1, megabytes=512, role="watch", high_water_mark=16
 )
-MODELS: Channel[Model] = Channel("models", (Model,), ("trainer",), None, "newest", port=2, megabytes=1, role="watch")
+MODELS: Channel[Model] = Channel(
+    "models", (Model,), ("trainer",), None, "newest", port=2, megabytes=1, role="watch", high_water_mark=256
+)
 TRACKS: Channel[Track | End] = Channel(
     "tracks", (Track, End), ("detector",), None, "every", port=3, megabytes=1, role="watch"
 )
-RESULTS: Channel[Track | End] = Channel("results", (Track, End), ("detector",), "owner", "every", port=4, megabytes=1)
-HEALTH: Channel[Health] = Channel("health", (Health,), _ALL, None, "newest", port=5, megabytes=1, role="watch")
+RESULTS: Channel[Tracks | End] = Channel("results", (Tracks, End), ("detector",), "owner", "every", port=4, megabytes=1)
+HEALTH: Channel[Health] = Channel(
+    "health", (Health,), _ALL, None, "newest", port=5, megabytes=1, role="watch", high_water_mark=16
+)
 PREVIEWS: Channel[Preview] = Channel(
-    "previews", (Preview,), ("detector",), None, "newest", port=8, megabytes=1, role="watch"
+    "previews", (Preview,), ("detector",), None, "newest", port=8, megabytes=1, role="watch", high_water_mark=8
 )
 CONTROL: Channel[Command | Answer] = Channel(
     "control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=1, role="steer"

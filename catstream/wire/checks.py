@@ -13,8 +13,9 @@ from typing import Any, get_origin
 import numpy as np
 
 from catstream.box import Box, Window
-from catstream.errors import ProtocolError
-from catstream.schema import LARGEST_INTEGER, Array, Bytes, Field, Named, OnlyWith, Whole, fields
+from catstream.errors import ObjectError, ProtocolError
+from catstream.names import check_name
+from catstream.schema import LARGEST_INTEGER, Array, ByObject, Bytes, Field, Name, Named, OnlyWith, Whole, fields
 
 __all__ = ["check_message"]
 
@@ -77,6 +78,8 @@ def _check_of(field: Field, where: str) -> _Check | None:
         return _array(array, where)
     if limits := field.limit(Bytes):
         return _bytes(limits, where)
+    if field.limit(Name):
+        return _object_name(where)
     if field.type is int:
         return _whole(where, least.low if (least := field.limit(Whole)) else 0)
     return {float: _number(where), Box: _rectangle(where), Window: _rectangle(where)}.get(field.type)
@@ -85,6 +88,7 @@ def _check_of(field: Field, where: str) -> _Check | None:
 def _map(field: Field, values: Field, where: str) -> _Check | None:
     """The check of a map: its names, and each value."""
     check_value, named = _check_of(values, where), field.limit(Named)
+    check_object = _object_name(where) if field.limit(ByObject) else None
     if check_value is None:
         return None
 
@@ -92,6 +96,9 @@ def _map(field: Field, values: Field, where: str) -> _Check | None:
         found = {name: check_value(entry, lengths) for name, entry in entries.items()}
         if named is not None:
             _check_names(found, named, where)
+        if check_object is not None:
+            for name in entries:
+                check_object(name, lengths)
 
     return checked
 
@@ -160,6 +167,16 @@ def _number(where: str) -> _Check:
     def checked(number: float, _: _Lengths) -> None:
         if not math.isfinite(number):
             raise ProtocolError(f"{where}: expected a finite number, got {number}", "finite")
+
+    return checked
+
+
+def _object_name(where: str) -> _Check:
+    def checked(name: str, _: _Lengths) -> None:
+        try:
+            check_name(name)
+        except ObjectError as error:
+            raise ProtocolError(f"{where}: {error}", "name") from None
 
     return checked
 

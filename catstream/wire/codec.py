@@ -1,12 +1,16 @@
 """Messages to bytes and back. Everything that arrives is checked before it is used.
 
-A message is one frame of msgpack, `[version, kind, fields]`:
+A message is one frame of msgpack, `[version, kind, object, fields]`:
 
-    version   2; another one is rejected
+    version   3; another one is rejected
     kind      name of the message in small letters: "features", "track" ...
+    object    name of the object that the message is about, "" if it is about none or about all
     fields    map from each field's name to its value, see `catstream.messages`
     a box     [x, y, w, h]
     an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
+
+Version, kind and object are the first bytes of a message, and thus its topic: a subscriber may take one kind of message,
+or that of one object.
 
 Every size has a limit before memory is taken for it. Then the message is checked against its
 schema (`catstream.wire.checks`). A field that this version does not know is ignored.
@@ -35,21 +39,24 @@ from catstream.messages import (
     Sample,
     Stored,
     Track,
+    Tracks,
 )
 from catstream.schema import LONGEST_LIST, LONGEST_TEXT
 from catstream.wire.checks import check_message
 
-__all__ = ["KINDS", "VERSION", "decode", "decode_json", "encode", "encode_json", "opening"]
+__all__ = ["KINDS", "VERSION", "decode", "decode_json", "encode", "encode_json", "opening", "topic_of"]
 
 Message = TypeVar("Message")
 
 #: Version of the envelope and of the meaning of the fields.
-VERSION = 2
+VERSION = 3
+
+_LONGEST_TOPIC = 512  # bytes
 
 #: Kinds of message, by their name on the wire.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind
-    for kind in (Answer, Command, End, Features, Health, Model, Position, Preview, Run, Sample, Stored, Track)
+    for kind in (Answer, Command, End, Features, Health, Model, Position, Preview, Run, Sample, Stored, Track, Tracks)
 }
 
 
@@ -62,7 +69,7 @@ def encode(message: object) -> bytes:
         If it breaks its schema: it would be rejected on arrival.
     """
     check_message(message)
-    return _ENCODER.encode((VERSION, type(message).__name__.lower(), message))
+    return _ENCODER.encode((VERSION, type(message).__name__.lower(), getattr(message, "object", ""), message))
 
 
 def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
@@ -88,11 +95,11 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
         raise ProtocolError(
             f"expected {expected}, got {len(data)} bytes that are not its msgpack: {error}", "msgpack"
         ) from None
-    if not isinstance(envelope, list) or len(envelope) != 3:
+    if not isinstance(envelope, list) or len(envelope) != 4:
         raise ProtocolError(
-            f"expected {expected} as [version, kind, fields], got something else in msgpack", "envelope"
+            f"expected {expected} as [version, kind, object, fields], got something else in msgpack", "envelope"
         )
-    version, name, fields = envelope
+    version, name, about, fields = envelope
     if version != VERSION:
         raise ProtocolError(
             f"expected version {VERSION} of the protocol, got {_brief(version)}: run the same catstream", "version"
@@ -104,13 +111,33 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
         message: Message = msgspec.convert(fields, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
         raise ProtocolError(f"{name}: {error}", "type") from None
+    if about != getattr(message, "object", ""):
+        raise ProtocolError(f"{name}: its topic is of the object {_brief(about)}, and its fields are not", "envelope")
     check_message(message)
     return message
 
 
-def opening(kind: type) -> bytes:
-    """The bytes that every message of a kind begins with."""
-    return _ENCODER.encode((VERSION, kind.__name__.lower(), None))[:-1]  # nil is one byte
+def opening(kind: type, about: str | None = None) -> bytes:
+    """The bytes that every message of a kind begins with; of those about one object, if a name is given."""
+    names = (kind.__name__.lower(),) if about is None else (kind.__name__.lower(), about)
+    return _ENCODER.encode((VERSION, *names, *[None] * (3 - len(names))))[: -(3 - len(names))]  # nil is one byte
+
+
+def topic_of(data: bytes | memoryview) -> bytes:
+    """The topic of a message: the bytes before its fields; all of the data if it is not a message.
+
+    >>> topic_of(encode(End(1, "over"))) == opening(End, "")
+    True
+    """
+    reader = msgpack.Unpacker(max_buffer_size=len(data) + 1, max_str_len=LONGEST_TEXT)
+    reader.feed(data[:_LONGEST_TOPIC])
+    try:
+        reader.read_array_header()
+        for _ in range(3):
+            reader.skip()
+    except (ValueError, msgpack.exceptions.UnpackException):
+        return bytes(data)
+    return bytes(data[: reader.tell()])
 
 
 def encode_json(message: object) -> bytes:

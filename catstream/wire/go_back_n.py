@@ -76,18 +76,19 @@ class SendWindow:
     acknowledged : newest seq that the receiver will not ask for again while it lives
     stored : newest seq that survives the receiver's death; less than `acknowledged` while its disk fails
     taken : newest seq that the receiver has processed
-    version : newest sample that the receiver has made
+    versions : version of the newest sample of each object that the receiver has made, by name
     """
 
     def __init__(self, channel: str, size: int, now: float) -> None:
-        self.sent = self.acknowledged = self.stored = self.taken = self.version = 0
+        self.sent = self.acknowledged = self.stored = self.taken = 0
         self._channel, self._size = channel, size
         self._unacknowledged: deque[tuple[int, bytes]] = deque()  # oldest first
         self._in_flight = 0  # how many of them were transmitted since the last Position
         self._sent_before = 0  # newest seq that a sender before this one may have sent
         self._last_reply = now
-        self._samples: deque[tuple[int, int]] = deque(maxlen=_MAX_SAMPLES)  # seq that led to a sample, its version
-        self._sample = 0  # version that `sample_of` returned last
+        self.versions: dict[str, int] = {}
+        self._changes: deque[tuple[int, dict[str, int]]] = deque(maxlen=_MAX_SAMPLES)  # seq that led to these versions
+        self._versions: dict[str, int] = {}  # that `samples_of` returned last
 
     def resume(self, seq: int, known: int) -> None:
         """Continue after message `seq` of an earlier sender, of which the receiver has stored `known`."""
@@ -146,21 +147,22 @@ class SendWindow:
             before = f"{self.taken} were processed and {self.acknowledged} acknowledged before"
             return Reject("acknowledgement", f"expected no step back ({before}), got {reply.taken} and {reply.seq}")
         self._last_reply = now
-        if reply.version > self.version:
-            self.version = reply.version
-            self._samples.append((self.taken + 1, reply.version))
+        versions = {name: max(version, self.versions.get(name, 0)) for name, version in reply.versions.items()}
+        if versions != self.versions:
+            self.versions = versions
+            self._changes.append((self.taken + 1, versions))
         self._forget(reply)
         self.taken = min(reply.seq if isinstance(reply, Position) else reply.taken, self.sent)
         return None
 
-    def sample_of(self, seq: int) -> int:
-        """Version of the newest sample that the messages up to `seq` led to; ask with a `seq` that never falls.
+    def samples_of(self, seq: int) -> dict[str, int]:
+        """Versions of the newest samples that the messages up to `seq` led to; ask with a `seq` that never falls.
 
         If the receiver did not reply to each message, a sample counts from the first message that it may be of.
         """
-        while self._samples and self._samples[0][0] <= seq:
-            self._sample = self._samples.popleft()[1]
-        return self._sample
+        while self._changes and self._changes[0][0] <= seq:
+            self._versions = self._changes.popleft()[1]
+        return self._versions
 
     def _go_back(self, position: Position) -> None:
         """Transmit everything again that the receiver has not."""
@@ -249,4 +251,4 @@ class ReceiveWindow:
 
     def _stored(self) -> Stored:
         at = self._position
-        return Stored(at.seq, self.taken, at.version, at.unsaved)
+        return Stored(at.seq, self.taken, at.versions, at.unsaved)

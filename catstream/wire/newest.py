@@ -1,11 +1,13 @@
 """Published channels (`samples`, `models`, `tracks`, `health`, `previews`, `training`): any number of subscribers.
 
-The publisher binds an XPUB socket, subscribers connect SUB sockets and subscribe to everything (the empty topic) or
-to one kind of message (the bytes that all of its messages begin with). The publisher never waits for a subscriber: one
-that falls too far behind misses messages.
+The publisher binds an XPUB socket, subscribers connect SUB sockets. They subscribe to everything (the empty topic), to
+one kind of message, or to the messages of one kind about one object (the bytes that these messages begin with, see
+`catstream.wire.codec.opening`). The publisher never waits for a subscriber: one that falls too far behind misses
+messages.
 
-If a channel keeps the newest message, it is transmitted again to late joiners, and once to all if nothing newer
-followed within 0.2 s: a burst may have cost a subscriber the last one. A `Subscriber` drops repeats.
+If a channel keeps the newest message, it keeps that of each object. They are transmitted again to late joiners, and once
+to all if nothing newer followed within 0.2 s: a burst may have cost a subscriber the last one. A `Subscriber` drops
+repeats.
 """
 
 from __future__ import annotations
@@ -18,16 +20,15 @@ from typing import TypeVar
 
 import zmq
 
-from catstream.messages import Health
+from catstream.messages import End, Health
 from catstream.wire.channels import Channel
-from catstream.wire.codec import encode, opening
+from catstream.wire.codec import encode, opening, topic_of
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.socket import ChannelSocket
 
 __all__ = ["Publisher", "Subscriber"]
 
-_NEWEST_SENT = 8  # messages that are queued for a subscriber if only the newest counts
-_NEWEST_RECEIVED = 16
+_MOST_KEPT = 256  # newest messages that are kept, one of each object
 _MAX_CHANGES = 1000  # subscriptions that are processed at once
 _MAX_SUBSCRIPTION_BYTES = 4096
 _REPEAT_SECONDS = 0.2  # without a newer message, after which the last one is sent again
@@ -53,13 +54,15 @@ class Publisher(ChannelSocket[Message]):
         first_message: Message | None = None,
     ) -> None:
         self._newest = channel.keeps == "newest"
-        super().__init__(zmq.XPUB, channel, endpoint, _NEWEST_SENT if self._newest else channel.high_water_mark)
+        super().__init__(zmq.XPUB, channel, endpoint, channel.high_water_mark)
         self._socket.set(zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES)
         self._socket.set(zmq.XPUB_VERBOSE, 1)  # report every subscription, also one that another subscriber has
-        self._topics = {b"", *map(opening, channel.messages)}  # that may be subscribed to
+        self._kinds = tuple(map(opening, channel.messages))  # the beginnings of topics that may be subscribed to
         self._subscribed: set[bytes] = set()
         self._expected: set[bytes] = set()  # topics of announced subscribers that are not connected yet
-        self._last: bytes | None = None if first_message is None else encode(first_message)
+        self._last: dict[bytes, bytes] = {}  # the messages for late joiners by topic, oldest first
+        if first_message is not None:
+            self._last[b""] = encode(first_message)
         self._repeat_at = math.inf
         self._bind(sender)
 
@@ -84,9 +87,21 @@ class Publisher(ChannelSocket[Message]):
             if self._subscribed:
                 self._socket.send(encode(message), copy=False)
             return
-        self._last, self._repeat_at = encode(message), monotonic() + _REPEAT_SECONDS
-        self._socket.send(self._last, copy=False)
+        data = encode(message)
+        if isinstance(message, End):  # nothing before it counts
+            self._last.clear()
+        self._last.pop(topic := topic_of(data), None)
+        self._last[topic] = data
+        if len(self._last) > _MOST_KEPT:
+            del self._last[next(iter(self._last))]
+        self._repeat_at = monotonic() + _REPEAT_SECONDS
+        self._socket.send(data, copy=False)
         self.serve_late_joiners()
+
+    def keep_only(self, objects: Iterable[str]) -> None:
+        """Send late joiners only messages about these objects from now on."""
+        topics = {opening(kind, name) for kind in self.channel.messages for name in objects}
+        self._last = {topic: data for topic, data in self._last.items() if topic in topics}
 
     def serve_late_joiners(self) -> None:
         """Process subscriptions; send the first or the last message again if it is due. Call once per iteration."""
@@ -98,16 +113,19 @@ class Publisher(ChannelSocket[Message]):
             except zmq.Again:
                 break
             due |= self._process(subscribes=change.startswith(b"\x01"), topic=change[1:])
-        if due and self._last is not None:
+        if due:
             self._repeat_at = math.inf
-            self._socket.send(self._last, copy=False)
+            for data in self._last.values():
+                self._socket.send(data, copy=False)
 
     def _process(self, subscribes: bool, topic: bytes) -> bool:
         """Process one subscription or its end; returns whether there is a new subscriber."""
         if topic.startswith(_READER):
             self._expected.discard(topic)
-        elif topic not in self._topics:
-            self._reject("subscription", "a message was dropped: one subscribes to everything, or to one kind")
+        elif topic and not topic.startswith(self._kinds):
+            self._reject(
+                "subscription", "a message was dropped: one subscribes to everything, or to messages of a kind"
+            )
         elif subscribes:
             self._subscribed.add(topic)
             return True
@@ -117,11 +135,15 @@ class Publisher(ChannelSocket[Message]):
 
 
 class Subscriber(ChannelSocket[Message]):
-    """Receives what is published from now on; if the channel keeps the newest message, the last one first.
+    """Receives what is published from now on; if the channel keeps the newest message, the last ones first.
+
+    Of a channel that keeps the newest message, older ones of the same object are passed over. The objects take turns: the
+    message of the object that has waited longest is received first.
 
     Parameters
     ----------
     only : the one kind of message to receive; None for all
+    about : name of the one object whose messages of this kind are received; None for all
     every : on a channel that keeps the newest message, receive older ones too, as far as they arrive
     reader : name by which this subscriber was announced, see `catstream.wire.announced`
     """
@@ -132,28 +154,28 @@ class Subscriber(ChannelSocket[Message]):
         endpoint: Endpoint,
         only: type | None = None,
         *,
+        about: str | None = None,
         every: bool = False,
         reader: str = "",
     ) -> None:
         self._newest = channel.keeps == "newest"
-        super().__init__(zmq.SUB, channel, endpoint, _NEWEST_RECEIVED if self._newest else channel.high_water_mark)
-        self._last: dict[str, bytes] = {}  # digest of the last message of each process, to drop repeats
-        if self._newest and len(channel.senders) == 1 and not every:
-            self._socket.set(zmq.CONFLATE, 1)
-        self._socket.subscribe(b"" if only is None else opening(only))
+        self._passes_over = self._newest and len(channel.senders) == 1 and not every
+        super().__init__(zmq.SUB, channel, endpoint, channel.high_water_mark)
+        self._arrived: dict[bytes, zmq.Frame] = {}  # newest message of each topic, the topic that waits longest first
+        self._last: dict[bytes, bytes] = {}  # digest of the last message of each topic or process, to drop repeats
+        self._socket.subscribe(b"" if only is None else opening(only, about))
         if reader:  # after the topic of the messages: subscriptions are transmitted in order, the empty one first
             self._socket.subscribe(_READER + reader.encode())
         self._connect()
 
     def pending(self) -> bool:
         """Whether something has arrived."""
-        return self._wait(0)
+        return bool(self._arrived) or self._wait(0)
 
     def receive(self, seconds: float) -> Message | None:
         """The next message, None if none arrived in time; repeats and what is rejected are passed over."""
         deadline = monotonic() + seconds
-        while self._wait(deadline - monotonic()):
-            frame = self._socket.recv(copy=False)
+        while (frame := self._next_frame(deadline)) is not None:
             message = self._decode(frame.buffer, *self.channel.messages)
             if message is not None and not (self._newest and self._is_repeat(message, frame.buffer)):
                 return message
@@ -163,9 +185,18 @@ class Subscriber(ChannelSocket[Message]):
         """All messages that have arrived, oldest first."""
         return list(iter(lambda: self.receive(0), None))
 
+    def _next_frame(self, deadline: float) -> zmq.Frame | None:
+        """The next message as it arrived, None if none arrives before the deadline."""
+        if not self._passes_over:
+            return self._socket.recv(copy=False) if self._wait(deadline - monotonic()) else None
+        while self._wait(0 if self._arrived else deadline - monotonic()):
+            frame = self._socket.recv(copy=False)
+            self._arrived[topic_of(frame.buffer)] = frame  # in the place of an older one
+        return self._arrived.pop(next(iter(self._arrived))) if self._arrived else None
+
     def _is_repeat(self, message: Message, data: memoryview) -> bool:
-        """Whether the last message of the same process was the same: it was sent again to a late joiner."""
-        sender = message.process if isinstance(message, Health) else ""
+        """Whether the last message of the same process or topic was the same: it was sent again to a late joiner."""
+        sender = message.process.encode() if isinstance(message, Health) else topic_of(data)
         before, digest = self._last.get(sender), blake2b(data, digest_size=16).digest()
         self._last[sender] = digest
         return before == digest

@@ -1,0 +1,172 @@
+"""The forest: the compressors of all objects of a stream, one for each, and their checkpoint."""
+
+from __future__ import annotations
+
+import os
+
+from catstream import storage
+from catstream.compression.compressor import Compressor
+from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.messages import Features, Position, Sample
+from catstream.settings import Settings
+from catstream.storage import Arrays, Metadata, with_prefix
+
+__all__ = ["Forest"]
+
+_KIND = "forest 1"  # and the version of what a checkpoint holds
+
+
+class Forest:
+    """Takes the features of every frame, and returns the samples of the objects whose trees have grown enough.
+
+    An object begins with its first features. If a message has no part for it, its trees are dropped. The same messages
+    make the same samples, bit for bit, also across `save` and `load`.
+
+    Attributes
+    ----------
+    seq, frame : number of the newest message, and of its frame
+    version : of the newest sample. All objects share one count, so that no version is ever used twice
+    compressors : the compressor of each object, by name
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.seq = self.version = 0
+        self.frame = -1
+        self.compressors: dict[str, Compressor] = {}
+
+    def add(self, compressor: Compressor) -> None:
+        """Add an object that was learned in an earlier stream, before the first message of this one."""
+        self.compressors[compressor.name] = compressor
+        self.version = max(self.version, compressor.version)
+
+    def check_features(self, features: Features) -> None:
+        """Raise ProtocolError if rows have another length than those before."""
+        width = max((compressor.width for compressor in self.compressors.values()), default=0)
+        for part in features.objects.values():
+            for training in part.training.values():
+                if width and training.rows.shape[1] != width:
+                    raise ProtocolError(
+                        f"features rows have length {training.rows.shape[1]}, those before {width}: "
+                        "start all processes with the same catstream and the same settings",
+                        "width",
+                    )
+
+    def take(self, features: Features) -> list[Sample]:
+        """Insert the features of one frame; returns the samples that are due.
+
+        A message whose `seq` was processed before is ignored.
+
+        Raises
+        ------
+        ProtocolError
+            If a message before this one is missing, or its rows have another length than those before. Nothing of it
+            is inserted.
+        """
+        if features.seq <= self.seq:
+            return []
+        if features.seq != self.seq + 1:
+            raise ProtocolError(
+                f"features {features.seq} came after {self.seq}: {features.seq - self.seq - 1} are missing, "
+                "send from the one after the last acknowledged"
+            )
+        self.check_features(features)  # before the first tree takes its rows, so that all trees hold the same frames
+        self.compressors = {name: self._compressor(name, part.begins) for name, part in features.objects.items()}
+        samples = []
+        for name, part in features.objects.items():
+            sample = self.compressors[name].take(features.frame, part, self.version + 1)
+            if sample is not None:
+                self.version = sample.version
+                samples.append(sample)
+        self.seq, self.frame = features.seq, features.frame
+        return samples
+
+    def _compressor(self, name: str, begins: bool) -> Compressor:
+        """The compressor of an object; a new one if it begins."""
+        before = None if begins else self.compressors.get(name)
+        return before or Compressor(self.settings, name)
+
+    @property
+    def position(self) -> Position:
+        """Position at which the stream continues, once everything that was processed is stored."""
+        objects = {name: compressor.position for name, compressor in self.compressors.items()}
+        return Position(self.seq, max(self.frame, 0), objects)
+
+    @property
+    def last_samples(self) -> list[Sample]:
+        """The newest sample of each object that has one."""
+        samples = [compressor.last_sample for compressor in self.compressors.values()]
+        return [sample for sample in samples if sample is not None]
+
+    def counters(self) -> dict[str, float]:
+        """Counters of all objects together, for the health messages."""
+        own = list(self.object_counters().values())
+        names = dict.fromkeys(name for counters in own for name in counters)
+        highest = {name for name in names if name in ("version", "level")}
+        total = {name: (max if name in highest else sum)(each[name] for each in own) for name in names}
+        return {"seq": self.seq, "objects": len(own)} | total | {"version": self.version}
+
+    def object_counters(self) -> dict[str, dict[str, float]]:
+        """Counters of each object, by name, for the health messages."""
+        return {name: compressor.counters() for name, compressor in self.compressors.items()}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything to one file, atomically."""
+        arrays, metadata = self.state()
+        storage.write(path, arrays, metadata | {"kind": _KIND})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], settings: Settings) -> Forest:
+        """Restore what `save` wrote.
+
+        Raises
+        ------
+        ProtocolError
+            If the file is damaged.
+        ServiceError
+            If it is not a checkpoint, or one of another version of catstream.
+        SettingsError
+            If it was made with another coreset size.
+        """
+        arrays, metadata = storage.read(path)
+        if (kind := metadata.get("kind")) != _KIND:
+            raise ServiceError(
+                f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: continue with the version that wrote it, "
+                "or start a new run in another folder"
+            )
+        try:
+            self = cls.from_state(arrays, metadata, settings)
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+            raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
+        trees = [tree for compressor in self.compressors.values() for tree in compressor.trees.values()]
+        if others := {tree.reduction for tree in trees} - {settings.coreset.reduction}:
+            raise SettingsError(
+                f"{path} holds trees of coreset.reduction={max(others)}, the settings say "
+                f"{settings.coreset.reduction}: continue with the same settings"
+            )
+        if sizes := {tree.size for tree in trees} - {settings.coreset.size}:
+            raise SettingsError(
+                f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset.size}: "
+                "continue with the same settings"
+            )
+        return self
+
+    def state(self) -> tuple[Arrays, Metadata]:
+        """Arrays and metadata that `from_state` restores."""
+        arrays: Arrays = {}
+        objects: list[Metadata] = []
+        for i, (name, compressor) in enumerate(self.compressors.items()):
+            own, metadata = compressor.state()
+            arrays |= {f"{i}.{key}": array for key, array in own.items()}
+            objects.append(metadata | {"name": name})
+        return arrays, {"seq": self.seq, "frame": self.frame, "version": self.version, "objects": objects}
+
+    @classmethod
+    def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings) -> Forest:
+        """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
+        self = cls(settings)
+        self.seq, self.frame, self.version = (int(metadata[name]) for name in ("seq", "frame", "version"))
+        for i, own in enumerate(metadata["objects"]):
+            name = str(own["name"])
+            self.compressors[name] = Compressor.from_state(with_prefix(arrays, f"{i}."), own, settings, name)
+        return self

@@ -1,0 +1,121 @@
+"""The detectors of all objects of a stream: one pyramid a frame, one message of features, a track for each object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from catstream.box import Box
+from catstream.detection.detector import Detector, Result
+from catstream.errors import ObjectError
+from catstream.features.pyramid import Pyramid
+from catstream.messages import Features, Model, Track, Tracks
+from catstream.names import check_count, check_name, listed
+from catstream.settings import Settings
+
+__all__ = ["Detectors", "prepare"]
+
+
+class Detectors:
+    """Follows the objects of one stream, each with a detector of its own.
+
+    For a frame, `begin` or `correct` the objects whose box is given, then `step`.
+
+    Attributes
+    ----------
+    seq : of the last messages
+    detectors : the detector of each object, by name, in the order in which they began
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.seq = 0
+        self.detectors: dict[str, Detector] = {}
+
+    def add(self, name: str) -> Detector:
+        """Return the detector of an object; a new one if there is none yet.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid, or there are too many objects.
+        """
+        if name not in self.detectors:
+            check_count(len(self.detectors) + 1, self.settings.run.objects_most)
+            self.detectors[name] = Detector(self.settings, check_name(name))
+        return self.detectors[name]
+
+    def begin(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:
+        """Start an object with its box in the next frame; another one of this name is forgotten.
+
+        Raises
+        ------
+        BoxError
+            As `Detector.init` does. Nothing changes.
+        ObjectError
+            If the name is not valid, or there are too many objects. Nothing changes.
+        """
+        is_new = name not in self.detectors
+        detector = self.add(name)
+        try:
+            return detector.init(frame, self.seq + 1, time, box)
+        except BaseException:
+            if is_new:
+                del self.detectors[name]
+            raise
+
+    def correct(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:
+        """Continue an object at another box in the next frame: see `Detector.correct`."""
+        return self.detectors[name].correct(frame, self.seq + 1, time, box)
+
+    def step(
+        self, frame: Pyramid, time: float = 0.0, given: Mapping[str, Result] | None = None
+    ) -> tuple[Tracks, Features]:
+        """Find the objects in the next frame.
+
+        Parameters
+        ----------
+        given : results of the objects that are not searched, by name: those of `begin` and `correct`
+        """
+        self.seq += 1
+        results = dict(given or {})
+        searched = {name: detector for name, detector in self.detectors.items() if name not in results}
+        found = {name: detector.look(frame, self.seq) for name, detector in searched.items()}
+        for name, detector in searched.items():
+            results[name] = detector.settle(found[name], frame, self.seq, time)
+        names = [*self.detectors, *(name for name in results if name not in self.detectors)]
+        tracks: dict[str, Track] = {name: results[name][0] for name in names}
+        parts = {name: results[name][1] for name in names}
+        return Tracks(self.seq, self.seq - 1, tracks), Features(self.seq, self.seq - 1, time, parts)
+
+    def forget(self, name: str) -> None:
+        """Follow an object no more.
+
+        Raises
+        ------
+        ObjectError
+            If there is no object of this name.
+        """
+        if name not in self.detectors:
+            raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.detectors)}")
+        del self.detectors[name]
+
+    def adopt(self, model: Model) -> None:
+        """Use a model for its object from now on, see `Detector.adopt`; one of a forgotten object is dropped."""
+        if (detector := self.detectors.get(model.object)) is not None:
+            detector.adopt(model)
+
+    def newest_versions(self, seq: int) -> dict[str, int]:
+        """Version of the newest model that arrived of each object that had begun by message `seq`, by name."""
+        return {
+            name: detector.newest_version
+            for name, detector in self.detectors.items()
+            if detector.state is not None and detector.state.first_frame < seq
+        }
+
+
+def prepare(settings: Settings) -> None:
+    """Import what `Detectors.begin` needs, if that takes long."""
+    if settings.teaching.bootstrap == "scm":
+        from catstream.paper import scm
+
+        scm.prepare()

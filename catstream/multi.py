@@ -1,0 +1,251 @@
+"""Several objects in one process: detectors, compressors and trainer, one after the other.
+
+The paper's three components in the order of its system figure: in each frame every object is searched with its last
+model, its training rows are added to its coreset trees, and a model is trained whenever these have grown.
+`catstream.pipeline` runs the same as three processes side by side.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from catstream import kalman, storage
+from catstream.compression.forest import Forest
+from catstream.detection.detector import Detector
+from catstream.detection.objects import Detectors, prepare
+from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, ServiceError
+from catstream.features.cells import row_length
+from catstream.features.pyramid import Pyramid
+from catstream.image import as_bgr
+from catstream.messages import Features, Model, Track, Tracks
+from catstream.names import Boxes, boxes_by_name, check_count
+from catstream.packing import pack, unpack
+from catstream.settings import Settings
+from catstream.storage import Arrays, Metadata, with_prefix
+from catstream.threads import one_thread
+from catstream.training.trainer import Trainer
+from catstream.wire.checks import check_message
+
+__all__ = ["MultiTracker"]
+
+_KIND = "tracker 3"  # and the version of what the file holds
+
+
+class MultiTracker:
+    """Follows several objects, frame by frame.
+
+    The same frames and settings give the same boxes, bit for bit; they are those of a `catstream.Pipeline` in lockstep.
+    While a call computes, linear algebra in this process runs on one thread; what was set before holds again once it
+    returns.
+
+    A frame is an array as `catstream.Tracker` takes it.
+
+    Parameters
+    ----------
+    settings : Settings or mapping of str
+        The settings that differ from the defaults.
+
+    Examples
+    --------
+    >>> frame = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
+    >>> tracker = MultiTracker()
+    >>> tracker.init(frame, {"anna": (60, 40, 40, 40), "ben": (10, 70, 30, 30)})
+    >>> tracks = tracker.update(np.roll(frame, 2, axis=1))
+    >>> tracks["ben"].box.overlap((12, 70, 30, 30)) > 0.9
+    True
+    """
+
+    def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
+        self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
+        self._tracks: dict[str, Track] | None = None
+
+    @property
+    def tracks(self) -> dict[str, Track]:
+        """The result of each object for the last frame, by name.
+
+        Raises
+        ------
+        BoxError
+            Before `init`.
+        """
+        if self._tracks is None:
+            raise BoxError("nothing is tracked yet: call init with a frame and a box first")
+        return dict(self._tracks)
+
+    def init(self, frame: np.ndarray, boxes: Boxes, time: float = 0.0) -> None:
+        """Start with the boxes of objects, and forget everything before.
+
+        Parameters
+        ----------
+        frame : ndarray
+            The image.
+        boxes : mapping of str to boxes
+            The box of each object by its name: x, y, w, h in pixels, for example `{"anna": (120, 80, 64, 48)}`.
+        time : float
+            Seconds since the start of the video.
+
+        Raises
+        ------
+        BoxError
+            For a box that is not in the frame, has no area, or is not a number.
+        FrameError
+            For an array that is not a frame.
+        ObjectError
+            For a name that is not valid, no object, or too many objects.
+        """
+        image, boxes = as_bgr(frame), boxes_by_name(boxes)
+        if not boxes:
+            raise ObjectError("there is no object to follow: give a box for at least one name")
+        check_count(len(boxes), self.settings.run.objects_most)
+        detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
+        prepare(self.settings)  # a library is held to one thread if it is there when a call begins
+        with one_thread():
+            pyramid = Pyramid.of(image)
+            given = {name: detectors.begin(name, pyramid, box, time) for name, box in boxes.items()}
+            # If a box was refused, nothing has changed.
+            self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
+            self._learn(*detectors.step(pyramid, time, given))
+
+    def update(self, frame: np.ndarray, time: float = 0.0, *, begin: Boxes | None = None) -> dict[str, Track]:
+        """Find the objects in the next frame, and learn from it.
+
+        Parameters
+        ----------
+        begin : mapping of str to boxes
+            The boxes of objects that begin in this frame. An object of the same name is forgotten.
+
+        Returns
+        -------
+        the track of each object, by name
+
+        Raises
+        ------
+        BoxError
+            Before `init`, or for a box as there.
+        FrameError
+            For an array that is not a frame, or is of another size than those before.
+        ObjectError
+            For a name as in `init`.
+        """
+        _ = self.tracks
+        image, boxes = as_bgr(frame), boxes_by_name(begin or {})
+        if image.shape[:2] != self._size:
+            (height, width), (first_height, first_width) = image.shape[:2], self._size
+            raise FrameError(
+                f"this frame is {width}x{height} pixels, those before it {first_width}x{first_height}: "
+                "resize it, or call init to begin anew"
+            )
+        with one_thread():
+            pyramid = Pyramid.of(image)
+            given = {name: self.detectors.begin(name, pyramid, box, time) for name, box in boxes.items()}
+            self._learn(*self.detectors.step(pyramid, time, given))
+        return self.tracks
+
+    def forget(self, name: str) -> None:
+        """Follow an object no more; everything learned of it is dropped with the next frame.
+
+        Raises
+        ------
+        BoxError
+            Before `init`.
+        ObjectError
+            If there is no object of this name.
+        """
+        _ = self.tracks
+        self.detectors.forget(name)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything that was learned to one file, atomically: `load` continues from there.
+
+        Raises
+        ------
+        BoxError
+            Before `init`.
+        ServiceError
+            If it cannot be written.
+        """
+        tracks = Tracks(self.forest.seq, self.forest.frame, self.tracks)
+        arrays, metadata = self.forest.state()
+        objects: list[Metadata] = []
+        for i, (name, detector) in enumerate(self.detectors.detectors.items()):
+            model, model_metadata = pack(detector.model, f"model.{i}")
+            start, start_metadata = detector.scm_state()
+            arrays |= model | {f"bootstrap.{i}.{key}": array for key, array in start.items()}
+            objects.append({"name": name, "model": model_metadata, "bootstrap": start_metadata})
+        whole: Metadata = {
+            "kind": _KIND,
+            "program": version("catstream"),
+            "settings": self.settings.texts(),
+            "size": list(self._size),
+            "tracks": pack(tracks, "tracks")[1],
+            "forest": metadata,
+            "objects": objects,
+        }
+        try:
+            storage.write(path, arrays, whole)
+        except OSError as error:
+            raise ServiceError(f"cannot write {str(path)!r} ({error}): give another file") from None
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """A tracker that continues where `save` was called, bit for bit.
+
+        Raises
+        ------
+        ServiceError
+            If there is no such file, or it cannot be read.
+        ProtocolError
+            If it is damaged, another file, or of a catstream with other features.
+        """
+        if not Path(path).is_file():
+            raise ServiceError(f"there is no saved tracker {str(path)!r}: `{cls.__name__}.save` writes one")
+        arrays, metadata = storage.read(path)
+        try:
+            if metadata.get("kind") != _KIND:
+                raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")
+            return cls._of(arrays, metadata)
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+            raise ProtocolError(f"{path} is not a saved tracker ({error}): `{cls.__name__}.save` writes one") from None
+
+    @classmethod
+    def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
+        self = cls(Settings.from_values(metadata["settings"]))
+        self.forest = Forest.from_state(arrays, metadata["forest"], self.settings)
+        self.trainer, self.detectors = Trainer(self.settings), Detectors(self.settings)
+        self.detectors.seq = self.forest.seq
+        for i, each in enumerate(metadata["objects"]):
+            model = unpack(Model, arrays, each["model"], f"model.{i}")
+            check_message(model)
+            if len(model.weights) != row_length():
+                raise ValueError(
+                    f"its model has {len(model.weights)} weights, the features of this catstream are {row_length()}: "
+                    f"catstream {metadata['program']} wrote it"
+                )
+            self._resume(self.detectors.add(str(each["name"])), model)
+            self.detectors.detectors[each["name"]].resume_scm(with_prefix(arrays, f"bootstrap.{i}."), each["bootstrap"])
+        height, width = metadata["size"]
+        self._size = int(height), int(width)
+        tracks = unpack(Tracks, arrays, metadata["tracks"], "tracks")
+        check_message(tracks)
+        self._tracks = tracks.tracks
+        kalman.prepare()
+        return self
+
+    def _resume(self, detector: Detector, model: Model) -> None:
+        state = self.forest.compressors[detector.name].detector
+        if state is None:
+            raise ValueError(f"it does not say where the object {detector.name!r} was")
+        detector.resume(state, model)
+
+    def _learn(self, tracks: Tracks, features: Features) -> None:
+        self._tracks = tracks.tracks
+        for sample in self.forest.take(features):
+            self.detectors.adopt(self.trainer.train(sample))
+        if tracks.frame >= self.settings.search.motion_frames // 2:
+            kalman.prepare()  # after twice as many frames, a sample has the centres

@@ -1,0 +1,90 @@
+"""Names of objects. Each object of a stream has its own; an object that is alone may have none, which is the name ""."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+
+from catstream.box import Box
+from catstream.errors import ObjectError
+
+__all__ = ["UNNAMED", "Boxes", "boxes_by_name", "check_count", "check_name", "listed", "split_name"]
+
+#: The name of an object that has none.
+UNNAMED = ""
+
+#: The boxes of objects: of one object without a name, or by name.
+Boxes = str | Iterable[float] | Mapping[str, str | Iterable[float]]
+
+_LONGEST = 64
+_NAME = re.compile(rf"(\w[\w.-]{{0,{_LONGEST - 1}}})?")
+
+
+def check_name(name: str) -> str:
+    """Return the name of an object; raise ObjectError if it is not valid.
+
+    Examples
+    --------
+    >>> check_name("anna-2")
+    'anna-2'
+    """
+    if not _NAME.fullmatch(name):
+        raise ObjectError(
+            f"{name[:80]!r} is not a name: expected 1 to {_LONGEST} letters, digits, '_', '-' and '.', the first of them "
+            "a letter, a digit or '_'"
+        )
+    return name
+
+
+def split_name(text: str) -> tuple[str, str]:
+    """Split the text NAME=VALUE; the name is "" if there is only a value.
+
+    Examples
+    --------
+    >>> split_name("anna=120,80,64,48"), split_name("120,80,64,48")
+    (('anna', '120,80,64,48'), ('', '120,80,64,48'))
+    """
+    name, equals, value = text.partition("=")
+    if not equals:
+        return UNNAMED, text
+    if not name:
+        raise ObjectError(f"{text[:80]!r} has no name before the '=': write NAME={value[:60]}, or only the value")
+    return check_name(name), value
+
+
+def boxes_by_name(boxes: Boxes) -> dict[str, Box]:
+    """The boxes of objects by name.
+
+    Raises
+    ------
+    BoxError, ObjectError
+        For a box or a name that is not valid.
+
+    Examples
+    --------
+    >>> boxes_by_name("120,80,64,48")
+    {'': Box(x=120.0, y=80.0, w=64.0, h=48.0)}
+    """
+    if isinstance(boxes, Mapping):
+        return {check_name(name): Box.parse(box) for name, box in boxes.items()}
+    return {UNNAMED: Box.parse(boxes)}
+
+
+def check_count(count: int, most: int) -> None:
+    """Raise ObjectError if there are more objects than allowed."""
+    if count > most:
+        raise ObjectError(
+            f"{count} objects are more than {most}: follow fewer, or raise the limit (--set run.objects_most={count}, up to "
+            "256)"
+        )
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names of objects, for a message to the user.
+
+    Examples
+    --------
+    >>> listed(["anna", ""]), listed([])
+    ("anna, the object without a name", 'none')
+    """
+    return ", ".join(name or "the object without a name" for name in names) or "none"
