@@ -89,8 +89,8 @@ class Job:
     def __post_init__(self) -> None:
         if both := self.boxes.keys() & self.models.keys():
             raise SettingsError(
-                f"{listed(sorted(both))}: a box gives the position of an object, and a model searches for it: give one of "
-                "them"
+                f"{listed(sorted(both))}: a box gives the position of an object, and a model searches for it: "
+                "give one of them"
             )
         check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
 

@@ -323,8 +323,8 @@ class Track:
         name = f"object={self.object!r}, " if self.object else ""
         box = None if self.box is None else f"({', '.join(f'{side:.1f}' for side in self.box)})"
         return (
-            f"Track({name}frame={self.frame}, time={self.time:.3f}, state={self.state!r}, box={box}, score={self.score:.2f}, "
-            f"model_version={self.model_version})"
+            f"Track({name}frame={self.frame}, time={self.time:.3f}, state={self.state!r}, box={box}, "
+            f"score={self.score:.2f}, model_version={self.model_version})"
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Names of objects. Each object of a stream has its own; an object that is alone may have none, which is the name ""."""
+"""Names of objects: each object of a stream has its own. A single object may have none; its name is then ""."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def check_name(name: str) -> str:
     """
     if not _NAME.fullmatch(name):
         raise ObjectError(
-            f"{name[:80]!r} is not a name: expected 1 to {_LONGEST} letters, digits, '_', '-' and '.', the first of them "
-            "a letter, a digit or '_'"
+            f"{name[:80]!r} is not a name: expected 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
+            "the first of them a letter, a digit or '_'"
         )
     return name
 
@@ -74,8 +74,8 @@ def check_count(count: int, most: int) -> None:
     """Raise ObjectError if there are more objects than allowed."""
     if count > most:
         raise ObjectError(
-            f"{count} objects are more than {most}: follow fewer, or raise the limit (--set run.objects_most={count}, up to "
-            "256)"
+            f"{count} objects are more than {most}: follow fewer, or raise the limit "
+            f"(--set run.objects_most={count}, up to 256)"
         )
 
 

@@ -109,8 +109,8 @@ class Pipeline:
     Raises
     ------
     BoxError, ObjectError, VideoError
-        From the constructor, if a box is not in the frame, a name is not valid, there are too many objects, or the source
-        cannot be read.
+        From the constructor, if a box is not in the frame, a name is not valid, there are too many objects, or the
+        source cannot be read.
     RecordingError
         From the constructor, if the file to record to exists.
     SettingsError

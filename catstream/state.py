@@ -45,7 +45,7 @@ def position(folder: Path, settings: Settings) -> Position:
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
-    """The model, sample and box of an object in the newest valid checkpoint; the model is trained again from the sample.
+    """The model, sample and box of an object in the newest valid checkpoint; the model is trained from the sample.
 
     Raises
     ------

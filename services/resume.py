@@ -17,13 +17,13 @@ class Start:
     """The point of a stream after which the detectors continue.
 
     seq      the last message that every receiver has stored
-    objects  of each object that continues: the state of its detector after that message, and the model that belongs to it
+    objects  the state of the detector of each object after that message, and the model that belongs to it
     desired  the desired state from there on
     """
 
     seq: int
     objects: dict[str, tuple[DetectorState, Model]] = field(default_factory=dict)
-    desired: DesiredState = DesiredState()
+    desired: DesiredState = field(default_factory=DesiredState)
 
 
 def agree(features: Position, models: Mapping[str, Model], desired: DesiredState) -> bool:
@@ -52,8 +52,8 @@ def start(
 ) -> Start:
     """Return the start of the detectors: after the last message that every receiver has stored.
 
-    If nothing was learned of any object yet, it is before the first frame of the first of them. If nothing was learned of
-    one of several objects, which takes long with the paper's first tracker only, it begins anew where it was last.
+    If nothing was learned of any object yet, it is before the first frame of the first of them. If nothing was learned
+    of one of several objects, which takes long with the paper's first tracker only, it begins anew where it was last.
 
     Parameters
     ----------

@@ -32,8 +32,8 @@ Result = tuple[Track, ObjectFeatures]
 class Detector:
     """Follows one object with the newest model.
 
-    Call `init` with the first frame, or `seek` before it. For every other frame call `look`, then `settle`; `adopt` models
-    as they arrive.
+    Call `init` with the first frame, or `seek` before it. For every other frame call `look`, then `settle`; `adopt`
+    models as they arrive.
 
     Attributes
     ----------

@@ -9,8 +9,8 @@ A message is one frame of msgpack, `[version, kind, object, fields]`:
     a box     [x, y, w, h]
     an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
 
-Version, kind and object are the first bytes of a message, and thus its topic: a subscriber may take one kind of message,
-or that of one object.
+Version, kind and object are the first bytes of a message, and thus its topic: a subscriber may take one kind of
+message, or that of one object.
 
 Every size has a limit before memory is taken for it. Then the message is checked against its
 schema (`catstream.wire.checks`). A field that this version does not know is ignored.

@@ -5,9 +5,9 @@ one kind of message, or to the messages of one kind about one object (the bytes 
 `catstream.wire.codec.opening`). The publisher never waits for a subscriber: one that falls too far behind misses
 messages.
 
-If a channel keeps the newest message, it keeps that of each object. They are transmitted again to late joiners, and once
-to all if nothing newer followed within 0.2 s: a burst may have cost a subscriber the last one. A `Subscriber` drops
-repeats.
+If a channel keeps the newest message, it keeps that of each object. They are transmitted again to late joiners, and
+once to all if nothing newer followed within 0.2 s: a burst may have cost a subscriber the last one. A `Subscriber`
+drops repeats.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ class Publisher(ChannelSocket[Message]):
 class Subscriber(ChannelSocket[Message]):
     """Receives what is published from now on; if the channel keeps the newest message, the last ones first.
 
-    Of a channel that keeps the newest message, older ones of the same object are passed over. The objects take turns: the
+    If the channel keeps the newest message, older ones of the same object are passed over. The objects take turns: the
     message of the object that has waited longest is received first.
 
     Parameters
