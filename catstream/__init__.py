@@ -1,4 +1,4 @@
-"""catstream tracks one object in a video stream. It learns the object from a single box, online, on a CPU.
+"""catstream tracks objects in a video stream. It learns each object from a single box, online, on a CPU.
 
     import catstream
 
@@ -6,7 +6,8 @@
         for track in pipeline:
             print(track.frame, track.state, track.box, track.score)
 
-`catstream.Tracker` tracks in one process, frame by frame, like a `cv2.Tracker`. While a pipeline runs, other processes
+`catstream.Tracker` tracks in one process, frame by frame, like a `cv2.Tracker`, and `catstream.MultiTracker` tracks several
+objects. While a pipeline runs, other processes
 receive its messages with `catstream.subscribe` and send commands to it with `catstream.control`.
 """
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from catstream.box import Box
     from catstream.errors import CatstreamError
     from catstream.messages import Track
+    from catstream.multi import MultiTracker
     from catstream.pipeline import Pipeline
     from catstream.settings import Settings
     from catstream.steering import Control, control
@@ -30,6 +32,7 @@ __all__ = [
     "Box",
     "CatstreamError",
     "Control",
+    "MultiTracker",
     "Pipeline",
     "Settings",
     "Subscription",
@@ -47,6 +50,7 @@ _HOMES = {
     "Box": "box",
     "CatstreamError": "errors",
     "Control": "steering",
+    "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "settings",
     "Subscription": "subscription",
