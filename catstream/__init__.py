@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from catstream.adapters import to_supervision
     from catstream.box import Box
     from catstream.errors import CatstreamError
+    from catstream.learned import Learned, merge
     from catstream.messages import Track
     from catstream.multi import MultiTracker
     from catstream.pipeline import Pipeline
@@ -32,6 +33,7 @@ __all__ = [
     "Box",
     "CatstreamError",
     "Control",
+    "Learned",
     "MultiTracker",
     "Pipeline",
     "Settings",
@@ -40,6 +42,7 @@ __all__ = [
     "Tracker",
     "__version__",
     "control",
+    "merge",
     "subscribe",
     "to_supervision",
 ]
@@ -50,6 +53,7 @@ _HOMES = {
     "Box": "box",
     "CatstreamError": "errors",
     "Control": "steering",
+    "Learned": "learned",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "settings",
@@ -57,6 +61,7 @@ _HOMES = {
     "Track": "messages",
     "Tracker": "tracker",
     "control": "steering",
+    "merge": "learned",
     "subscribe": "subscription",
     "to_supervision": "adapters",
 }

@@ -1,42 +1,107 @@
-"""A saved model: with it, the object is found again in another video, and training continues.
+"""A saved model: everything that was learned of one object, as one file.
 
-The file has the newest model, the sample of the coreset trees that it was trained on, and the last box.
+The file contains the coreset trees whole, with the energy that they have lost, and the model that was trained from
+them. Tracking goes on from it in another video, as if the frames had come from one stream.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
 from catstream import storage
-from catstream.box import Box
-from catstream.errors import ProtocolError, ServiceError
-from catstream.messages import Model, Sample
+from catstream.box import Box, Window
+from catstream.compression.compressor import Compressor, sample_of
+from catstream.compression.reduce import energy
+from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
+from catstream.detection.likeness import Likeness
+from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.features.cells import row_length
+from catstream.heads import HEADS
+from catstream.messages import Model
 from catstream.packing import pack, unpack
+from catstream.settings import Settings
 from catstream.storage import Arrays, Metadata
+from catstream.threads import one_thread
+from catstream.training.trainer import Trainer
 from catstream.wire.checks import check_message
 
-__all__ = ["Learned"]
+__all__ = ["Learned", "merge"]
 
-_KIND = "learned 2"  # and the version of what the file holds
+_KIND = "learned 3"  # and the version of what the file holds
+
+#: Settings that say what a feature row and a tree contain: models can be merged, and continued, only if they agree.
+_SAME = ("coreset.size", "coreset.reduction", "search.context", "teaching.colours", "teaching.classifier")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Learned:
-    """A model and the sample that it was trained on.
+    """Everything that was learned of an object. The trees are not changed: `compressor` makes copies of them.
 
-    model   the newest model; loaded from a file, its frame is 0
-    sample  the sample that the model was trained on
-    box     last box of the object, in pixels: a search begins with its size
+    object        name of the object, empty for the object without a name
+    trees         coreset tree of each head of `catstream.heads`
+    centres       centres of the object in the last complete block of frames, as in a `Sample`
+    origins       digest of the first training rows of each stream that the trees contain
+    box           last box of the object in pixels; only its size matters in another video
+    first_window  window of the object in its first frame: the search prefers its size and aspect ratio
+    model         trained from the trees; its frame is 0
+    settings      that the trees and the model were made with
     """
 
-    model: Model
-    sample: Sample
+    object: str
+    trees: dict[str, CoresetTree]
+    centres: np.ndarray
+    origins: tuple[str, ...]
     box: Box
+    first_window: Window
+    model: Model
+    settings: Settings
+
+    @classmethod
+    def of(cls, compressor: Compressor, settings: Settings) -> Self:
+        """Everything that a compressor knows of its object, with a model trained from it.
+
+        Raises
+        ------
+        ServiceError
+            If the trees have no leaf yet, or the object was not found yet.
+        """
+        state = compressor.detector
+        if compressor.box is None or state is None or state.first_window is None or not compressor.version:
+            raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
+        trees = {head: tree.copy() for head, tree in compressor.trees.items()}
+        centres, name = compressor.centres, compressor.name
+        model = _trained(trees, centres, compressor.version, name, settings)
+        return cls(name, trees, centres, compressor.origins, compressor.box, state.first_window, model, settings)
+
+    def compressor(self, settings: Settings, name: str = "") -> Compressor:
+        """A compressor that inserts the frames of another stream into copies of the trees; versions continue.
+
+        Parameters
+        ----------
+        name : name of the object in that stream
+
+        Raises
+        ------
+        SettingsError
+            If the settings do not suit the trees.
+        """
+        _check_same(self.settings, settings, "the saved model was learned", "this run has")
+        return Compressor.continuing(self.trees, self.model.version, self.centres, self.origins, settings, name)
+
+    def likeness(self) -> Likeness:
+        """Measures the likeness of a window to the object, from the trees: see `catstream.detection.likeness`."""
+        tree, background = self.trees["object"], self.trees["background"]
+        rows = np.vstack([*(node.rows for node in tree.nodes), tree.pending])
+        whole = energy(rows) + tree.dropped_energy
+        mean = (background.sum / background.rows_seen).astype(np.float32)
+        return Likeness.of(rows, whole, tree.sum, tree.rows_seen, mean)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one safetensors file, atomically.
@@ -46,43 +111,144 @@ class Learned:
         ServiceError
             If it cannot be written.
         """
-        sample_arrays, sample_metadata = pack(self.sample, "sample")
-        model_arrays, model_metadata = pack(self.model, "model")
-        metadata: Metadata = {"kind": _KIND, "box": list(self.box), "sample": sample_metadata, "model": model_metadata}
         try:
-            storage.write(path, sample_arrays | model_arrays, metadata)
+            storage.write_atomically(path, self.to_bytes())
         except OSError as error:
             raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another file") from None
 
+    def to_bytes(self) -> bytes:
+        """The content of the file that `save` writes."""
+        arrays, trees = pack_trees(self.trees)
+        model_arrays, model = pack(self.model, "model")
+        metadata: Metadata = {
+            "kind": _KIND,
+            "object": self.object,
+            "trees": trees,
+            "origins": list(self.origins),
+            "box": list(self.box),
+            "first_window": list(self.first_window),
+            "model": model,
+            "settings": self.settings.portable(),
+        }
+        return storage.encode(arrays | model_arrays | {"centres": self.centres}, metadata)
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read what `save` wrote.
+        """Read the file that `save` wrote.
 
         Raises
         ------
         ServiceError
             If it does not exist.
         ProtocolError
-            If it is damaged, or another file.
+            If it is damaged, another file, or one of other features.
         """
         if not Path(path).is_file():
             raise ServiceError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
-        arrays, metadata = storage.read(path)
+        return cls.from_bytes(Path(path).read_bytes(), str(path))
+
+    @classmethod
+    def from_bytes(cls, data: bytes, name: str) -> Self:
+        """The reverse of `to_bytes`; `name` of the file is for the errors, which are those of `load`."""
+        arrays, metadata = storage.decode(data, name)
         try:
             if metadata.get("kind") != _KIND:
                 raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")
             learned = cls._of(arrays, metadata)
-            for message in (learned.model, learned.sample):
-                check_message(message)
-            x, y, w, h = learned.box
-            if not (np.isfinite((x, y)).all() and 0 < w < np.inf and 0 < h < np.inf):
-                raise ValueError(f"its box is {learned.box}")
+            learned._check()
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ProtocolError(f"{path} is not a saved model ({error}): `catstream save` writes one") from None
+            raise ProtocolError(f"{name} is not a saved model ({error}): `catstream save` writes one") from None
+        width = len(learned.model.weights)
+        if width != row_length():
+            raise ProtocolError(
+                f"{name} has {width} features of a window, this catstream has {row_length()}: "
+                "learn the object anew with this catstream"
+            )
         return learned
 
     @classmethod
     def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
-        sample = unpack(Sample, arrays, metadata["sample"], "sample")
-        model = unpack(Model, arrays, metadata["model"], "model")
-        return cls(replace(model, frame=0), replace(sample, frame=0), Box(*map(float, metadata["box"])))
+        trees = unpack_trees(arrays, metadata["trees"])
+        return cls(
+            str(metadata["object"]),
+            {name: trees[name] for name in HEADS},
+            arrays["centres"],
+            tuple(map(str, metadata["origins"])),
+            Box(*map(float, metadata["box"])),
+            Window(*map(float, metadata["first_window"])),
+            unpack(Model, arrays, metadata["model"], "model"),
+            Settings.from_values(metadata["settings"]),
+        )
+
+    def _check(self) -> None:
+        """Raise ValueError if the parts do not belong together."""
+        check_message(self.model)
+        check_message(sample_of(self.trees, self.model.version, 0, self.centres, self.object))
+        for rectangle in (self.box, self.first_window):
+            x, y, w, h = rectangle
+            if not (np.isfinite((x, y)).all() and 0 < w < np.inf and 0 < h < np.inf):
+                raise ValueError(f"its box is {rectangle}")
+        for name, head in HEADS.items():
+            tree, width = self.trees[name], len(self.model.weights) + head.more_columns
+            if tree.size != self.settings.coreset.size or tree.width not in (0, width):
+                raise ValueError(f"its tree {name!r} has {tree.size} rows of length {tree.width}")
+
+
+def merge(parts: Sequence[Learned]) -> Learned:
+    """One saved model from several of the same object, as if one stream had contained all their frames.
+
+    The trees are merged, and a model is trained from them. The bound of the merged tree is the sum of the bounds plus
+    the energy that the merge itself loses; both are in its `dropped_energy`. The order of the parts does not matter
+    for the numbers of rows; the rows themselves may differ within the bound.
+
+    Raises
+    ------
+    SettingsError
+        If there are fewer than two, if their settings or names differ, or if two contain the same frames.
+    """
+    if len(parts) < 2:
+        raise SettingsError(f"{len(parts)} saved model given: a merge needs two or more")
+    return reduce(_merged, parts)
+
+
+def _merged(one: Learned, other: Learned) -> Learned:
+    if one.object and other.object and one.object != other.object:
+        raise SettingsError(
+            f"one saved model is of {one.object!r}, another of {other.object!r}: "
+            "only models of the same object can be merged"
+        )
+    _check_same(one.settings, other.settings, "one saved model was learned", "another")
+    if set(one.origins) & set(other.origins):
+        raise SettingsError(
+            "two of the saved models have learned from the same frames, which would count twice: "
+            "merge models of different videos"
+        )
+    trees = {name: one.trees[name].merged(other.trees[name]) for name in HEADS}
+    version = max(one.model.version, other.model.version)
+    centres, name = one.centres if len(one.centres) else other.centres, one.object or other.object
+    # The geometric mean of the sizes does not depend on the order.
+    scale = np.sqrt(np.divide(other.box[2:], one.box[2:]))
+    return replace(
+        one,
+        object=name,
+        trees=trees,
+        centres=centres,
+        origins=one.origins + other.origins,
+        box=one.box.scaled(*map(float, scale)),
+        model=_trained(trees, centres, version, name, one.settings),
+    )
+
+
+def _trained(
+    trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings
+) -> Model:
+    with one_thread():  # as a pipeline's own trainer: the model has the same bits
+        return Trainer(settings).train(sample_of(trees, version, 0, centres, name))
+
+
+def _check_same(ours: Settings, theirs: Settings, one: str, other: str) -> None:
+    """Raise SettingsError if settings that both sides share differ."""
+    known, given = ours.texts(), theirs.texts()
+    for name in _SAME:
+        if known[name] != given[name]:
+            raise SettingsError(f"{one} with {name}={known[name]}, {other} {name}={given[name]}: use the same setting")

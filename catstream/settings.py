@@ -215,7 +215,14 @@ class BeliefSettings(_Group):
             "Difference of score to the best window elsewhere in the frame that an object of a saved model needs to be "
             "detected for the first time."
         ),
-    ] = 0.25
+    ] = 0.2
+    sighting_likeness: Annotated[
+        float,
+        _about(
+            "Likeness to the object of a saved model that it needs to be detected for the first time: share of a "
+            "window's appearance in the subspace of the object, relative to that of the object itself."
+        ),
+    ] = 0.5
     sighting_frames: Annotated[
         int, _about("Successive frames that must agree before an object of a saved model is detected.", ge=1)
     ] = 3

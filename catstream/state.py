@@ -17,14 +17,13 @@ from pathlib import Path
 
 from catstream import storage
 from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.compression.compressor import Compressor
 from catstream.errors import ObjectError, ServiceError
 from catstream.job import Job
 from catstream.learned import Learned
 from catstream.messages import Position
 from catstream.names import UNNAMED, listed
 from catstream.settings import Settings
-from catstream.threads import one_thread
-from catstream.training.trainer import Trainer
 
 __all__ = ["TREES", "began", "learned", "locked", "position"]
 
@@ -45,7 +44,7 @@ def position(folder: Path, settings: Settings) -> Position:
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
-    """The model, sample and box of an object in the newest valid checkpoint; the model is trained from the sample.
+    """Everything that was learned of an object up to the newest valid checkpoint.
 
     Raises
     ------
@@ -57,13 +56,7 @@ def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
     forest = CheckpointStore(folder / TREES).load(settings)
     if forest.compressors and name not in forest.compressors:
         raise ObjectError(f"there is no object {name!r}: the objects are {listed(forest.compressors)}")
-    compressor = forest.compressors.get(name)
-    if compressor is None or compressor.last_sample is None or compressor.box is None:
-        raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
-    trainer = Trainer(settings)
-    with one_thread():  # as the pipeline's own trainer: the model has the same bits
-        model = trainer.train(compressor.last_sample)
-    return Learned(model, compressor.last_sample, compressor.box)
+    return Learned.of(forest.compressors.get(name) or Compressor(settings, name), settings)
 
 
 @contextlib.contextmanager

@@ -16,7 +16,18 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 
-__all__ = ["Arrays", "Metadata", "is_locked", "is_writable", "lock", "read", "write", "write_atomically"]
+__all__ = [
+    "Arrays",
+    "Metadata",
+    "decode",
+    "encode",
+    "is_locked",
+    "is_writable",
+    "lock",
+    "read",
+    "write",
+    "write_atomically",
+]
 
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
@@ -100,11 +111,7 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode
     OSError
         If the file cannot be written, as in `write_atomically`.
     """
-    from safetensors.numpy import save
-
-    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    header = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
-    write_atomically(path, save(contiguous, metadata={_KEY: json.dumps(header, sort_keys=True)}), mode)
+    write_atomically(path, encode(arrays, metadata), mode)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
@@ -115,19 +122,40 @@ def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
     ProtocolError
         If the file is incomplete or damaged, or was not written by catstream.
     """
-    from safetensors import SafetensorError, safe_open
+    return decode(Path(path).read_bytes(), str(path))
+
+
+def encode(arrays: Arrays, metadata: Metadata) -> bytes:
+    """Return the content of the file that `write` writes."""
+    from safetensors.numpy import save
+
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    header = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
+    return save(contiguous, metadata={_KEY: json.dumps(header, sort_keys=True)})
+
+
+def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
+    """Return the arrays and the metadata in the content of a file, whose name is for the error.
+
+    Raises
+    ------
+    ProtocolError
+        As in `read`.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
 
     try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {})[_KEY])
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        arrays = {key: array.copy() for key, array in load(data).items()}  # `load` checks the header, and shares `data`
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][_KEY])
         metadata = header["facts"]
         if header["version"] != _VERSION:
             raise ValueError(f"it is of version {header['version']}, this catstream reads {_VERSION}")
         if header["checksum"] != _checksum(arrays, metadata):
             raise ValueError("its checksum does not match")
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ProtocolError(f"{path} is not an undamaged file of catstream ({error}): use an older copy") from None
+        raise ProtocolError(f"{name} is not an undamaged file of catstream ({error}): use an older copy") from None
     return arrays, metadata
 
 

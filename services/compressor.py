@@ -160,7 +160,7 @@ def _forest(job: Job, checkpoints: CheckpointStore | None) -> Forest:
     forest = checkpoints.load(job.settings) if checkpoints is not None else Forest(job.settings)
     if not forest.seq:
         for name, file in job.models.items():
-            forest.add(Compressor.from_sample(Learned.load(file).sample, job.settings, name))
+            forest.add(Learned.load(file).compressor(job.settings, name))
     return forest
 
 

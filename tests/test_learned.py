@@ -1,4 +1,4 @@
-"""What was learned, in a file: as it was, or not at all; and trees that go on from it."""
+"""A saved model: the file, the trees that continue from it, and merging."""
 
 from __future__ import annotations
 
@@ -7,67 +7,137 @@ import dataclasses
 import numpy as np
 import pytest
 
-from catstream.box import Box
+from catstream.box import Box, Window
 from catstream.compression.compressor import Compressor
-from catstream.compression.tree import CoresetTree
-from catstream.errors import ProtocolError, ServiceError
+from catstream.compression.reduce import energy
+from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.features.cells import row_length
 from catstream.heads import APPEARANCE, EXTENT
-from catstream.learned import Learned
-from catstream.messages import Features, Model, Motion, TrainingRows
+from catstream.learned import Learned, merge
+from catstream.messages import DetectorState, Features, TrainingRows
 from catstream.settings import Settings
 
-SIZE, WIDTH = 8, 20
+SIZE, WIDTH, FRAMES = 8, row_length(), 60
+SETTINGS = Settings(coreset={"size": SIZE})
+BOX = Box(1.0, 2.0, 30.0, 40.0)
 
 
 def features(rng, seq, begins=False):
-    """What a frame teaches: rows of an object around 1, and of a background around -1."""
+    """The features of a frame: rows of an object around 1, and of a background around -1."""
     labels = np.repeat(np.float32([1, 0]), 4)
     rows = rng.normal(scale=0.2, size=(8, WIDTH)).astype(np.float32) + np.where(labels[:, None], 1, -1)
-    box = Box(1.0, 2.0, 30.0, 40.0)
     training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
-    return Features(seq, seq - 1, seq / 25, box, training, None, begins)
+    window = Window(0.0, 0.0, 40.0, 50.0)
+    state = DetectorState(0, "confident", window, window, window)
+    return Features(seq, seq - 1, seq / 25, BOX, training, state, begins)
 
 
-@pytest.fixture
-def compressor(rng):
-    """One that has seen a while."""
-    compressor = Compressor(Settings(coreset={"size": SIZE}))
-    for seq in range(1, 101):
-        compressor.take(features(rng, seq))
+def stream(seed, frames=FRAMES):
+    rng = np.random.default_rng(seed)
+    return [features(rng, seq) for seq in range(1, frames + 1)]
+
+
+def compressed(messages, compressor=None):
+    """A compressor that has taken the messages, whatever their numbers in the streams that they came from."""
+    compressor = compressor or Compressor(SETTINGS)
+    for message in messages:
+        compressor.take(dataclasses.replace(message, seq=compressor.seq + 1, frame=compressor.seq))
     return compressor
 
 
-@pytest.fixture
-def learned(compressor, rng):
-    sample = compressor.last_sample
-    motion = Motion(np.eye(4), np.eye(2))
-    weights = rng.normal(size=WIDTH).astype(np.float32)
-    return Learned(
-        Model(sample.version, sample.frame, weights, -0.25, motion, {EXTENT: weights}),
-        sample,
-        Box(1.0, 2.0, 30.0, 40.0),
-    )
+def learn(messages, settings=SETTINGS, name=""):
+    return Learned.of(compressed(messages), settings, name)
 
 
-def test_a_saved_model_is_loaded_bit_for_bit_and_frames_start_at_zero(learned, tmp_path):
+@pytest.fixture(scope="module")
+def messages():
+    return stream(1)
+
+
+@pytest.fixture(scope="module")
+def learned(messages):
+    return learn(messages)
+
+
+def bits(trees):
+    return {(name, key): array.tobytes() for name, tree in trees.items() for key, array in tree.state()[0].items()}
+
+
+def rows_of(tree):
+    """All rows in memory, C."""
+    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
+
+
+def test_a_saved_model_is_loaded_bit_for_bit(learned, tmp_path):
     learned.save(tmp_path / "one")
     read = Learned.load(tmp_path / "one")
-    anew = (dataclasses.replace(part, frame=0) for part in (learned.model, learned.sample))
-    np.testing.assert_equal(dataclasses.asdict(read), dataclasses.asdict(Learned(*anew, learned.box)))
+    assert read.to_bytes() == learned.to_bytes()
+    assert bits(read.trees) == bits(learned.trees)
+    assert [tree.dropped_energy for tree in read.trees.values()] == [
+        tree.dropped_energy for tree in learned.trees.values()
+    ]
 
 
-@pytest.mark.parametrize("share", [0, 0.3, 0.99])
+@pytest.mark.parametrize("half", [7, 30, 53])
+def test_a_stream_continued_from_a_saved_model_gives_the_trees_of_one_stream(messages, half, tmp_path):
+    learn(messages[:half]).save(tmp_path / "one")
+    continued = compressed(messages[half:], Learned.load(tmp_path / "one").compressor(SETTINGS))
+    assert bits(continued.trees) == bits(compressed(messages).trees)
+
+
+def test_the_energy_lost_before_saving_stays_in_the_bound(messages, tmp_path):
+    learn(messages[:30]).save(tmp_path / "one")
+    continued = compressed(messages[30:], Learned.load(tmp_path / "one").compressor(SETTINGS))
+    tree, whole = continued.trees["object"], np.vstack([m.training[APPEARANCE].rows[:4] for m in messages])
+    basis = np.linalg.qr(np.random.default_rng(2).normal(size=(WIDTH, 3)))[0].astype(np.float32)
+    truth, kept, slack = energy(whole @ basis), energy(rows_of(tree) @ basis), 1e-5 * energy(whole)
+    assert truth - tree.dropped_energy - slack <= kept <= truth + slack
+    assert tree.dropped_energy > compressed(messages[:30]).trees["object"].dropped_energy > 0
+
+
+def test_samples_continue_after_the_version_of_the_saved_model(learned, messages):
+    compressor = learned.compressor(SETTINGS)
+    assert compressor.sampled == learned.model.version
+    assert compressor.last_sample.version == learned.model.version
+    versions = [sample.version for message in messages if (sample := compressor.take(message))]
+    assert versions == list(range(learned.model.version + 1, learned.model.version + 1 + len(versions)))
+    assert versions
+
+
+def test_a_saved_model_is_not_changed_by_a_run_that_continues_from_it(learned, messages):
+    before = bits(learned.trees)
+    compressed(messages, learned.compressor(SETTINGS))
+    assert bits(learned.trees) == before
+
+
+def test_settings_that_do_not_suit_the_trees_are_an_error(learned):
+    with pytest.raises(SettingsError, match="coreset.size=8, this run has coreset.size=16".replace(".", r"\.")):
+        learned.compressor(Settings(coreset={"size": 16}))
+
+
+def test_before_the_first_sample_there_is_nothing_to_save():
+    with pytest.raises(ServiceError, match="nothing was learned"):
+        learn(stream(1, 1))
+
+
+@pytest.mark.parametrize("share", [0, 0.001, 0.3, 0.99])
 def test_an_incomplete_file_is_an_error(learned, tmp_path, share):
-    learned.save(tmp_path / "one")
-    whole = (tmp_path / "one").read_bytes()
+    whole = learned.to_bytes()
     (tmp_path / "one").write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(ProtocolError, match="not an undamaged file"):
         Learned.load(tmp_path / "one")
 
 
-def test_a_file_of_another_kind_is_an_error(compressor, tmp_path):
-    compressor.save(tmp_path / "one")
+def test_a_file_of_another_kind_is_an_error(messages, tmp_path):
+    compressed(messages).save(tmp_path / "one")
     with pytest.raises(ProtocolError, match="not a saved model"):
+        Learned.load(tmp_path / "one")
+
+
+def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
+    learned.save(tmp_path / "one")
+    monkeypatch.setattr("catstream.learned.row_length", lambda: WIDTH + 1)
+    with pytest.raises(ProtocolError, match=f"{WIDTH} features of a window, this catstream has {WIDTH + 1}"):
         Learned.load(tmp_path / "one")
 
 
@@ -77,46 +147,73 @@ def test_an_unwritable_file_is_an_error_and_leaves_nothing(learned, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("size", [SIZE // 2, SIZE, 2 * SIZE])
-def test_a_tree_of_a_sample_stands_for_as_many_rows_with_the_same_mean(compressor, size):
-    tree = compressor.trees["object"]
-    summary = tree.sample()
-    other = CoresetTree.from_summary(summary, size)
-    assert summary.count / 2 < other.rows_seen <= summary.count
-    np.testing.assert_allclose(other.sum / other.rows_seen, tree.sum / tree.rows_seen, rtol=1e-5)
-    directions = np.linalg.qr(np.random.default_rng(3).normal(size=(WIDTH, 3)))[0]
-    ours, theirs = (
-        sum(float(np.sum((node.rows @ directions) ** 2)) for node in each.nodes) / each.rows_seen
-        for each in (other, tree)
-    )
-    assert ours == pytest.approx(theirs, rel=0.2)
-    CoresetTree.from_state(*other.state())
+def test_merged_scores_are_within_the_bound_of_one_tree_of_all_frames():
+    """For a vector w, | ||C w||^2 - ||A w||^2 | <= c ||w||^2, and c contains what the merge has lost."""
+    parts = [learn(stream(seed), SETTINGS) for seed in (1, 2)]
+    merged, rng = merge(parts), np.random.default_rng(3)
+    for name, tree in merged.trees.items():
+        ours = sum(part.trees[name].dropped_energy for part in parts)
+        one = compressed([*stream(1), *stream(2)]).trees[name]
+        assert tree.dropped_energy >= ours - 1e-6 * energy(rows_of(tree))
+        for _ in range(5):
+            weights = rng.normal(size=tree.width).astype(np.float32)
+            weights /= np.linalg.norm(weights)
+            scores = [energy((rows_of(each) @ weights)[:, None]) for each in (tree, one)]
+            assert abs(scores[0] - scores[1]) <= max(tree.dropped_energy, one.dropped_energy) + 1e-3
 
 
-def test_a_compressor_continues_from_a_sample_with_its_version_and_its_weight(learned, rng, tmp_path):
-    learned.save(tmp_path / "one")
-    compressor = Compressor.from_sample(Learned.load(tmp_path / "one").sample, Settings(coreset={"size": SIZE}))
-    assert compressor.sampled == learned.sample.version
-    samples = [sample for seq in range(1, 30) if (sample := compressor.take(features(rng, seq)))]
-    assert [sample.version for sample in samples] == [learned.sample.version + 1 + i for i in range(len(samples))]
-    assert samples[-1].trees["object"].count > learned.sample.trees["object"].count / 2
+def test_the_order_of_a_merge_changes_no_count(learned):
+    other = learn(stream(2, 35))
+    for one, two in ((learned, other), (other, learned)):
+        merged = merge([one, two])
+        for name, tree in merged.trees.items():
+            assert tree.rows_seen == learned.trees[name].rows_seen + other.trees[name].rows_seen
+            assert_sums = learned.trees[name].sum + other.trees[name].sum
+            np.testing.assert_allclose(tree.sum, assert_sums, rtol=1e-9, atol=1e-6)
+        assert np.sqrt(merged.box.area) == pytest.approx(np.sqrt(BOX.area))
 
 
-def test_a_new_object_keeps_nothing_of_the_previous_one_except_the_versions(compressor, rng):
-    version, fresh = compressor.version, Compressor(Settings(coreset={"size": SIZE}))
-    stream = [features(rng, seq, begins=seq == 101) for seq in range(101, 140)]
-    ours = [compressor.take(message) for message in stream]
-    theirs = [fresh.take(dataclasses.replace(message, seq=message.seq - 100)) for message in stream]
+def test_frames_cannot_be_merged_twice(learned, messages):
+    with pytest.raises(SettingsError, match="the same frames"):
+        merge([learned, learned])
+    longer = Learned.of(compressed(stream(2), learned.compressor(SETTINGS)), SETTINGS)
+    with pytest.raises(SettingsError, match="the same frames"):
+        merge([longer, learned])
+    with pytest.raises(SettingsError, match="the same frames"):
+        merge([learned, learn(messages[:30])])
+
+
+def test_models_that_do_not_fit_are_not_merged(learned):
+    other = Settings(coreset={"size": 16})
+    larger = Compressor(other)
+    for message in stream(2):
+        larger.take(message)
+    for wrong, why in (
+        (Learned.of(larger, other), "coreset.size=8, another coreset.size=16"),
+        (learn(stream(2), name="anna"), "without a name, another of anna"),
+    ):
+        with pytest.raises(SettingsError, match=why):
+            merge([learned, wrong])
+    with pytest.raises(SettingsError, match="two or more"):
+        merge([learned])
+
+
+def test_a_new_object_keeps_nothing_of_the_previous_one_except_the_versions(learned, rng):
+    compressor, fresh = learned.compressor(SETTINGS), Compressor(SETTINGS)
+    version = compressor.version
+    messages = [features(rng, seq, begins=seq == 1) for seq in range(1, 40)]
+    ours, theirs = ([each.take(message) for message in messages] for each in (compressor, fresh))
     for one, other in zip(ours, theirs, strict=True):
-        if one is not None:
-            np.testing.assert_equal(
-                dataclasses.asdict(one), dataclasses.asdict(dataclasses.replace(other, version=other.version + version))
-            )
-    assert [one is None for one in ours] == [other is None for other in theirs]
-    assert ours[-1] is not None or any(ours)
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            renumbered = dataclasses.replace(other, version=other.version + version)
+            np.testing.assert_equal(dataclasses.asdict(one), dataclasses.asdict(renumbered))
+    assert any(ours)
+    assert compressor.origins == fresh.origins
 
 
-def test_until_its_first_sample_another_object_has_none(compressor, rng):
+def test_until_its_first_sample_another_object_has_none(messages, rng):
+    compressor = compressed(messages)
     assert compressor.sampled
-    compressor.take(features(rng, 101, begins=True))
+    compressor.take(features(rng, FRAMES + 1, begins=True))
     assert compressor.sampled == 0

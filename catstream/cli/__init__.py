@@ -34,6 +34,7 @@ VERBS = {
     "pause": "Pause a running pipeline.",
     "resume": "Resume a paused pipeline.",
     "save": "Save what a pipeline has learned to a file.",
+    "merge": "Merge saved models of one object.",
     "stop": "Stop a running pipeline as if its source had ended.",
     "keys": "Manage the keys of a pipeline and its clients.",
     "settings": "List all settings with their defaults and descriptions.",

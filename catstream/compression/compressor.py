@@ -5,19 +5,22 @@ It is the only owner of the object's coreset trees: one for each head of `catstr
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from hashlib import blake2b
+
 import numpy as np
 
 from catstream.arrays import Bool, Float32
 from catstream.box import Box
-from catstream.compression.tree import TREES, CoresetTree
+from catstream.compression.tree import TREES, CoresetTree, pack_trees, unpack_trees
 from catstream.errors import SettingsError
-from catstream.heads import HEADS, Head
+from catstream.heads import APPEARANCE, HEADS, Head
 from catstream.messages import DetectorState, ObjectFeatures, ObjectPosition, Sample, TrainingRows
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
-from catstream.storage import Arrays, Metadata, with_prefix
+from catstream.storage import Arrays, Metadata
 
-__all__ = ["Compressor"]
+__all__ = ["Compressor", "sample_of"]
 
 _GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between
 
@@ -57,14 +60,24 @@ class Compressor:
         self.centres = np.empty((0, 2))
         self._path: list[tuple[float, float]] = []
         self._sampled_leaves = 0  # 0 before the first sample
+        self._origin = ""  # digest of the first training rows in this stream, empty before them
+        self._earlier: tuple[str, ...] = ()  # origins of the streams that the trees continue
 
     @classmethod
-    def from_sample(cls, sample: Sample, settings: Settings, name: str = "") -> Compressor:
-        """A compressor whose trees are made from a sample of an earlier stream, one node each."""
+    def continuing(
+        cls,
+        trees: Mapping[str, CoresetTree],
+        version: int,
+        centres: np.ndarray,
+        origins: tuple[str, ...],
+        settings: Settings,
+        name: str = "",
+    ) -> Compressor:
+        """A compressor that inserts another stream into copies of the trees of an earlier one."""
         self = cls(settings, name)
-        for head, summary in sample.trees.items():
-            self.trees[head] = self._tree.from_summary(summary, settings.coreset.size)
-        self.last_sample, self.centres, self._sampled_leaves = sample, sample.centres, self.leaves
+        self.trees = {head: tree.copy() for head, tree in trees.items()}
+        self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name), centres
+        self._sampled_leaves, self._earlier = self.leaves, origins
         return self
 
     @property
@@ -80,6 +93,8 @@ class Compressor:
         ----------
         version : of the sample, if there is one
         """
+        if not self._origin and APPEARANCE in features.training:
+            self._origin = blake2b(features.training[APPEARANCE].rows.tobytes(), digest_size=8).hexdigest()
         for name, head in HEADS.items():
             if (training := features.training.get(head.group)) is not None:
                 self.trees[name].insert(_rows_of(head, training))
@@ -104,6 +119,11 @@ class Compressor:
         """Number of leaves that were inserted into the trees."""
         return sum(self._leaves().values())
 
+    @property
+    def origins(self) -> tuple[str, ...]:
+        """Digest of the first training rows of each stream that the trees contain, oldest stream first."""
+        return (*self._earlier, self._origin) if self._origin else self._earlier
+
     def counters(self) -> dict[str, float]:
         """Counters for the health messages."""
         return {
@@ -118,12 +138,15 @@ class Compressor:
 
     def state(self) -> tuple[Arrays, Metadata]:
         """Arrays and metadata that `from_state` restores."""
-        arrays: Arrays = {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
+        arrays, trees = pack_trees(self.trees)
+        arrays |= {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
         metadata: Metadata = {
             "frame": self.frame,
             "box": list(self.box) if self.box else None,
             "sampled_leaves": self._sampled_leaves,
-            "trees": {},
+            "trees": trees,
+            "origin": self._origin,
+            "earlier": list(self._earlier),
         }
         # The trees grow after a sample was made. The sample is kept too, so that a restarted trainer trains the same
         # model again that the detector uses.
@@ -131,9 +154,6 @@ class Compressor:
             if message is not None:
                 own, metadata[name] = pack(message, name)
                 arrays |= own
-        for name, tree in self.trees.items():
-            own, metadata["trees"][name] = tree.state()
-            arrays |= {f"{name}.{key}": array for key, array in own.items()}
         return arrays, metadata
 
     @classmethod
@@ -148,8 +168,8 @@ class Compressor:
             self.last_sample = unpack(Sample, arrays, metadata["sample"], "sample")
         self._sampled_leaves = int(metadata["sampled_leaves"])
         self.centres, self._path = arrays["centres"], [(x, y) for x, y in arrays["path"].tolist()]
-        for head, tree_metadata in metadata["trees"].items():
-            self.trees[head] = CoresetTree.from_state(with_prefix(arrays, f"{head}."), tree_metadata)
+        self._origin, self._earlier = str(metadata["origin"]), tuple(map(str, metadata["earlier"]))
+        self.trees |= unpack_trees(arrays, metadata["trees"])
         return self
 
     def _leaves(self) -> dict[str, int]:
@@ -173,9 +193,14 @@ class Compressor:
 
     def _sample(self, version: int) -> Sample:
         self._sampled_leaves = self.leaves
-        summaries = {name: tree.sample() for name, tree in self.trees.items() if tree.nodes}
-        self.last_sample = Sample(version, self.frame, summaries, self.centres, self.name)
+        self.last_sample = sample_of(self.trees, version, self.frame, self.centres, self.name)
         return self.last_sample
+
+
+def sample_of(trees: Mapping[str, CoresetTree], version: int, frame: int, centres: np.ndarray, name: str) -> Sample:
+    """The sample of all trees of an object that have a leaf."""
+    summaries = {head: tree.sample() for head, tree in trees.items() if tree.nodes}
+    return Sample(version, frame, summaries, centres, name)
 
 
 def _rows_of(head: Head, training: TrainingRows) -> Float32:

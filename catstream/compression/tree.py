@@ -6,6 +6,7 @@ become a node one level up (paper, "Coreset Tree Implementation"). `FrequentDire
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -14,7 +15,7 @@ from catstream import storage
 from catstream.arrays import Float64
 from catstream.compression import sampling
 from catstream.compression.node import Node
-from catstream.compression.reduce import energy, reduce, shrink
+from catstream.compression.reduce import shrink
 from catstream.errors import ProtocolError
 from catstream.messages import Summary
 from catstream.storage import Arrays, Metadata
@@ -22,7 +23,7 @@ from catstream.storage import Arrays, Metadata
 if TYPE_CHECKING:
     import os
 
-__all__ = ["TREES", "CoresetTree", "FrequentDirections"]
+__all__ = ["TREES", "CoresetTree", "FrequentDirections", "pack_trees", "unpack_trees"]
 
 _LEVELS = 64  # no stream has 2**64 leaves
 
@@ -57,27 +58,6 @@ class CoresetTree:
         self.size = size
         self.nodes: list[Node] = []
         self.pending = np.empty((0, 0), np.float32)
-
-    @classmethod
-    def from_summary(cls, summary: Summary, size: int) -> Self:
-        """A tree of one node with the weight and the mean of everything that a sample of another tree summarises.
-
-        The count is rounded down to n * 2**level. If it is less than a leaf, the rows of the sample are pending rows.
-        The bound of this tree does not include the energy that the sample had lost.
-        """
-        tree = cls(size)
-        level = (summary.count // size).bit_length() - 1
-        if level < 0:
-            tree.insert(summary.rows)
-            return tree
-        count = size << level
-        heavy = summary.rows * np.float32(np.sqrt(count / len(summary.rows)))
-        kept = reduce(heavy, size, towards=summary.mean)
-        rows = np.zeros((size, heavy.shape[1]), np.float32)
-        rows[: len(kept)] = kept
-        tree.nodes.append(Node(level, rows, count, summary.mean.astype(np.float64) * count, energy(heavy)))
-        tree.pending = np.empty((0, heavy.shape[1]), np.float32)
-        return tree
 
     @property
     def width(self) -> int:
@@ -128,6 +108,18 @@ class CoresetTree:
             self._push(Node.leaf(waiting[: self.size].copy()))
             waiting = waiting[self.size :]
         self.pending = waiting.copy()
+
+    def copy(self) -> Self:
+        """A tree with the same content: rows that are inserted into one are not in the other."""
+        tree = type(self)(self.size)
+        tree.nodes, tree.pending = list(self.nodes), self.pending  # nodes and pending rows are replaced, not changed
+        return tree
+
+    def merged(self, other: CoresetTree) -> Self:
+        """A tree of the rows of both: see `merge`."""
+        tree = self.copy()
+        tree.merge(other)
+        return tree
 
     def merge(self, other: CoresetTree) -> None:
         """Add the summary of another stream, as if its rows had been inserted here.
@@ -285,3 +277,20 @@ class FrequentDirections(CoresetTree):
 
 #: The class of a tree, by the value of the setting `coreset.reduction`.
 TREES: dict[str, type[CoresetTree]] = {kind.reduction: kind for kind in (CoresetTree, FrequentDirections)}
+
+
+def pack_trees(trees: Mapping[str, CoresetTree]) -> tuple[Arrays, Metadata]:
+    """Arrays and metadata of several trees; the name of each array begins with that of its tree."""
+    arrays: Arrays = {}
+    metadata: Metadata = {}
+    for name, tree in trees.items():
+        own, metadata[name] = tree.state()
+        arrays |= {f"{name}.{key}": array for key, array in own.items()}
+    return arrays, metadata
+
+
+def unpack_trees(arrays: Arrays, metadata: Metadata) -> dict[str, CoresetTree]:
+    """The trees that `pack_trees` described; ProtocolError if it is something else."""
+    return {
+        name: CoresetTree.from_state(storage.with_prefix(arrays, f"{name}."), state) for name, state in metadata.items()
+    }

@@ -9,6 +9,7 @@ import numpy as np
 
 from catstream.box import Box, Window
 from catstream.detection import motion, teacher
+from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection, ScoreMap
 from catstream.detection.step import looked, replaced, settled, taught, track_of
 from catstream.detection.teacher import Training
@@ -41,6 +42,7 @@ class Detector:
     state : after the last frame, None before there is an object; with the model, and SCM if it is in use, all there is
     model : the one in use
     newest_version : of the models that arrived, in use or not
+    likeness : to the object of a saved model, which is used until that is found; None without one
     """
 
     def __init__(self, settings: Settings, name: str = "") -> None:
@@ -49,6 +51,7 @@ class Detector:
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
         self.newest_version = 0
         self._scm: SparseCollaborativeModel | None = None
+        self.likeness: Likeness | None = None
 
     @property
     def box(self) -> Box | None:
@@ -80,15 +83,16 @@ class Detector:
         self.state, self.model, self._scm = DetectorState(seq - 1, "confident", window, window, window), model, scm
         return self._result(seq, time, 1.0, training, begins=True)
 
-    def seek(self, model: Model, box: Box) -> None:
-        """Start with a model: the object is absent until it is found, in whichever frame and size that is.
+    def seek(self, model: Model, box: Box, likeness: Likeness | None = None) -> None:
+        """Start with a saved model: the object is absent until it is found, in whichever frame and size that is.
 
-        It is found at the window that scores `sighting_lead` higher than the rest of the frame, in `sighting_frames`
-        frames in a row: of two objects that look alike, neither.
+        It is found at a window that looks like the object and scores `sighting_lead` higher than the rest of the
+        frame, in `sighting_frames` successive frames. Of two objects that look alike, neither is found.
 
         Parameters
         ----------
         box : in pixels, about as large as the object may be
+        likeness : to the object; None to search by the score only
 
         Raises
         ------
@@ -102,7 +106,7 @@ class Detector:
             )
         window = Window.around(box, self.settings.search.context)
         self.state = DetectorState(0, "lost", window, window, None)
-        self.model, self.newest_version = model, model.version
+        self.model, self.newest_version, self.likeness = model, model.version, likeness
 
     def look(self, frame: Pyramid, seq: int) -> Detection:
         """Search the object in the next frame. The state then has the place that was expected.
@@ -114,7 +118,7 @@ class Detector:
         if self._scm is not None:
             score, box = self._scm.follow(frame.image)
             return Detection(score, Window.around(box, self.settings.search.context).with_centre_in(*frame.size))
-        self.state, found = looked(self._known(), frame, seq, self.model, self.settings)
+        self.state, found = looked(self._known(), frame, seq, self.model, self.likeness, self.settings)
         return found
 
     def settle(self, found: Detection, frame: Pyramid, seq: int, time: float) -> Result:
@@ -125,7 +129,7 @@ class Detector:
         else:
             state = settled(state, found, frame.size, model, settings)
         self.state = state
-        return self._result(seq, time, found.score, taught(state, found, frame, seq, model, settings))
+        return self._result(seq, time, found.score, taught(state, found, frame, seq, model, self.likeness, settings))
 
     def correct(self, frame: Pyramid, seq: int, time: float, box: Box) -> Result:
         """Continue with the same object at another box, whatever a search would have found.

@@ -13,6 +13,7 @@ import numpy as np
 
 from catstream.box import Window
 from catstream.detection import belief, extent
+from catstream.detection.likeness import Likeness
 from catstream.features.cells import Cells
 from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
@@ -104,9 +105,14 @@ class ScoreMap:
         """Feature row of the window at (row, column), float32 (d,)."""
         return self.cells.row(row, column)
 
+    def highest(self, penalty: np.ndarray | float = 0.0) -> tuple[int, int]:
+        """Row and column of the window with the highest score less a penalty."""
+        row, column = np.unravel_index((self.scores - penalty).argmax(), self.scores.shape)
+        return int(row), int(column)
+
     def best(self, penalty: np.ndarray | float = 0.0) -> Detection:
         """The window with the highest score less a penalty, its place refined between the cells."""
-        row, column = map(int, np.unravel_index((self.scores - penalty).argmax(), self.scores.shape))
+        row, column = self.highest(penalty)
         return Detection(float(self.scores[row, column]), self.window(*self.refined(row, column)))
 
     def refined(self, row: int, column: int) -> tuple[float, float]:
@@ -125,11 +131,11 @@ class ScoreMap:
 
 
 def searched(
-    frame: Pyramid, state: DetectorState, seq: int, model: Model, settings: Settings
+    frame: Pyramid, state: DetectorState, seq: int, model: Model, likeness: Likeness | None, settings: Settings
 ) -> tuple[DetectorState, Detection]:
     """The best window of a frame, and the state that it was searched with: `seek` changes it, `find` does not."""
     if state.first_window is None:
-        return seek(frame, state, seq, model, settings)
+        return seek(frame, state, seq, model, likeness, settings)
     return state, find(frame, state, seq, model, settings)
 
 
@@ -159,24 +165,31 @@ def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings:
 
 
 def seek(
-    frame: Pyramid, state: DetectorState, seq: int, model: Model, settings: Settings
+    frame: Pyramid, state: DetectorState, seq: int, model: Model, likeness: Likeness | None, settings: Settings
 ) -> tuple[DetectorState, Detection]:
     """The best window of the whole frame, of any size that an object that has not been found yet may have.
 
-    The object counts as found once this window has led the rest of the frame in one place in several frames in a
-    row: the state then has a first window. While no score is high, each frame is searched at a third of the sizes.
+    The object counts as found once this window has looked like the object and has led the rest of the frame, in one
+    place in several successive frames: the state then has a first window. While no score is high, each frame is
+    searched at a third of the sizes.
     """
-    best, lead = _sought(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model)
-    if state.sightings or best.score >= settings.belief.confident_score:
-        best, lead = _sought(frame, state.window, _SOUGHT_FACTORS, model)
-    seen = best.score >= settings.belief.confident_score and lead >= settings.belief.sighting_lead
+    limits = settings.belief
+    sighting = _sighting(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model)
+    if state.sightings or sighting.found.score >= limits.confident_score:
+        sighting = _sighting(frame, state.window, _SOUGHT_FACTORS, model)
+    best = sighting.found
+    seen = (
+        best.score >= limits.confident_score
+        and sighting.lead >= limits.sighting_lead
+        and (likeness is None or likeness(sighting.row) >= limits.sighting_likeness)
+    )
     again = state.sightings > 0 and best.window.overlap(state.confident_window) > _SAME_OVERLAP
     state = replace(
         state,
         sightings=0 if not seen else state.sightings + 1 if again else 1,
         confident_window=best.window,
     )
-    if state.sightings < settings.belief.sighting_frames:
+    if state.sightings < limits.sighting_frames:
         return state, best
     found = fitted(frame, best, best.window, model, settings.extent)
     return replace(state, window=best.window, first_window=best.window), replace(found, redetected=True)
@@ -200,21 +213,32 @@ def whole(frame: Pyramid, window: Window, model: Model) -> Detection:
     return found[int(np.argmax([each.score - cost for each, cost in zip(found, costs, strict=True)]))]
 
 
-def _sought(frame: Pyramid, window: Window, factors: tuple[float, ...], model: Model) -> tuple[Detection, float]:
-    """The best window of a whole frame at several sizes, and by how much it leads the rest of the frame.
+@dataclass(frozen=True, slots=True)
+class _Sighting:
+    """The best window of a whole frame at several sizes.
+
+    lead  difference of its score to the highest of the windows that do not touch it, at any size
+    row   its feature row
+    """
+
+    found: Detection
+    lead: float
+    row: np.ndarray
+
+
+def _sighting(frame: Pyramid, window: Window, factors: tuple[float, ...], model: Model) -> _Sighting:
+    """The best window of a whole frame, at the size of a window times each of several factors.
 
     In a scene that the model never saw, anything may score high. The windows that do not touch the best
     one show how high; 0, the mean of the background that was learned, counts as one of them.
-
-    Parameters
-    ----------
-    factors : the sizes, as factors of that of the window
     """
     maps = [ScoreMap.whole(frame, window.scaled(factor), model) for factor in factors]
     costs = [extent.cost(math.log(factor)) for factor in factors]
     worths = [float(each.scores.max()) - cost for each, cost in zip(maps, costs, strict=True)]
-    best = maps[int(np.argmax(worths))].best()
-    return best, best.score - max(0.0, *(each.highest_apart(best.window) for each in maps))
+    scores = maps[int(np.argmax(worths))]
+    best = scores.best()
+    others = max([0.0, *(each.highest_apart(best.window) for each in maps)])
+    return _Sighting(best, best.score - others, scores.row(*scores.highest()))
 
 
 def _near(frame: Pyramid, window: Window, state: DetectorState, model: Model, settings: Settings) -> Detection:

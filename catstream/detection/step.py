@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from catstream.detection import belief, colour_centroid, extent, motion, search, teacher
+from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
 from catstream.features.cells import COLOURS
@@ -19,18 +20,22 @@ __all__ = ["looked", "replaced", "settled", "taught", "track_of"]
 
 
 def looked(
-    state: DetectorState, frame: Pyramid, seq: int, model: Model, settings: Settings
+    state: DetectorState, frame: Pyramid, seq: int, model: Model, likeness: Likeness | None, settings: Settings
 ) -> tuple[DetectorState, Detection]:
     """Search the object in the next frame.
 
     Costs the same for every frame: a few small patches around the object, and the whole frame if the belief is low (or
     always, if `search.mode` is "full").
 
+    Parameters
+    ----------
+    likeness : to the object of a saved model that has not been found yet
+
     Returns
     -------
     the state with the place that was expected, and the detection
     """
-    return search.searched(frame, motion.expected(state), seq, model, settings)
+    return search.searched(frame, motion.expected(state), seq, model, likeness, settings)
 
 
 def settled(
@@ -55,9 +60,17 @@ def replaced(state: DetectorState, found: Detection, settings: Settings) -> Dete
 
 
 def taught(
-    state: DetectorState, found: Detection, frame: Pyramid, seq: int, model: Model, settings: Settings
+    state: DetectorState,
+    found: Detection,
+    frame: Pyramid,
+    seq: int,
+    model: Model,
+    likeness: Likeness | None,
+    settings: Settings,
 ) -> Training:
     """The training rows of a frame, as far as the belief in its detection allows."""
+    if state.first_window is None:
+        return teacher.training_beside(frame, found.window, model, likeness, settings)
     if not _policy(state, settings).teach:
         return {}
     return teacher.training_of(frame, state.window, found.around, seq, model, settings)

@@ -17,6 +17,7 @@ import numpy as np
 from catstream import ridge
 from catstream.box import Window
 from catstream.detection import extent
+from catstream.detection.likeness import Likeness
 from catstream.detection.search import ScoreMap, non_maximum_suppression
 from catstream.errors import BoxError
 from catstream.features.cells import COLOURS, Cells, row_length
@@ -33,6 +34,7 @@ __all__ = [
     "hard_negatives",
     "initial_model",
     "training_at",
+    "training_beside",
     "training_of",
 ]
 
@@ -118,12 +120,31 @@ def training_at(
     return {APPEARANCE: rows, **(_extents(frame, window, rows, settings) if extents else {})}
 
 
+def training_beside(
+    frame: Pyramid, window: Window, model: Model, likeness: Likeness | None, settings: Settings
+) -> Training:
+    """The rows of a frame in which the object of a saved model has not been found yet: background of a new scene.
+
+    Windows with a high score are taken, but neither the best one, which may be the object, nor others that look like
+    the object.
+    """
+    scores = ScoreMap.whole(frame, window, model)
+    rows = _strongest(scores, window, settings.teaching.hard_negatives, settings.belief.weak_score)
+    strange = [row for row in rows if likeness is None or likeness(row) < settings.belief.sighting_likeness]
+    return {APPEARANCE: _rows(strange, 0, 1, settings.teaching)} if strange else {}
+
+
 def hard_negatives(frame: Pyramid, window: Window, model: Model, teaching: TeachingSettings) -> TrainingRows:
     """The windows of the whole frame that score highest, without those that overlap the object's."""
     scores = ScoreMap.whole(frame, window, model)
-    places = non_maximum_suppression(scores.scores, teaching.hard_negatives + 1, WINDOW // 2)
+    return _rows(_strongest(scores, window, teaching.hard_negatives), 0, 1, teaching)
+
+
+def _strongest(scores: ScoreMap, window: Window, most: int, least: float = -math.inf) -> list[np.ndarray]:
+    """The rows of the windows with the highest scores above `least` that hardly overlap another window."""
+    places = non_maximum_suppression(scores.scores, most + 1, WINDOW // 2, least)
     rows = [scores.row(*place) for place in places if scores.window(*place).overlap(window) < _HARD_OVERLAP]
-    return _rows(rows[: teaching.hard_negatives], 0, 1, teaching)
+    return rows[:most]
 
 
 def initial_model(rows: TrainingRows) -> Model:

@@ -9,6 +9,7 @@ import pytest
 
 from catstream.box import Box
 from catstream.detection.detector import Detector
+from catstream.detection.likeness import Likeness
 from catstream.detection.step import step
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import row_length
@@ -265,10 +266,19 @@ def learned(scene):
     return dataclasses.replace(started(scene).model, version=7)
 
 
-def sought(model, frames):
+@pytest.fixture
+def likeness(scene):
+    """To the object of `learned`."""
+    detector = Detector(Settings())
+    training = detector.init(scene((60, 50)), START)[1].training["appearance"]
+    own, other = training.rows[training.labels == 1], training.rows[training.labels == 0]
+    return Likeness.of(own, float((own**2).sum()), own.sum(axis=0), len(own), other.mean(axis=0))
+
+
+def sought(model, frames, likeness=None):
     """The tracks of an object, as large as START when it was learned, that is searched for in these frames."""
     detector = Detector(Settings())
-    detector.seek(model, START)
+    detector.seek(model, START, likeness)
     return [detector.step(frame)[0] for frame in frames]
 
 
@@ -297,6 +307,25 @@ def test_a_window_that_does_not_lead_its_frame_is_not_the_object(scene, learned)
     assert tracks[-1].score > Settings().belief.confident_score
 
 
+def test_a_window_that_does_not_look_like_the_object_is_not_the_object(scene, learned, likeness):
+    frames = [scene((90, 60))] * 5
+    assert sought(learned, frames, likeness)[-1].state == "present"
+    stranger = dataclasses.replace(likeness, basis=np.roll(likeness.basis, 1, axis=1))
+    assert {track.state for track in sought(learned, frames, stranger)} == {"absent"}
+
+
+def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(scene, learned, likeness):
+    frame = scene((90, 60))
+    frame[150:190, 200:248] = frame[60:100, 90:138]  # two objects that look alike: neither is found
+    detector = Detector(Settings(belief={"weak_score": 0.1}))
+    detector.seek(learned, START, likeness)
+    taught = [detector.step(frame)[1].training for _ in range(4)]
+    rows = [rows for training in taught for rows in training.values()]
+    assert rows
+    assert all(not each.labels.any() for each in rows)
+    assert all(likeness(row) < Settings().belief.sighting_likeness for each in rows for row in each.rows)
+
+
 def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned):
     tracks = sought(learned, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
     assert {track.state for track in tracks} == {"absent"}
@@ -305,9 +334,9 @@ def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, lea
 def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned):
     detector = Detector(Settings())
     detector.seek(learned, START)
-    taught = [len(detector.step(scene((90, 60)))[1].training) for _ in range(5)]
-    assert not any(taught[:2])
-    assert any(taught)
+    taught = [detector.step(scene((90, 60)))[1].training.get("appearance") for _ in range(5)]
+    assert not any(rows is not None and rows.labels.any() for rows in taught[:2])
+    assert any(rows is not None and rows.labels.any() for rows in taught[2:])
 
 
 def test_a_resumed_search_continues_bit_for_bit(scene, learned):

@@ -1,0 +1,108 @@
+"""Learns a saved model from a part of a sequence, and tracks with it in another part or another sequence."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from itertools import islice
+from typing import TypeVar
+
+import numpy as np
+from groups import CHECK
+from sequences import sequences
+from table import command
+
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
+from catstream.detection.detector import Detector
+from catstream.evaluation.datasets import Sequence
+from catstream.learned import Learned
+from catstream.messages import Features, Track
+from catstream.services.start import SPAWN
+from catstream.settings import Settings
+from catstream.threads import one_thread
+from catstream.training.trainer import Trainer
+
+__all__ = ["chosen", "each", "hits", "learning_command", "messages", "model_of", "tracked", "training_frames"]
+
+_LEAST, _MOST = 20, 250  # frames that a model is learned from
+Task, Result = TypeVar("Task"), TypeVar("Result")
+
+
+def learning_command(about: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the options of a benchmark of saved models."""
+    parser = command(about)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes (default: %(default)s)")
+    parser.add_argument("--check", action="store_true", help="the sequences of the check list, not the others")
+    parser.add_argument("--frames", type=int, default=100, help="frames to track in (default: %(default)s)")
+    return parser
+
+
+def chosen(options: argparse.Namespace) -> list[Sequence]:
+    """Return the sequences of the check list, or all others."""
+    return [found for found in sequences(options) if options.quick or (found.name in CHECK) == options.check]
+
+
+def each(options: argparse.Namespace, work: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
+    """Do the work for each task in several processes; yield the results in the order of the tasks."""
+    if options.quick or options.jobs == 1:
+        yield from map(work, tasks)
+        return
+    with ProcessPoolExecutor(options.jobs, mp_context=SPAWN) as pool:
+        yield from pool.map(work, tasks)
+
+
+def training_frames(sequence: Sequence) -> int:
+    """Return the number of frames in the first third of a sequence, which its model is learned from."""
+    return min(max(len(sequence) // 3, _LEAST), _MOST, max(len(sequence) - 2, 1))
+
+
+def messages(sequence: Sequence, start: int, count: int, settings: Settings) -> list[Features]:
+    """Return the features of frames that a tracker learned from, which started at the true box."""
+    detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
+    found = []
+    with one_thread(opencv=True):
+        for row, image in enumerate(islice(sequence.frames(start), count)):
+            box = Box(*map(float, sequence.boxes[start]))
+            _, features = detector.step(image) if row else detector.init(image, box)
+            if (sample := compressor.take(features)) is not None:
+                detector.adopt(trainer.train(sample))
+            found.append(features)
+    return found
+
+
+def model_of(found: Iterable[Features], settings: Settings) -> Learned:
+    """Return the saved model of one tree that has seen all features, in the given order."""
+    compressor = Compressor(settings)
+    for seq, features in enumerate(found, start=1):
+        compressor.take(replace(features, seq=seq, frame=seq - 1, begins=False))
+    with one_thread():
+        return Learned.of(compressor, settings)
+
+
+def tracked(learned: Learned, sequence: Sequence, start: int, count: int) -> list[Track]:
+    """Return the tracks of a run that starts with a saved model and learns on."""
+    settings = learned.settings
+    detector, compressor, trainer = Detector(settings), learned.compressor(settings), Trainer(settings)
+    detector.seek(learned.model, learned.box, learned.likeness())
+    tracks = []
+    with one_thread(opencv=True):
+        for image in islice(sequence.frames(start), count):
+            track, features = detector.step(image)
+            if (sample := compressor.take(features)) is not None:
+                detector.adopt(trainer.train(sample))
+            tracks.append(track)
+    return tracks
+
+
+def hits(tracks: Iterable[Track], sequence: Sequence, start: int) -> list[bool]:
+    """Return for each track whether its box overlaps the true one by half; frames without a true box are left out."""
+    boxes = sequence.boxes[start:]
+    return [
+        track.box is not None and track.box.overlap(Box(*map(float, truth))) > 0.5
+        for track, truth in zip(tracks, boxes, strict=False)
+        if np.isfinite(truth).all()
+    ]

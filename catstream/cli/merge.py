@@ -1,0 +1,40 @@
+"""`catstream merge`: one saved model from several of the same object."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from catstream.errors import ServiceError
+from catstream.learned import Learned
+from catstream.learned import merge as merged
+
+__all__ = ["merge"]
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="FILE", help="File to write.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+def merge(files: tuple[Path, ...], output: Path, overwrite: bool) -> None:
+    """Merge saved models of one object, for example from two cameras.
+
+    The coreset trees of all files are merged, and a model is trained from them.
+    Its scores are those of one tree that has seen all the videos, within the
+    bound of the coreset. The files must be of the same object and settings, and
+    no two of them may contain the same frames.
+
+    \b
+    EXAMPLES
+      catstream merge door.safetensors yard.safetensors -o anna.safetensors
+    """
+    if output.exists() and not overwrite:
+        raise ServiceError(f"{output} exists already: replace it with --overwrite, or give another name")
+    whole = merged([Learned.load(file) for file in files])
+    whole.save(output)
+    tree = whole.trees["object"]
+    click.echo(
+        f"{output}: {len(files)} saved models, {len(whole.origins)} videos, {tree.rows_seen} rows of the object in "
+        f"{len(tree.nodes)} nodes"
+    )
