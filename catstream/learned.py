@@ -239,9 +239,7 @@ def _merged(one: Learned, other: Learned) -> Learned:
     )
 
 
-def _trained(
-    trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings
-) -> Model:
+def _trained(trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings) -> Model:
     with one_thread():  # as a pipeline's own trainer: the model has the same bits
         return Trainer(settings).train(sample_of(trees, version, 0, centres, name))
 

@@ -39,6 +39,7 @@ __all__ = [
     "Preview",
     "Run",
     "Sample",
+    "SavedModel",
     "State",
     "Stored",
     "Summary",
@@ -380,6 +381,20 @@ class Preview:
     height: Annotated[int, Whole(low=1)]
     boxes: Annotated[dict[str, Box], ByObject()]
     jpeg: Annotated[bytes, Bytes("a JPEG", longest=1 << 19, begin=b"\xff\xd8\xff")]
+
+
+@dataclass(frozen=True, slots=True)
+class SavedModel:
+    """Everything that was learned of an object, compressor -> anyone.
+
+    version  version of the newest sample of the object
+    file     the file that `catstream save` writes: the coreset trees whole, and a model
+    object   name of the object
+    """
+
+    version: int
+    file: Annotated[bytes, Bytes("a saved model", longest=511 << 20, begin=b"")]
+    object: ObjectName = ""
 
 
 @dataclass(frozen=True, slots=True)

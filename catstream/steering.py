@@ -20,8 +20,8 @@ from uuid import uuid4
 from catstream.box import Box
 from catstream.errors import CommandRejectedError, SilenceError
 from catstream.learned import Learned
-from catstream.messages import Answer, Command, Model, Sample, Verb
-from catstream.wire.channels import MODELS, SAMPLES
+from catstream.messages import Answer, Command, SavedModel, Verb
+from catstream.wire.channels import SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.endpoint import find
 from catstream.wire.newest import Subscriber
@@ -73,22 +73,27 @@ class Control:
         """Continue processing frames."""
         return self._ask("resume")
 
-    def save(self, path: str | os.PathLike[str]) -> Answer:
-        """Write the learned model and the coreset to a file on this machine, atomically; `Learned` reads it.
+    def save(self, path: str | os.PathLike[str], object: str = "") -> Answer:
+        """Write everything that was learned of an object to a file on this machine, atomically.
 
-        The file is written by this process, from the pipeline's newest model and sample.
+        The file is written by this process; `catstream.Learned` reads it. The pipeline is not interrupted.
+
+        Parameters
+        ----------
+        path : path
+            The file.
+        object : str
+            Name of the object; empty for the one without a name, or the only one.
 
         Raises
         ------
         ServiceError
             If the file cannot be written.
         """
-        answer = self._ask("save")
-        if answer.box is None:
-            raise CommandRejectedError("save: the object was not detected yet: try again once it was")
-        model, sample = self._newest(answer.version)
-        Learned(model, sample, answer.box).save(path)
-        return replace(answer, version=model.version)
+        answer = self._ask("save", object=object)
+        learned = self._newest(answer.object, answer.version)
+        learned.save(path)
+        return replace(answer, version=learned.model.version)
 
     def stop(self) -> Answer:
         """End the run as if the source had ended: everything learned is stored first."""
@@ -104,22 +109,21 @@ class Control:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _newest(self, version: int) -> tuple[Model, Sample]:
-        """Return the newest model, of this version or a later one, and the sample that it was trained on."""
-        model, samples, deadline = None, dict[int, Sample](), monotonic() + self.timeout
-        with Subscriber(MODELS, self._place) as models, Subscriber(SAMPLES, self._place) as newest:
-            while monotonic() < deadline:
-                samples |= {sample.version: sample for sample in newest.receive_all() if isinstance(sample, Sample)}
-                model = models.receive(0.05) or model
-                if model is not None and model.version >= version and model.version in samples:
-                    return model, samples[model.version]
+    def _newest(self, name: str, version: int) -> Learned:
+        """Return what was learned of an object up to a version or a later one."""
+        deadline = monotonic() + self.timeout
+        with Subscriber(SAVED_MODELS, self._place, SavedModel, about=name) as saved:
+            while (left := deadline - monotonic()) > 0:
+                message = saved.receive(left)
+                if message is not None and message.version >= version:
+                    return Learned.from_bytes(message.file, f"the saved model from {self.endpoint}")
         raise SilenceError(
-            f"no model with its sample arrived from {self.endpoint} within {self.timeout:g} s: "
+            f"no coreset trees arrived from {self.endpoint} within {self.timeout:g} s: "
             "check the pipeline with catstream status"
         )
 
-    def _ask(self, verb: Verb, box: Box | None = None, keep: bool = False) -> Answer:
-        answer = self._commands.ask(Command(uuid4().hex, verb, box, keep), self.timeout)
+    def _ask(self, verb: Verb, box: Box | None = None, keep: bool = False, object: str = "") -> Answer:
+        answer = self._commands.ask(Command(uuid4().hex, verb, box, keep, object), self.timeout)
         if answer is None:
             raise SilenceError(
                 f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "

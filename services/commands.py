@@ -63,7 +63,9 @@ class CommandHandler:
                 self._boxes.append(command)
             else:
                 try:
-                    answers.append(self._answer(command, *self._apply(command)))
+                    done, reason = self._apply(command)
+                    name = self._name(command) if command.verb == "save" else None
+                    answers.append(self._answer(command, done, reason, name=name))
                 except ObjectError as error:
                     answers.append(self._answer(command, False, str(error)))
                 answers += self.reject_boxes(f"the pipeline is ending: {self.end_reason}") if self.end_reason else []
@@ -145,8 +147,10 @@ class CommandHandler:
             waits = "" if self.desired.objects else ": no object is left, so the run waits for a box"
             return True, f"{listed([name])} is followed no more {after}{waits}"
         detector = self._detectors.detectors.get(name)
-        if detector is None or not detector.model.version or detector.box is None:
+        if detector is None or not detector.model.version or detector.state is None:
             return False, "nothing was learned of the object yet: try again once there is a model (catstream status)"
+        if detector.state.first_window is None:
+            return False, "the object of the saved model was not found yet: try again once it was"
         return True, f"model {detector.model.version} {after}"
 
     def _known(self, command: Command) -> str:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.job import Job
 from catstream.learned import Learned
@@ -17,6 +16,7 @@ from catstream.recording.file import RecordingWriter
 from catstream.services.loop import Process
 from catstream.services.progress import Progress
 from catstream.services.recorder import Recorder
+from catstream.services.saved_models import SavedModels
 from catstream.state import TREES, locked
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import FEATURES, SAMPLES
@@ -72,6 +72,7 @@ class CompressorLoop:
         self._samples = stack.enter_context(Publisher(SAMPLES, endpoint))
         for sample in self._forest.last_samples:
             self._samples.send(sample)
+        self._saved_models = stack.enter_context(SavedModels(endpoint, settings))
 
     @property
     def must_stop(self) -> bool:
@@ -117,8 +118,9 @@ class CompressorLoop:
         self._progress = self._progress.after(self._forest.position, time.monotonic(), saved=saved, urgent=urgent)
 
     def publish_health(self, *, last: bool = False) -> None:
-        """Serve late joiners and publish the health."""
+        """Serve late joiners, send the trees to subscribers, and publish the health."""
         self._samples.serve_late_joiners()
+        self._saved_models.turn(self._forest.compressors)
         self._process.trouble = self._checkpoints.trouble if self._checkpoints is not None else ""
         self._process.beat(self._counters, self._forest.object_counters, now=last)
 

@@ -145,7 +145,10 @@ class DetectorLoop:
         begin = start(positions, models, commands.desired, Detector(self._process.settings).state_at)
         self.detectors.seq, commands.desired = begin.seq, begin.desired
         for name, (state, model) in begin.objects.items():
-            self.detectors.add(name).resume(state, model)
+            detector = self.detectors.add(name)
+            detector.resume(state, model)
+            if state.first_window is None and name in self._learned:
+                detector.likeness = self._learned[name].likeness()
         for sender, position in zip(self._outputs.senders, positions, strict=True):
             sender.resume(begin.seq, position.seq)
 
@@ -153,7 +156,8 @@ class DetectorLoop:
         """Search for the objects of saved models that were not found yet, unless a command gave them a box."""
         for name, each in self._commands.desired.objects.items():
             if not each.begins and name not in self.detectors.detectors:
-                self.detectors.add(name).seek(self._learned[name].model, self._learned[name].box)
+                learned = self._learned[name]
+                self.detectors.add(name).seek(learned.model, learned.box, learned.likeness())
 
     def _position(self, sender: DataSender) -> Position:
         """The position that a receiver reports; there is no time-out."""

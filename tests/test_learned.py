@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.features.cells import row_length
 from catstream.heads import APPEARANCE, EXTENT
 from catstream.learned import Learned, merge
-from catstream.messages import DetectorState, Features, TrainingRows
+from catstream.messages import DetectorState, ObjectFeatures, TrainingRows
 from catstream.settings import Settings
 
 SIZE, WIDTH, FRAMES = 8, row_length(), 60
@@ -22,31 +20,30 @@ SETTINGS = Settings(coreset={"size": SIZE})
 BOX = Box(1.0, 2.0, 30.0, 40.0)
 
 
-def features(rng, seq, begins=False):
-    """The features of a frame: rows of an object around 1, and of a background around -1."""
+def features(rng):
+    """The features of an object in a frame: rows of the object around 1, and of a background around -1."""
     labels = np.repeat(np.float32([1, 0]), 4)
     rows = rng.normal(scale=0.2, size=(8, WIDTH)).astype(np.float32) + np.where(labels[:, None], 1, -1)
     training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
     window = Window(0.0, 0.0, 40.0, 50.0)
-    state = DetectorState(0, "confident", window, window, window)
-    return Features(seq, seq - 1, seq / 25, BOX, training, state, begins)
+    return ObjectFeatures(BOX, training, DetectorState(0, "confident", window, window, window))
 
 
 def stream(seed, frames=FRAMES):
     rng = np.random.default_rng(seed)
-    return [features(rng, seq) for seq in range(1, frames + 1)]
+    return [features(rng) for _ in range(frames)]
 
 
-def compressed(messages, compressor=None):
-    """A compressor that has taken the messages, whatever their numbers in the streams that they came from."""
-    compressor = compressor or Compressor(SETTINGS)
+def compressed(messages, compressor=None, settings=SETTINGS, name=""):
+    """A compressor that has taken the features."""
+    compressor = compressor or Compressor(settings, name)
     for message in messages:
-        compressor.take(dataclasses.replace(message, seq=compressor.seq + 1, frame=compressor.seq))
+        compressor.take(compressor.frame + 1, message, compressor.version + 1)
     return compressor
 
 
 def learn(messages, settings=SETTINGS, name=""):
-    return Learned.of(compressed(messages), settings, name)
+    return Learned.of(compressed(messages, None, settings, name), settings)
 
 
 @pytest.fixture(scope="module")
@@ -96,11 +93,11 @@ def test_the_energy_lost_before_saving_stays_in_the_bound(messages, tmp_path):
 
 
 def test_samples_continue_after_the_version_of_the_saved_model(learned, messages):
-    compressor = learned.compressor(SETTINGS)
-    assert compressor.sampled == learned.model.version
-    assert compressor.last_sample.version == learned.model.version
-    versions = [sample.version for message in messages if (sample := compressor.take(message))]
-    assert versions == list(range(learned.model.version + 1, learned.model.version + 1 + len(versions)))
+    compressor, version = learned.compressor(SETTINGS), learned.model.version
+    assert compressor.version == compressor.last_sample.version == version
+    samples = [compressor.take(frame, message, compressor.version + 1) for frame, message in enumerate(messages)]
+    versions = [sample.version for sample in samples if sample]
+    assert versions == list(range(version + 1, version + 1 + len(versions)))
     assert versions
 
 
@@ -129,7 +126,7 @@ def test_an_incomplete_file_is_an_error(learned, tmp_path, share):
 
 
 def test_a_file_of_another_kind_is_an_error(messages, tmp_path):
-    compressed(messages).save(tmp_path / "one")
+    compressed(messages).trees["object"].save(tmp_path / "one")
     with pytest.raises(ProtocolError, match="not a saved model"):
         Learned.load(tmp_path / "one")
 
@@ -185,35 +182,15 @@ def test_frames_cannot_be_merged_twice(learned, messages):
 
 def test_models_that_do_not_fit_are_not_merged(learned):
     other = Settings(coreset={"size": 16})
-    larger = Compressor(other)
-    for message in stream(2):
-        larger.take(message)
     for wrong, why in (
-        (Learned.of(larger, other), "coreset.size=8, another coreset.size=16"),
-        (learn(stream(2), name="anna"), "without a name, another of anna"),
+        (learn(stream(2), other), "coreset.size=8, another coreset.size=16"),
+        (learn(stream(2), name="ben"), "of 'anna', another of 'ben'"),
     ):
         with pytest.raises(SettingsError, match=why):
-            merge([learned, wrong])
+            merge([learn(stream(1), name="anna"), wrong])
     with pytest.raises(SettingsError, match="two or more"):
         merge([learned])
 
 
-def test_a_new_object_keeps_nothing_of_the_previous_one_except_the_versions(learned, rng):
-    compressor, fresh = learned.compressor(SETTINGS), Compressor(SETTINGS)
-    version = compressor.version
-    messages = [features(rng, seq, begins=seq == 1) for seq in range(1, 40)]
-    ours, theirs = ([each.take(message) for message in messages] for each in (compressor, fresh))
-    for one, other in zip(ours, theirs, strict=True):
-        assert (one is None) == (other is None)
-        if one is not None and other is not None:
-            renumbered = dataclasses.replace(other, version=other.version + version)
-            np.testing.assert_equal(dataclasses.asdict(one), dataclasses.asdict(renumbered))
-    assert any(ours)
-    assert compressor.origins == fresh.origins
-
-
-def test_until_its_first_sample_another_object_has_none(messages, rng):
-    compressor = compressed(messages)
-    assert compressor.sampled
-    compressor.take(features(rng, FRAMES + 1, begins=True))
-    assert compressor.sampled == 0
+def test_a_model_with_a_name_and_one_without_are_of_the_same_object(learned):
+    assert merge([learned, learn(stream(2), name="anna")]).object == "anna"

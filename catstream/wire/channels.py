@@ -11,6 +11,7 @@
     health     the newest of each process
     previews   small pictures of the newest frame; none is made while nobody subscribes
     control    commands and their answers; a command without an answer is sent again, and carried out once
+    saved-models   the coreset trees of each object as a file, the newest; none is made while nobody subscribes
     training   a copy of the messages of `features`, to any number of subscribers; nothing is sent while there is none
 
 The receiver of an acknowledged channel binds its address, and so does the sender of any other; the rest connect,
@@ -23,7 +24,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
-from catstream.messages import Answer, Command, End, Features, Health, Model, Preview, Run, Sample, Track, Tracks
+from catstream.messages import (
+    Answer,
+    Command,
+    End,
+    Features,
+    Health,
+    Model,
+    Preview,
+    Run,
+    Sample,
+    SavedModel,
+    Track,
+    Tracks,
+)
 
 __all__ = [
     "CHANNELS",
@@ -35,6 +49,7 @@ __all__ = [
     "PREVIEWS",
     "RESULTS",
     "SAMPLES",
+    "SAVED_MODELS",
     "TRACKS",
     "TRAINING",
     "Channel",
@@ -121,9 +136,20 @@ TRAINING: Channel[Run | Features | End] = Channel(
     role="watch",
     high_water_mark=64,
 )
+SAVED_MODELS: Channel[SavedModel] = Channel(
+    "saved-models",
+    (SavedModel,),
+    ("compressor",),
+    None,
+    "newest",
+    port=11,
+    megabytes=512,
+    role="watch",
+    high_water_mark=2,
+)
 
 #: THE TABLE, by name.
 CHANNELS: dict[str, Channel[object]] = {
     channel.name: channel
-    for channel in (FEATURES, SAMPLES, MODELS, TRACKS, RESULTS, HEALTH, PREVIEWS, CONTROL, TRAINING)
+    for channel in (FEATURES, SAMPLES, MODELS, TRACKS, RESULTS, HEALTH, PREVIEWS, CONTROL, TRAINING, SAVED_MODELS)
 }

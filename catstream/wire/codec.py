@@ -37,6 +37,7 @@ from catstream.messages import (
     Preview,
     Run,
     Sample,
+    SavedModel,
     Stored,
     Track,
     Tracks,
@@ -56,7 +57,22 @@ _LONGEST_TOPIC = 512  # bytes
 #: Kinds of message, by their name on the wire.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind
-    for kind in (Answer, Command, End, Features, Health, Model, Position, Preview, Run, Sample, Stored, Track, Tracks)
+    for kind in (
+        Answer,
+        Command,
+        End,
+        Features,
+        Health,
+        Model,
+        Position,
+        Preview,
+        Run,
+        Sample,
+        SavedModel,
+        Stored,
+        Track,
+        Tracks,
+    )
 }
 
 
