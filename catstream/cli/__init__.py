@@ -37,6 +37,7 @@ VERBS = {
     "merge": "Merge saved models of one object.",
     "stop": "Stop a running pipeline as if its source had ended.",
     "keys": "Manage the keys of a pipeline and its clients.",
+    "summary": "Choose the images that represent a collection, or the frames that taught most.",
     "settings": "List all settings with their defaults and descriptions.",
 }
 

@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 
 from catstream.errors import VideoError
+from catstream.storage import write_atomically
 
 __all__ = ["table", "write_page"]
 
@@ -27,6 +28,12 @@ svg .grid { stroke: var(--line); }
 .strip { display: flex; gap: .5rem; overflow-x: auto; padding-bottom: .4rem; }
 .strip figure { margin: 0; } .strip img { display: block; border-radius: 4px; }
 .strip figcaption { font-size: 12px; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(220px, 44%), 1fr)); gap: 1rem .8rem;
+  align-items: end; margin-top: 1.6rem; }
+.pictures figure { margin: 0; min-width: 0; } .pictures img { display: block; width: 100%; border-radius: 6px; }
+.pictures figcaption { font-size: 13px; margin-top: .35rem; line-height: 1.35; font-variant-numeric: tabular-nums; }
+.pictures b { display: block; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; font-weight: 600; }
+.missing { display: grid; place-items: center; aspect-ratio: 4 / 3; border-radius: 6px; background: var(--soft); }
 pre { background: var(--soft); padding: .8rem; border-radius: 6px; overflow-x: auto; }
 """
 
@@ -49,7 +56,7 @@ def table(heads: Iterable[str], rows: Iterable[Iterable[object]], *, texts: int 
 
 
 def write_page(path: Path, title: str, body: Iterable[str]) -> Path:
-    """Write a page with the non-empty parts of `body`.
+    """Write a page with the non-empty parts of `body`, atomically.
 
     Raises
     ------
@@ -63,7 +70,7 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> Path:
         + "\n</body></html>\n"
     )
     try:
-        path.write_text(page, encoding="utf-8")
+        write_atomically(path, page.encode())
     except OSError as error:
         raise VideoError(f"cannot write the report {str(path)!r} ({error.strerror}): give another folder") from None
     return path

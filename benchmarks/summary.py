@@ -1,0 +1,109 @@
+"""Summaries of image collections: energy kept by `catstream.summarize`, and by other choices of k images.
+
+The energy is the exact share ||A P||^2 / ||A||^2, with a row of A for each image, and P the projection on the span of
+the chosen rows. The greedy choice and the best subspace of dimension k, which is an upper bound, have all rows at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tracemalloc
+from collections.abc import Iterable, Iterator
+from statistics import fmean
+from time import perf_counter
+
+import numpy as np
+from sequences import sequences
+from table import Table, command, publish
+
+from catstream.evaluation.datasets import Sequence
+from catstream.summaries.images import describe
+from catstream.summaries.selection import RowSelection
+from catstream.summaries.subset import choose
+
+COLUMNS = (
+    "collection",
+    "images",
+    "k",
+    "catstream",
+    "random",
+    "evenly spaced",
+    "k-means",
+    "greedy, all rows",
+    "best subspace",
+)
+_LONG = 900  # frames of a sequence that is a collection by itself
+_STRIDE = 5  # of the frames of the mixed collection
+_DRAWS = 10
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    found = sequences(options)
+    sizes, long = ((2,), 1) if options.quick else (options.k, _LONG)
+    rows = {sequence.name: described(sequence) for sequence in found}
+    collections = {
+        "all sequences": np.concatenate([each[:: 1 if options.quick else _STRIDE] for each in rows.values()])
+    }
+    collections |= {name: each for name, each in rows.items() if len(each) >= long}
+    table = [(name, len(each), k, *kept_by_each(each, k)) for name, each in collections.items() for k in sizes]
+    yield Table("Energy kept", COLUMNS, table, f"random: mean of {_DRAWS} draws")
+    largest = max(rows.values(), key=len)
+    repeats = (1, 2) if options.quick else (1, 4, 16)
+    costs = [cost(np.tile(largest, (times, 1)), sizes[0]) for times in repeats]
+    yield Table("Cost of a selection", ("images", "us an image", "most MB"), costs, "rows of one sequence, repeated")
+
+
+def described(sequence: Sequence) -> np.ndarray:
+    return np.array([describe(image) for image in sequence.frames()])
+
+
+def kept_by_each(rows: np.ndarray, k: int) -> Iterator[float]:
+    """Yield the energy that each method keeps, in the order of the columns."""
+    exact = rows.astype(np.float64)
+    gram = exact @ exact.T
+    rng = np.random.default_rng(0)
+
+    def kept(numbers: Iterable[int]) -> float:
+        basis = np.linalg.qr(exact[list(numbers)].T)[0]
+        return float(np.sum((exact @ basis) ** 2) / np.trace(gram))
+
+    yield kept(selected(rows, k))
+    yield fmean(kept(rng.choice(len(rows), k, replace=False)) for _ in range(_DRAWS))
+    yield kept(((np.arange(k) + 0.5) * len(rows) / k).astype(int))
+    yield kept(nearest_to_means(rows, k))
+    yield kept(choose(gram, gram, k)[0])
+    yield float(np.linalg.eigvalsh(gram)[-k:].sum() / np.trace(gram))
+
+
+def selected(rows: np.ndarray, k: int) -> list[int]:
+    selection = RowSelection[int](k)
+    for number, row in enumerate(rows):
+        selection.add(row, number)
+    return [row.key for row in selection.selected().rows]
+
+
+def nearest_to_means(rows: np.ndarray, k: int) -> list[int]:
+    """Return the row nearest to each mean of k-means."""
+    from sklearn.cluster import KMeans
+
+    means = KMeans(k, n_init=3, random_state=0).fit(rows).cluster_centers_
+    return [int(np.sum((rows - mean) ** 2, axis=1).argmin()) for mean in means]
+
+
+def cost(rows: np.ndarray, k: int) -> tuple[int, float, float]:
+    """Return the number of rows, microseconds for each, and the most megabytes that the selection allocates."""
+    began = perf_counter()
+    selected(rows, k)
+    seconds = perf_counter() - began
+    tracemalloc.start()
+    selected(rows, k)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return len(rows), 1e6 * seconds / len(rows), most / 1e6
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("-k", type=int, nargs="+", default=(5, 20, 50), help="numbers of images (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options)
