@@ -6,9 +6,9 @@
         for track in pipeline:
             print(track.frame, track.state, track.box, track.score)
 
-`catstream.Tracker` tracks in one process, frame by frame, like a `cv2.Tracker`, and `catstream.MultiTracker` tracks several
-objects. While a pipeline runs, other processes
-receive its messages with `catstream.subscribe` and send commands to it with `catstream.control`.
+`catstream.Tracker` tracks in one process, frame by frame, like a `cv2.Tracker`, and `catstream.MultiTracker` tracks
+several objects. While a pipeline runs, other processes receive its messages with `catstream.subscribe` and send
+commands to it with `catstream.control`. `catstream.summarize` selects the images that represent a collection.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ if TYPE_CHECKING:
     from catstream.settings import Settings
     from catstream.steering import Control, control
     from catstream.subscription import Subscription, subscribe
+    from catstream.summaries.images import ImageSummary, summarize
     from catstream.tracker import Tracker
 
 __all__ = [
     "Box",
     "CatstreamError",
     "Control",
+    "ImageSummary",
     "Learned",
     "MultiTracker",
     "Pipeline",
@@ -44,6 +46,7 @@ __all__ = [
     "control",
     "merge",
     "subscribe",
+    "summarize",
     "to_supervision",
 ]
 
@@ -53,6 +56,7 @@ _HOMES = {
     "Box": "box",
     "CatstreamError": "errors",
     "Control": "steering",
+    "ImageSummary": "summaries.images",
     "Learned": "learned",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
@@ -63,6 +67,7 @@ _HOMES = {
     "control": "steering",
     "merge": "learned",
     "subscribe": "subscription",
+    "summarize": "summaries.images",
     "to_supervision": "adapters",
 }
 

@@ -33,7 +33,7 @@ class Collection:
 
     Attributes
     ----------
-    files : files of the collection
+    files, names : files of the collection, and their paths relative to the folder
     opened : number of files that were opened
     skipped : descriptions of the images and videos that could not be read, in order
 
@@ -47,17 +47,12 @@ class Collection:
         self.files = _files(path)
         self.opened = 0
         self.skipped: list[str] = []
-        self._folder = path if path.is_dir() else path.parent
-        self._places = {str(file.relative_to(self._folder)): place for place, file in enumerate(self.files)}
-
-    def place(self, origin: Origin) -> int:
-        """Number of the file of an image."""
-        return self._places[origin.file]
+        folder = path if path.is_dir() else path.parent
+        self.names = [str(file.relative_to(folder)) for file in self.files]
 
     def __iter__(self) -> Iterator[tuple[Origin, np.ndarray]]:
-        for file in self.files:
+        for file, name in zip(self.files, self.names, strict=True):
             self.opened += 1
-            name = str(file.relative_to(self._folder))
             if file.suffix.lower() in VIDEOS:
                 yield from self._frames(file, name)
             elif (image := read_image(file)) is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -100,7 +101,7 @@ class RowSelection(Generic[_Key]):
             self._insert()
             if len(self._old) > self._size:
                 chosen, _ = choose(*self._products(), self._size)
-                self._keep(sorted(chosen))
+                self._keep(sorted(self._completed(chosen, self._size)))
 
     def selected(self) -> Selection[_Key]:
         """The selection among all rows so far; the stream may continue.
@@ -117,14 +118,12 @@ class RowSelection(Generic[_Key]):
         chosen = exchange(gram, products, choose(gram, products, self._k)[0])
         order, energies = choose(gram[np.ix_(chosen, chosen)], products[:, chosen], len(chosen))
         whole = sum(node.energy for node in self._sketch.nodes) + energy(self._sketch.pending) or 1.0
-        shares = [each / whole for each in energies]
-        ranked = [Selected(self._keys[chosen[number]], share) for number, share in zip(order, shares, strict=True)]
-        # If fewer rows span the collection, any others complete the number.
-        others = [key for number, key in enumerate(self._keys) if number not in chosen]
-        ranked += [Selected(key, 0.0) for key in others[: self._k - len(ranked)]]
+        shares = [each / whole for each in energies] + [0.0] * (self._k - len(energies))
+        numbers = self._completed([chosen[place] for place in order], self._k)
+        rows = tuple(Selected(self._keys[number], share) for number, share in zip(numbers, shares, strict=True))
         kept = min(sum(shares), 1.0)
         error = min(1.0, self._k / (self._size + 1)) * max(self._sketch.dropped_energy, 0.0) / whole
-        return Selection(tuple(ranked), self.count, kept, min(kept + error, 1.0))
+        return Selection(rows, self.count, kept, min(kept + error, 1.0))
 
     def _insert(self) -> None:
         """Insert the new candidates into the sketch."""
@@ -139,6 +138,12 @@ class RowSelection(Generic[_Key]):
         candidates = self._old.astype(np.float64)
         sketch = np.vstack([*(node.rows for node in self._sketch.nodes), self._sketch.pending])
         return candidates @ candidates.T, sketch @ candidates.T
+
+    def _completed(self, chosen: list[int], count: int) -> list[int]:
+        """Complete chosen candidates by others to a number: rows that fewer rows span may be selected, too."""
+        taken = set(chosen)
+        others = (number for number in range(len(self._keys)) if number not in taken)
+        return [*chosen, *islice(others, count - len(chosen))]
 
     def _keep(self, numbers: list[int]) -> None:
         self._old, self._keys = self._old[numbers], [self._keys[number] for number in numbers]

@@ -1,25 +1,30 @@
-"""Writes a contact sheet: one self-contained HTML file with small pictures and a caption below each."""
+"""A contact sheet as one self-contained HTML file, with a JSON file of the same content without pictures."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
+from typing import Any, NamedTuple
 
+from catstream.errors import VideoError
 from catstream.html.page import write_page
+from catstream.storage import write_atomically
+from catstream.summaries.collection import Collection, Origin
+from catstream.summaries.selection import Selection
+from catstream.summaries.taught import TaughtFrame
 
-__all__ = ["Picture", "write_sheet"]
+__all__ = ["Picture", "Sheet", "json_beside", "sheet_of_frames", "sheet_of_images"]
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
+class Picture(NamedTuple):
     """A picture on the sheet.
 
     jpeg     JPEG file, None if the picture cannot be shown
-    title    name of the image, in the first line below it
-    caption  text in the second line
+    title    first line below it
+    caption  second line
     """
 
     jpeg: bytes | None
@@ -27,24 +32,90 @@ class Picture:
     caption: str
 
 
-def write_sheet(path: Path, title: str, about: Iterable[str], pictures: Iterable[Picture]) -> Path:
-    """Write a contact sheet.
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """The content of a contact sheet.
 
-    Parameters
-    ----------
-    about : paragraphs below the title
-
-    Raises
-    ------
-    VideoError
-        If the file cannot be written.
+    about     paragraphs below the title
+    pictures  in the order in which they are shown
+    figures   content of the JSON file
     """
-    paragraphs = (f'<p class="about">{escape(text)}</p>' for text in about)
-    return write_page(
-        path,
-        title,
-        [f"<h1>{escape(title)}</h1>", *paragraphs, '<div class="pictures">', *map(_figure, pictures), "</div>"],
+
+    title: str
+    about: tuple[str, ...]
+    pictures: list[Picture]
+    figures: dict[str, Any]
+
+    def save(self, path: Path) -> None:
+        """Write the HTML file, and the JSON file beside it, each atomically.
+
+        Raises
+        ------
+        VideoError
+            If a file cannot be written.
+        """
+        paragraphs = (f'<p class="about">{escape(text)}</p>' for text in self.about)
+        heading = f"<h1>{escape(self.title)}</h1>"
+        write_page(
+            path, self.title, [heading, *paragraphs, '<div class="pictures">', *map(_figure, self.pictures), "</div>"]
+        )
+        try:
+            write_atomically(json_beside(path), (json.dumps(self.figures, indent=1) + "\n").encode())
+        except OSError as error:
+            raise VideoError(f"cannot write {str(json_beside(path))!r}: {error.strerror}") from None
+
+
+def json_beside(path: Path) -> Path:
+    """Return the path of the JSON file that belongs to an HTML file."""
+    return path.with_suffix(".json")
+
+
+def sheet_of_images(name: str, collection: Collection, selection: Selection[tuple[Origin, bytes]]) -> Sheet:
+    """Return the sheet of the images that were selected from a collection, each with its JPEG, in their order there."""
+    places = {each: place for place, each in enumerate(collection.names)}
+    rows = sorted(selection.rows, key=lambda row: (places[row.key[0].file], row.key[0].frame or 0))
+    skipped = f"; {len(collection.skipped)} could not be read" * bool(collection.skipped)
+    return Sheet(
+        f"Summary of {name}",
+        (
+            f"{len(rows)} of {selection.count} images keep {100 * selection.kept:.1f} % of the energy of all{skipped}.",
+            "An image adds the energy that is not kept by the selected images which add more.",
+        ),
+        [Picture(row.key[1], row.key[0].file, _caption(row.key[0], row.energy)) for row in rows],
+        {
+            "images": selection.count,
+            "kept": selection.kept,
+            "kept_at_most": selection.kept_at_most,
+            "skipped": collection.skipped,
+            "selected": [asdict(row.key[0]) | {"energy": row.energy} for row in rows],
+        },
     )
+
+
+def sheet_of_frames(
+    name: str, frames: list[TaughtFrame], measured: int, source: str, pictures: dict[int, bytes]
+) -> Sheet:
+    """Return the sheet of the frames that taught the tracker most, of so many that were measured."""
+    return Sheet(
+        f"Summary of {name}",
+        (
+            f"The {len(frames)} of {measured} frames that taught the tracker most, spread over the run.",
+            "New is the share of the energy of the object's rows that the coreset did not span before the frame. The "
+            "box is the one that was learned from.",
+        ),
+        [
+            Picture(
+                pictures.get(each.frame), f"frame {each.frame}", f"{each.time:.2f} s; {100 * each.novelty:.1f} % new"
+            )
+            for each in frames
+        ],
+        {"frames": measured, "source": source, "selected": [asdict(frame) for frame in frames]},
+    )
+
+
+def _caption(origin: Origin, energy: float) -> str:
+    place = "" if origin.time is None else f"frame {origin.frame}, {origin.time:.2f} s; "
+    return f"{place}adds {100 * energy:.2f} %"
 
 
 def _figure(picture: Picture) -> str:

@@ -16,7 +16,7 @@ from catstream.arrays import Bool, Float32
 from catstream.box import Box
 from catstream.compression.reduce import energy, reduce
 from catstream.compression.tree import TREES, CoresetTree
-from catstream.errors import RecordingError, SettingsError
+from catstream.errors import SettingsError
 from catstream.heads import APPEARANCE
 from catstream.messages import Features
 from catstream.settings import CoresetSettings
@@ -28,7 +28,7 @@ _WEAK = 1e-3  # length of a direction, as a share of the longest one, below whic
 
 @dataclass(frozen=True, slots=True)
 class TaughtFrame:
-    """A frame from which the object was learned.
+    """A frame from which an object was learned.
 
     frame, time  number of the frame, and its seconds in the video
     box          the object's box
@@ -68,33 +68,28 @@ class Novelty:
 
 def taught_frames(
     features: Iterable[Features], settings: CoresetSettings, step: Callable[[], None] | None = None
-) -> list[TaughtFrame]:
-    """Measure each frame that taught something of the object, in order.
+) -> dict[str, list[TaughtFrame]]:
+    """Measure each frame that taught something of an object, in order; return the frames of each object by its name.
 
-    If another object begins, the frames of the one before are left out.
+    If another object begins under a name, the frames of the one before are left out.
 
     Parameters
     ----------
-    settings : of the coreset tree
+    settings : of the coreset trees
     step : called after each frame
-
-    Raises
-    ------
-    RecordingError
-        If no frame taught anything.
     """
-    frames: list[TaughtFrame] = []
-    novelty = Novelty(TREES[settings.reduction](settings.size))
+    frames: dict[str, list[TaughtFrame]] = {}
+    novelties: dict[str, Novelty] = {}
     for message in features:
-        if message.begins:
-            frames, novelty = [], Novelty(TREES[settings.reduction](settings.size))
-        if (training := message.training.get(APPEARANCE)) is not None:
-            of_object: Bool = training.labels == 1
-            frames.append(TaughtFrame(message.frame, message.time, message.box, novelty.of(training.rows[of_object])))
+        for name, part in message.objects.items():
+            if part.begins or name not in novelties:
+                frames[name], novelties[name] = [], Novelty(TREES[settings.reduction](settings.size))
+            if (training := part.training.get(APPEARANCE)) is not None:
+                of_object: Bool = training.labels == 1
+                new = novelties[name].of(training.rows[of_object])
+                frames[name].append(TaughtFrame(message.frame, message.time, part.box, new))
         if step is not None:
             step()
-    if not frames:
-        raise RecordingError("no frame has training rows of the object: the object was never found")
     return frames
 
 

@@ -1,0 +1,98 @@
+"""`catstream summary`: of a folder, a recording and a video; bad input, and an interrupt."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+import cv2
+import numpy as np
+import pytest
+
+from catstream.summaries import images
+
+
+@pytest.fixture
+def folder(tmp_path, rng):
+    """Ten images of different sizes, one of them damaged."""
+    (tmp_path / "photos").mkdir()
+    for number in range(10):
+        image = rng.integers(0, 256, (6, 8, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), cv2.resize(image, (60 + 9 * number, 50)))
+    (tmp_path / "photos" / "7.png").write_bytes(b"no image")
+    return tmp_path / "photos"
+
+
+def test_the_images_of_a_folder_are_summarised_and_damaged_ones_named(folder, said, tmp_path):
+    code, _, errors = said("summary", folder, "-k", 3, cwd=tmp_path)
+    assert code == 0, errors
+    assert "skipped 7.png: not an image that can be read" in errors
+    assert "3 of 9 images keep " in errors
+    figures = json.loads((tmp_path / "summary.json").read_text())
+    assert (figures["images"], len(figures["selected"]), len(figures["skipped"])) == (9, 3, 1)
+    assert 0 < figures["kept"] <= figures["kept_at_most"] <= 1
+    names = [each["file"] for each in figures["selected"]]
+    assert names == sorted(names)
+    page = (tmp_path / "summary.html").read_text()
+    assert page.count("<img ") == 3
+    assert all(f">{name}</b>" in page for name in names)
+    assert "http" not in page
+
+
+def test_the_frames_of_a_recording_are_shown_with_the_pictures_of_its_video(whole_run, said, tmp_path):
+    code, _, errors = said("summary", whole_run / "rec", "-k", 4, cwd=tmp_path)
+    assert code == 0, errors
+    figures = json.loads((tmp_path / "summary.json").read_text())
+    frames = [each["frame"] for each in figures["selected"]]
+    assert len(frames) == 4
+    assert frames[0] == 0
+    assert frames == sorted(frames)
+    assert (tmp_path / "summary.html").read_text().count("<img ") == 4
+
+
+def test_the_frames_are_found_without_the_video(whole_run, said, tmp_path):
+    code, _, errors = said("summary", whole_run / "rec", "-k", 4, "--source", tmp_path / "gone.mp4", cwd=tmp_path)
+    assert code == 0, errors
+    assert "the sheet has no pictures: there is no video or folder" in errors
+    assert (tmp_path / "summary.html").read_text().count("no picture</div>") == 4
+
+
+def test_a_video_with_a_box_is_tracked(video, said, tmp_path):
+    source, box = video
+    code, _, errors = said("summary", source, "--box", box, "-k", 3, "--output", tmp_path / "frames.html")
+    assert code == 0, errors
+    assert "The 3 of " in errors
+    assert (tmp_path / "frames.html").read_text().count("<img ") == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames.html", "frames.json"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["photos", "-k", "20"], "k = 20 images cannot be selected from 9: give a smaller k"),
+        (["empty"], "there are no images or videos in 'empty'"),
+        (["photos", "--output", "no/where.html"], "its folder does not exist"),
+        (["photos", "--output", "some.json"], "give a name that ends in .html"),
+        (["photos", "--output", "old.html"], "'old.html' exists: give another --output, or --overwrite"),
+        (["0"], "there is no folder or video '0'|live source"),
+    ],
+)
+def test_bad_input_is_an_error_of_one_line_and_nothing_is_written(arguments, problem, folder, said, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "old.html").write_text("old")
+    before = sorted(tmp_path.rglob("*"))
+    code, _, errors = said("summary", *arguments, cwd=folder.parent)
+    assert code == 1
+    assert any(each in errors.splitlines()[-1] for each in problem.split("|"))
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_interrupt_leaves_no_file(folder, said, tmp_path, monkeypatch):
+    def interrupted(image):
+        signal.raise_signal(signal.SIGTERM)
+        return image
+
+    monkeypatch.setattr(images, "describe", interrupted)
+    code, _, errors = said("summary", folder, cwd=tmp_path)
+    assert (code, errors) == (130, "stopped\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]

@@ -1,0 +1,77 @@
+"""`catstream.summarize`: images of all sizes, from arrays and files."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from catstream import summarize
+from catstream.errors import FrameError, SettingsError, VideoError
+from catstream.summaries.collection import Collection
+from catstream.summaries.images import describe
+
+
+def test_images_of_different_sizes_are_summarised(photographs):
+    found = summarize(iter(photographs), k=6)
+    assert len(set(found.indices)) == 6
+    assert found.count == len(photographs)
+    assert 0.5 < found.kept <= found.kept_at_most <= 1
+    assert found.kept == pytest.approx(sum(found.energies))
+
+
+def test_a_summary_of_copies_of_two_photographs_has_both(photographs):
+    copies = [cv2.resize(photographs[number % 2], (60 + number, 90 - number)) for number in range(30)]
+    assert {index % 2 for index in summarize(copies, k=2).indices} == {0, 1}
+
+
+def test_the_same_images_give_the_same_summary_as_arrays_and_as_files(photographs, tmp_path):
+    files = [tmp_path / f"{number}.png" for number in range(10)]
+    for file, image in zip(files, photographs, strict=False):
+        cv2.imwrite(str(file), image)
+    assert summarize(files, 3) == summarize(map(str, files), 3) == summarize(photographs[:10], 3)
+
+
+def test_a_row_changes_little_with_the_size_of_the_image(frames):
+    for image in frames[:3]:
+        row, smaller = describe(image), describe(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        other = describe(np.ascontiguousarray(frames[-1][::-1]))
+        assert np.linalg.norm(row - smaller) < 0.3 * np.linalg.norm(row - other)
+
+
+def test_invalid_input_is_an_error_of_one_line(photographs, tmp_path):
+    (tmp_path / "torn.jpg").write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(VideoError, match=r"cannot read the image '.*torn.jpg': replace it, or leave it out"):
+        summarize([tmp_path / "torn.jpg"], 1)
+    with pytest.raises(FrameError, match="got None"):
+        summarize([photographs[0], None], 1)
+    with pytest.raises(SettingsError, match="k = 3 images cannot be selected from 2"):
+        summarize(photographs[:2], 3)
+
+
+def test_a_folder_is_read_in_natural_order_and_damaged_images_are_named(folder):
+    collection = Collection(folder)
+    names = [origin.file for origin, _ in collection]
+    assert names == [f"a/{number}.jpg" for number in (0, 1, 2, 3, 5)] + [f"b/{number}.jpg" for number in range(6, 12)]
+    assert collection.skipped == ["a/4.jpg: not an image that can be read"]
+
+
+def test_every_frame_of_a_video_is_an_image_and_a_file_that_is_no_video_is_named(demo_video, tmp_path):
+    path, _ = demo_video(60)
+    (tmp_path / "clip.mp4").symlink_to(path)
+    (tmp_path / "torn.mp4").write_bytes(b"no video")
+    collection = Collection(tmp_path)
+    assert [origin.frame for origin, _ in collection] == list(range(60))
+    assert len(collection.skipped) == 1
+    assert collection.skipped[0].startswith("torn.mp4: ")
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [("", "there are no images or videos in"), ("gone", "there is no folder or video"), ("notes.txt", "is neither an")],
+)
+def test_a_path_without_images_is_an_error_of_one_line(name, problem, tmp_path):
+    (tmp_path / "notes.txt").write_text("no image")
+    with pytest.raises(VideoError, match=problem) as error:
+        Collection(tmp_path / name)
+    assert "\n" not in str(error.value)
