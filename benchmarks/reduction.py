@@ -18,11 +18,12 @@ from sequences import named
 from table import Cell, Table, publish
 
 from catstream.box import Box
-from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
 from catstream.compression.tree import TREES
-from catstream.detection.detector import Detector
+from catstream.detection.objects import Detectors
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.runs import EvaluationRun
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Features, Model
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
@@ -43,28 +44,28 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 class Stages:
-    """A compressor and a trainer with their times in seconds, and the most bytes of the trees."""
+    """A forest and a trainer with their times in seconds, and the most bytes of the trees."""
 
     def __init__(self, settings: Settings) -> None:
-        self.compressor, self.trainer = Compressor(settings), Trainer(settings)
+        self.forest, self.trainer = Forest(settings), Trainer(settings)
         self.compression: list[float] = []
         self.training: list[float] = []
         self.most_bytes = 0.0
 
     def take(self, features: Features) -> Model | None:
         began = perf_counter()
-        sample = self.compressor.take(features)
+        samples = self.forest.take(features)
         self.compression.append(perf_counter() - began)
-        self.most_bytes = max(self.most_bytes, self.compressor.counters()["bytes"])
-        if sample is None:
+        self.most_bytes = max(self.most_bytes, self.forest.counters()["bytes"])
+        if not samples:
             return None
         began = perf_counter()
-        model = self.trainer.train(sample)
+        model = self.trainer.train(samples[0])
         self.training.append(perf_counter() - began)
         return model
 
     def row(self, name: str) -> tuple[Cell, ...]:
-        trees, counters = self.compressor.trees.values(), self.compressor.counters()
+        trees, counters = self.forest.compressors[""].trees.values(), self.forest.counters()
         dropped = sum(tree.dropped_energy for tree in trees) / sum(node.energy for tree in trees for node in tree.nodes)
         frames, rows, size = len(self.compression), int(counters["rows"]), counters["bytes"] / 1e6
         mean, slow = 1000 * fmean(self.compression), 1000 * float(np.quantile(self.compression, 0.99))
@@ -73,13 +74,15 @@ class Stages:
 
 def costs(sequence: Sequence, variants: dict[str, Settings]) -> Table:
     """Track a sequence with the default, and give the features of each frame to all variants."""
-    detector = Detector(variants["svd"])
+    detectors = Detectors(variants["svd"])
     stages = {name: Stages(settings) for name, settings in variants.items()}
     for number, image in enumerate(sequence.frames()):
-        _, features = detector.step(image) if number else detector.init(image, Box(*sequence.boxes[0]))
+        pyramid = Pyramid.of(image)
+        given = {} if number else {"": detectors.begin("", pyramid, Box(*sequence.boxes[0]))}
+        _, features = detectors.step(pyramid, 0.0, given)
         models = {name: each.take(features) for name, each in stages.items()}
         if (model := models["svd"]) is not None:
-            detector.adopt(model)
+            detectors.adopt(model)
     rows = [each.row(name) for name, each in stages.items()]
     return Table(f"Costs on {sequence.name}", COSTS, rows, "MB of all trees; ms a frame of the compressor")
 

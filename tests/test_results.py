@@ -1,4 +1,4 @@
-"""`docs/results.md` shows what the benchmarks wrote, and README what the page shows."""
+"""The pages of results show what the benchmarks wrote, and README what the pages show."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ def measured_by(record: page.Record) -> str:
     return name if program == "python" else f"{program} {name}"
 
 
-def test_the_page_is_the_one_that_the_records_give():
-    shown = page.PAGE.read_text(encoding="utf-8")
-    assert shown == page.written(FOUND) == page.written(page.records()), "docs/results.md is old: run `make results`"
+@pytest.mark.parametrize("one", page.PAGES, ids=lambda one: one.path.name)
+def test_a_page_is_the_one_that_the_records_give(one):
+    shown = one.path.read_text(encoding="utf-8")
+    assert shown == page.written(one, FOUND) == page.written(one, page.records()), "it is old: run `make results`"
     assert shown.count("\n") <= 200
 
 
@@ -40,7 +41,7 @@ def test_readme_has_the_figures_of_the_records():
     assert shown == page.readme(FOUND, shown), "the figures in README.md are old: run `make results`"
 
 
-def test_every_benchmark_has_a_record_and_every_record_its_place_on_the_page():
+def test_every_benchmark_has_a_record_and_every_record_its_place_on_a_page():
     measured = {measured_by(record) for record in FOUND.values()}
     assert measured == SCRIPTS | {"catstream evaluate", "catstream loadtest"}, (
         "benchmarks/results: see docs/benchmarks.md"
@@ -66,4 +67,4 @@ def test_the_tuning_set_is_reported_separately():
     names = {row["name"] for row in FOUND["accuracy"]["sequences"]}
     assert (len(TUNED), len(CHECK), len(TUNED & CHECK)) == (20, 15, 3)
     assert names >= TUNED | CHECK
-    assert "The defaults were chosen on the first 20" in page.written(FOUND)
+    assert "The defaults were chosen on the first 20" in page.written(page.PAGES[0], FOUND)
