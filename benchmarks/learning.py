@@ -6,7 +6,6 @@ import argparse
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from itertools import islice
 from typing import TypeVar
 
@@ -19,14 +18,15 @@ from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
 from catstream.evaluation.datasets import Sequence
+from catstream.features.pyramid import Pyramid
 from catstream.learned import Learned
-from catstream.messages import Features, Track
+from catstream.messages import ObjectFeatures, Track
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 
-__all__ = ["chosen", "each", "hits", "learning_command", "messages", "model_of", "tracked", "training_frames"]
+__all__ = ["chosen", "each", "features", "hits", "learning_command", "model_of", "tracked", "training_frames"]
 
 _LEAST, _MOST = 20, 250  # frames that a model is learned from
 Task, Result = TypeVar("Task"), TypeVar("Result")
@@ -60,27 +60,35 @@ def training_frames(sequence: Sequence) -> int:
     return min(max(len(sequence) // 3, _LEAST), _MOST, max(len(sequence) - 2, 1))
 
 
-def messages(sequence: Sequence, start: int, count: int, settings: Settings) -> list[Features]:
+def features(sequence: Sequence, start: int, count: int, settings: Settings) -> list[ObjectFeatures]:
     """Return the features of frames that a tracker learned from, which started at the true box."""
     detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
     found = []
     with one_thread(opencv=True):
-        for row, image in enumerate(islice(sequence.frames(start), count)):
-            box = Box(*map(float, sequence.boxes[start]))
-            _, features = detector.step(image) if row else detector.init(image, box)
-            if (sample := compressor.take(features)) is not None:
-                detector.adopt(trainer.train(sample))
-            found.append(features)
+        for seq, image in enumerate(islice(sequence.frames(start), count), start=1):
+            frame = Pyramid.of(image)
+            if seq == 1:
+                _, part = detector.init(frame, seq, 0.0, Box(*map(float, sequence.boxes[start])))
+            else:
+                _, part = detector.settle(detector.look(frame, seq), frame, seq, 0.0)
+            learn(detector, compressor, trainer, seq, part)
+            found.append(part)
     return found
 
 
-def model_of(found: Iterable[Features], settings: Settings) -> Learned:
+def learn(detector: Detector, compressor: Compressor, trainer: Trainer, seq: int, part: ObjectFeatures) -> None:
+    """Compress the features of a frame; the detector adopts the model if there is a new one."""
+    sample = compressor.take(seq - 1, part, compressor.version + 1)
+    if sample is not None:
+        detector.adopt(trainer.train(sample))
+
+
+def model_of(found: Iterable[ObjectFeatures], settings: Settings) -> Learned:
     """Return the saved model of one tree that has seen all features, in the given order."""
     compressor = Compressor(settings)
-    for seq, features in enumerate(found, start=1):
-        compressor.take(replace(features, seq=seq, frame=seq - 1, begins=False))
-    with one_thread():
-        return Learned.of(compressor, settings)
+    for frame, part in enumerate(found):
+        compressor.take(frame, part, compressor.version + 1)
+    return Learned.of(compressor, settings)
 
 
 def tracked(learned: Learned, sequence: Sequence, start: int, count: int) -> list[Track]:
@@ -90,10 +98,10 @@ def tracked(learned: Learned, sequence: Sequence, start: int, count: int) -> lis
     detector.seek(learned.model, learned.box, learned.likeness())
     tracks = []
     with one_thread(opencv=True):
-        for image in islice(sequence.frames(start), count):
-            track, features = detector.step(image)
-            if (sample := compressor.take(features)) is not None:
-                detector.adopt(trainer.train(sample))
+        for seq, image in enumerate(islice(sequence.frames(start), count), start=1):
+            frame = Pyramid.of(image)
+            track, part = detector.settle(detector.look(frame, seq), frame, seq, 0.0)
+            learn(detector, compressor, trainer, seq, part)
             tracks.append(track)
     return tracks
 

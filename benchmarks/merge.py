@@ -13,7 +13,7 @@ from itertools import islice
 from statistics import fmean, stdev
 
 import numpy as np
-from learning import chosen, each, hits, learning_command, messages, model_of, tracked
+from learning import chosen, each, features, hits, learning_command, model_of, tracked
 from table import Table, publish
 
 from catstream.box import Box, Window
@@ -36,7 +36,7 @@ def measured(task: tuple[Sequence, int]) -> tuple[str, Row, float, float] | None
     third, settings = max(len(sequence) // 3, 1), Settings()
     if not np.isfinite(sequence.boxes[[0, third]]).all() or len(sequence) < 2 * third + 1:
         return None
-    halves = [messages(sequence, start, third, settings) for start in (0, third)]
+    halves = [features(sequence, start, third, settings) for start in (0, third)]
     first, second = (model_of(half, settings) for half in halves)
     merged, one = merge([first, second]), model_of([*halves[0], *halves[1]], settings)
     models = {"first third": first, "second third": second, "merged": merged, "one tree": one}

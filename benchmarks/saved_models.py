@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from statistics import fmean, stdev
 
 import numpy as np
-from learning import chosen, each, hits, learning_command, messages, model_of, tracked, training_frames
+from learning import chosen, each, features, hits, learning_command, model_of, tracked, training_frames
 from table import Table, publish
 
 from catstream.evaluation.datasets import Sequence
@@ -27,7 +27,7 @@ def measured(task: tuple[Sequence, list[Sequence], int]) -> Row:
     """Measure the model of one sequence."""
     own, others, frames = task
     count = training_frames(own)
-    learned = model_of(messages(own, 0, count, Settings()), Settings())
+    learned = model_of(features(own, 0, count, Settings()), Settings())
     tracks = tracked(learned, own, count, frames)
     found = hits(tracks, own, count)
     boxes = [(track.box, truth) for track, truth in zip(tracks, own.boxes[count:], strict=False) if track.box]

@@ -215,7 +215,7 @@ class BeliefSettings(_Group):
             "Difference of score to the best window elsewhere in the frame that an object of a saved model needs to be "
             "detected for the first time."
         ),
-    ] = 0.2
+    ] = 0.1
     sighting_likeness: Annotated[
         float,
         _about(

@@ -19,7 +19,7 @@ from catstream.features.hog import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.heads import EXTENT
 from catstream.messages import DetectorState, Model
-from catstream.settings import ExtentSettings, SearchSettings, Settings
+from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 
 __all__ = [
     "Detection",
@@ -38,6 +38,7 @@ _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a 
 _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
 _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
+_LEAD_OVER_ALIKE = 0.25  # difference of score to another window that looks like the object of a saved model, too
 _SAME_OVERLAP = 0.3  # above which two windows in successive frames show the same object
 
 
@@ -120,14 +121,14 @@ class ScoreMap:
         scores = self.scores
         return row + vertex(scores[:, column], row), column + vertex(scores[row], column)
 
-    def highest_apart(self, window: Window) -> float:
-        """The highest score of a window that does not touch another; -inf if there is none."""
+    def apart(self, window: Window) -> ScoreMap:
+        """The same, but the score of each window that touches another one is -inf."""
         (x, y), (w, h) = self.origin, self.step
         rows, columns = self.scores.shape
         top, left = y + h * np.arange(rows), x + w * np.arange(columns)
         beyond = (top >= window.y + window.h) | (top + WINDOW * h <= window.y)
         beside = (left >= window.x + window.w) | (left + WINDOW * w <= window.x)
-        return float(self.scores.max(where=beyond[:, None] | beside, initial=-np.inf))
+        return replace(self, scores=np.where(beyond[:, None] | beside, self.scores, np.float32(-np.inf)))
 
 
 def searched(
@@ -178,11 +179,7 @@ def seek(
     if state.sightings or sighting.found.score >= limits.confident_score:
         sighting = _sighting(frame, state.window, _SOUGHT_FACTORS, model)
     best = sighting.found
-    seen = (
-        best.score >= limits.confident_score
-        and sighting.lead >= limits.sighting_lead
-        and (likeness is None or likeness(sighting.row) >= limits.sighting_likeness)
-    )
+    seen = best.score >= limits.confident_score and _stands_out(sighting, likeness, limits)
     again = state.sightings > 0 and best.window.overlap(state.confident_window) > _SAME_OVERLAP
     state = replace(
         state,
@@ -213,32 +210,46 @@ def whole(frame: Pyramid, window: Window, model: Model) -> Detection:
     return found[int(np.argmax([each.score - cost for each, cost in zip(found, costs, strict=True)]))]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Sighting:
-    """The best window of a whole frame at several sizes.
+    """The best window of a whole frame at several sizes, and its rival: the best one that does not touch it.
 
-    lead  difference of its score to the highest of the windows that do not touch it, at any size
-    row   its feature row
+    rival      score of the rival; 0, the mean of the background that was learned, if none is higher
+    row        feature row of the best window
+    rival_row  feature row of the rival, None if there is none
     """
 
     found: Detection
-    lead: float
+    rival: float
     row: np.ndarray
+    rival_row: np.ndarray | None
 
 
 def _sighting(frame: Pyramid, window: Window, factors: tuple[float, ...], model: Model) -> _Sighting:
     """The best window of a whole frame, at the size of a window times each of several factors.
 
-    In a scene that the model never saw, anything may score high. The windows that do not touch the best
-    one show how high; 0, the mean of the background that was learned, counts as one of them.
+    In a scene that the model never saw, anything may score high: the rival shows how high.
     """
     maps = [ScoreMap.whole(frame, window.scaled(factor), model) for factor in factors]
     costs = [extent.cost(math.log(factor)) for factor in factors]
     worths = [float(each.scores.max()) - cost for each, cost in zip(maps, costs, strict=True)]
     scores = maps[int(np.argmax(worths))]
     best = scores.best()
-    others = max([0.0, *(each.highest_apart(best.window) for each in maps)])
-    return _Sighting(best, best.score - others, scores.row(*scores.highest()))
+    apart = max((each.apart(best.window) for each in maps), key=lambda each: float(each.scores.max()))
+    rival = float(apart.scores.max())
+    rival_row = apart.row(*apart.highest()) if rival > 0 else None
+    return _Sighting(best, max(rival, 0.0), scores.row(*scores.highest()), rival_row)
+
+
+def _stands_out(sighting: _Sighting, likeness: Likeness | None, limits: BeliefSettings) -> bool:
+    """Whether the best window looks like the object, and leads the rest of the frame."""
+    lead = sighting.found.score - sighting.rival
+    if likeness is None:
+        return lead >= _LEAD_OVER_ALIKE
+    if likeness(sighting.row) < limits.sighting_likeness or lead < limits.sighting_lead:
+        return False
+    alike = sighting.rival_row is not None and likeness(sighting.rival_row) >= limits.sighting_likeness
+    return lead >= _LEAD_OVER_ALIKE or not alike
 
 
 def _near(frame: Pyramid, window: Window, state: DetectorState, model: Model, settings: Settings) -> Detection:
