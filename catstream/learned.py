@@ -92,8 +92,12 @@ class Learned:
         SettingsError
             If the settings do not suit the trees.
         """
-        _check_same(self.settings, settings, "the saved model was learned", "this run has")
+        self.check_fits(settings)
         return Compressor.continuing(self.trees, self.model.version, self.centres, self.origins, settings, name)
+
+    def check_fits(self, settings: Settings) -> None:
+        """Raise SettingsError if a run with these settings cannot continue the trees."""
+        _check_same(self.settings, settings, "the saved model was learned", "this run has")
 
     def likeness(self) -> Likeness:
         """Measures the likeness of a window to the object, from the trees: see `catstream.detection.likeness`."""

@@ -23,8 +23,9 @@ from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, S
 from catstream.features.cells import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.image import as_bgr
+from catstream.learned import Learned
 from catstream.messages import Features, Model, Track, Tracks
-from catstream.names import Boxes, boxes_by_name, check_count
+from catstream.names import UNNAMED, Boxes, boxes_by_name, check_count, listed
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
 from catstream.storage import Arrays, Metadata, with_prefix
@@ -159,6 +160,23 @@ class MultiTracker:
         """
         _ = self.tracks
         self.detectors.forget(name)
+
+    def learned(self, name: str = UNNAMED) -> Learned:
+        """Everything that was learned of an object: save it as a model, and use it in another video.
+
+        Raises
+        ------
+        BoxError
+            Before `init`.
+        ObjectError
+            If there is no object of this name.
+        ServiceError
+            If too few frames were learned from.
+        """
+        _ = self.tracks
+        if name not in self.forest.compressors:
+            raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.forest.compressors)}")
+        return Learned.of(self.forest.compressors[name], self.settings)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything that was learned to one file, atomically: `load` continues from there.

@@ -162,6 +162,8 @@ class Pipeline:
             each.validated(*self.size)
         path = job.source if self.live else str(Path(job.source).absolute())
         self._job = replace(job, source=path, size=self.size, settings=job.settings.for_length(self.frames))
+        for file in job.models.values():
+            Learned.load(file).check_fits(self._job.settings)
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
         self._record, self._save_model = _path(record), _path(save_model)
@@ -463,8 +465,6 @@ def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
     """Raise an error if a run cannot start, before anything is opened."""
     if not job.source:
         raise SettingsError("a new run needs a source: give one")
-    for file in job.models.values():
-        Learned.load(file)
     if job.settings.run.lockstep and is_live(job.source):
         raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
     if record is not None and record.exists() and is_new:

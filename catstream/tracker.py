@@ -10,6 +10,7 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.errors import ObjectError
+from catstream.learned import Learned
 from catstream.messages import Track
 from catstream.multi import MultiTracker
 from catstream.names import UNNAMED
@@ -102,6 +103,18 @@ class Tracker:
         """
         track = self._objects.update(frame, time)[UNNAMED]
         return track.box is not None, track.box
+
+    def learned(self) -> Learned:
+        """Everything that was learned of the object: save it as a model, and use it in another video.
+
+        Raises
+        ------
+        BoxError
+            Before `init`.
+        ServiceError
+            If too few frames were learned from.
+        """
+        return self._objects.learned()
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all that was learned to one file, whole or not at all: `Tracker.load` continues from there.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,8 @@ from catstream.heads import APPEARANCE, EXTENT
 from catstream.learned import Learned, merge
 from catstream.messages import DetectorState, ObjectFeatures, TrainingRows
 from catstream.settings import Settings
+from catstream.tracker import Tracker
+from catstream.video.source import open_source
 
 SIZE, WIDTH, FRAMES = 8, row_length(), 60
 SETTINGS = Settings(coreset={"size": SIZE})
@@ -194,3 +198,18 @@ def test_models_that_do_not_fit_are_not_merged(learned):
 
 def test_a_model_with_a_name_and_one_without_are_of_the_same_object(learned):
     assert merge([learned, learn(stream(2), name="anna")]).object == "anna"
+
+
+def test_a_tracker_gives_what_its_trees_have_learned(demo_video):
+    path, boxes = demo_video(60)
+    tracker = Tracker({"coreset.size": 16})
+    with open_source(str(path)) as source:
+        for frame in islice(source, 12):
+            if frame.number:
+                tracker.update(frame.image)
+            else:
+                tracker.init(frame.image, boxes[0])
+    learned = tracker.learned()
+    assert learned.object == ""
+    assert learned.box.overlap(Box(*boxes[11])) > 0.5
+    assert learned.likeness()(learned.trees["object"].nodes[0].rows[0]) > 0.5

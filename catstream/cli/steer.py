@@ -135,13 +135,14 @@ def resume(pipeline: Control) -> str:
 @click.option(
     "--state", type=click.Path(path_type=Path), metavar="FOLDER", help="State folder of a run, which may have ended."
 )
+@click.option("--object", "name", default="", metavar="NAME", help="Name of the object, if the run has several.")
 @_with_pipeline
-def save(target: _Target, file: Path, state: Path | None) -> None:
-    """Save what a pipeline has learned to FILE.
+def save(target: _Target, file: Path, state: Path | None, name: str) -> None:
+    """Save everything that a pipeline has learned of an object to FILE.
 
-    The file has the newest model and the coreset that it was trained on.
-    `catstream track SOURCE --model FILE` finds the object with it and continues
-    to learn. A running pipeline is not interrupted.
+    The file has the coreset trees whole, and a model. `catstream track SOURCE
+    --model FILE` finds the object with it and continues to learn. A running
+    pipeline is not interrupted.
 
     With --state, the newest checkpoint in that folder is saved, and no pipeline
     has to run. `catstream track --save-model FILE` writes the same file at the
@@ -150,18 +151,19 @@ def save(target: _Target, file: Path, state: Path | None) -> None:
     \b
     EXAMPLES
       catstream save walker.safetensors
+      catstream save anna.safetensors --object anna
       catstream save walker.safetensors --state checkpoints
       catstream track other.mp4 --model walker.safetensors
     """
     if state is None:
         with target.control() as pipeline:
-            version = pipeline.save(file).version
+            version = pipeline.save(file, name).version
     elif target.is_named:
         raise click.UsageError(
             "--state names the folder of a run, --endpoint and --source a running pipeline: give one"
         )
     else:
-        content = learned(state, Job.load(state).settings)
+        content = learned(state, Job.load(state).settings, name)
         content.save(file)
         version = content.model.version
     click.echo(f"model {version} is in {file}")

@@ -1,0 +1,61 @@
+"""`catstream merge`, as a person uses it."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import pytest
+
+from catstream.box import Box
+from catstream.learned import Learned
+from catstream.tracker import Tracker
+from catstream.video.source import open_source
+
+
+@pytest.fixture(scope="session")
+def models(demo_video, once):
+    """Two saved models of one object, learned from two parts of the demo video."""
+    path, boxes = demo_video(60)
+
+    def learn(folder):
+        for name, first in (("door", 0), ("yard", 30)):
+            tracker = Tracker({"coreset.size": 16})
+            with open_source(str(path)) as source:
+                for frame in islice(source, first, first + 15):
+                    if frame.number == first:
+                        tracker.init(frame.image, Box(*boxes[first]))
+                    else:
+                        tracker.update(frame.image)
+            tracker.learned().save(folder / name)
+
+    folder = once("models", learn)
+    return folder / "door", folder / "yard"
+
+
+def test_models_of_two_cameras_are_merged_into_one_file(said, models, tmp_path):
+    code, output, errors = said("merge", *models, "-o", tmp_path / "both")
+    assert (code, errors) == (0, "")
+    one, other, both = map(Learned.load, (*models, tmp_path / "both"))
+    rows = both.trees["object"].rows_seen
+    assert rows == one.trees["object"].rows_seen + other.trees["object"].rows_seen
+    assert f"2 saved models, 2 videos, {rows} rows of the object" in output
+
+
+def test_a_merge_that_cannot_be_made_is_one_line_and_writes_nothing(said, models, tmp_path):
+    door, yard = models
+    damaged, kept = tmp_path / "damaged", tmp_path / "kept"
+    damaged.write_bytes(door.read_bytes()[:-9])
+    kept.write_text("kept")
+    for words, why in (
+        ((door, door, "-o", tmp_path / "new"), "the same frames"),
+        ((door, "-o", tmp_path / "new"), "needs two or more"),
+        ((door, damaged, "-o", tmp_path / "new"), "not an undamaged file"),
+        ((door, tmp_path / "none", "-o", tmp_path / "new"), "there is no saved model"),
+        ((door, yard, "-o", kept), "exists already"),
+    ):
+        code, output, errors = said("merge", *words)
+        assert (code, output, errors.count("\n")) == (1, "", 1), errors
+        assert why in errors
+    assert not (tmp_path / "new").exists()
+    assert kept.read_text() == "kept"
+    assert said("merge", door, yard, "-o", kept, "--overwrite")[0] == 0
