@@ -140,10 +140,11 @@ def results(tracker, frames):
     return [(*tracker.update(frame), tracker.track) for frame in frames]
 
 
+_SKETCH = {"coreset.reduction": "frequent-directions"}
 _SCM = {"teaching.bootstrap": "scm", "coreset.size": 36, "teaching.copies": 5}
 
 
-@pytest.mark.parametrize("settings", [{}, _SCM], ids=["copies", "scm"])
+@pytest.mark.parametrize("settings", [{}, _SCM, _SKETCH], ids=["copies", "scm", "sketch"])
 @pytest.mark.parametrize("after", [1, 4, 11], ids="after {} frames".format)
 def test_a_saved_tracker_continues_bit_for_bit(video, tmp_path, settings, after):
     frames, boxes = video
