@@ -6,17 +6,20 @@
         for track in tracks:
             print(track.frame, track.state, track.box)
 
-The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them.
+The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them. With
+`object="anna"`, only the messages about this object are transmitted.
 """
 
 from __future__ import annotations
 
+import math
 import select
 from time import monotonic
 from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
 
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
+from catstream.names import check_name
 from catstream.wire.announced import Announcement
 from catstream.wire.channels import CHANNELS, HEALTH, TRACKS
 from catstream.wire.endpoint import Endpoint, find
@@ -45,32 +48,43 @@ AnyMessage = Track | Model | Health | Sample | Features | Preview
 Message = TypeVar("Message", bound=AnyMessage)
 
 
-class GapCounter:
-    """Counts lost messages of a stream by the gaps in their sequence numbers `seq`, which start with 1.
+#: Public name of a channel whose messages are about one object each -> their kind.
+_KINDS: dict[str, type] = {"tracks": Track, "models": Model, "samples": Sample}
 
-    missed  messages lost after the first one was received; a restarted sender may repeat numbers
-    before  messages sent before the first one that was received
+
+class GapCounter:
+    """Counts lost frames of a stream by the gaps in the numbers `seq` of its messages, which start with 1.
+
+    The tracks of all objects in a frame have the same number. A restarted sender may repeat numbers.
+
+    missed  frames without a message between the first and the last one that was received
+    before  frames before the first message that was received
     """
 
     def __init__(self) -> None:
         self.missed = self.before = self._seq = 0
 
     def take(self, seq: int) -> None:
-        """Count the messages missing before the number of the next message, or of the end."""
+        """Count the frames missing before the number of the next message, or of the end."""
         if self._seq:
             self.missed += max(0, seq - self._seq - 1)
         else:
             self.before = max(0, seq - 1)
         self._seq = seq
 
+    def begin(self, seq: int) -> None:
+        """Count from this number on: an object begins here, so there were no messages about it before."""
+        self._seq = seq
+
 
 class Subscription(Generic[Message]):
     """The messages of one channel of a running pipeline, until the pipeline ends; iterate with `for` or `async for`.
 
-    There is one track and one features message for each frame; after a restart of the detector some are repeated. For
-    models, samples, previews and health reports, the last message arrives at once; then each iteration returns the
-    newest, and older ones that were not read are dropped. A subscriber to a named endpoint may start before the
-    pipeline. If both run on the same machine as the same user, the pipeline waits for it, so that it receives every
+    There is one features message for each frame, and one track for each object and frame; after a restart of the
+    detector some are repeated. For models, samples, previews and health reports, the last message arrives at once; then
+    each iteration returns the newest, and older ones that were not read are dropped. Models and samples are kept for
+    each object, and the object that has waited longest comes first. A subscriber to a named endpoint may start before
+    the pipeline. If both run on the same machine as the same user, the pipeline waits for it, so that it receives every
     message.
 
     Attributes
@@ -92,11 +106,25 @@ class Subscription(Generic[Message]):
         During iteration, if the pipeline rejects the keys.
     """
 
-    def __init__(self, endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        channel: str,
+        *,
+        object: str | None = None,
+        timeout: float | None = None,
+        keys: str = "",
+    ) -> None:
         if channel not in _SUBSCRIBABLE:
             raise ServiceError(
                 f"expected one of the channels {', '.join(_SUBSCRIBABLE)}, got {channel!r}: subscribe to one of them"
             )
+        if object is not None and channel not in _KINDS:
+            raise ServiceError(
+                f"a message of {channel} is about all objects: subscribe to {', '.join(_KINDS)} for one object, or to "
+                f"{channel} without an object"
+            )
+        about = None if object is None else check_name(object)
         place = find(endpoint, keys)
         self.endpoint, self.timeout = str(place), timeout
         self.keys = str(place.keys.folder) if place.keys is not None else ""
@@ -106,18 +134,23 @@ class Subscription(Generic[Message]):
         # A pipeline that starts here later waits until this subscription has connected.
         self._announcement = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
         reader = self._announcement.reader if self._announcement else ""
-        self._messages = Subscriber(self._channel, place, reader=reader)
+        only = None if about is None else _KINDS[channel]
+        self._messages = Subscriber(self._channel, place, only, about=about, reader=reader)
+        self._about, self._version = about, math.inf  # of the model of the object's last track
         # A socket of its own for the end: if this subscriber is slow, the end could be among the dropped messages.
         self._ends = Subscriber(TRACKS, place, only=End)
 
     @property
     def missed(self) -> int:
-        """Number of tracks or features that were not received: sent before the connection, or dropped."""
+        """Number of frames whose tracks or features were not received: sent before the connection, or dropped.
+
+        For one object, the frames between its first and its last track that was received.
+        """
         return self._gaps.missed + self._gaps.before
 
     @property
     def missed_before(self) -> int:
-        """Number of those that were sent before the connection."""
+        """Number of those that were sent before the connection; 0 for one object, which may begin later."""
         return self._gaps.before
 
     def losses(self) -> str:
@@ -172,7 +205,7 @@ class Subscription(Generic[Message]):
         """Return the next message if one was received, without waiting."""
         while (message := self._messages.receive(0)) is not None:
             if isinstance(message, Track | Features):
-                self._gaps.take(message.seq)
+                self._count(message)
             if not isinstance(message, Run | End):
                 self._withdraw_announcement()
                 return cast(Message, message)
@@ -184,6 +217,15 @@ class Subscription(Generic[Message]):
                 self.end, self._close_time = end, monotonic() + _DRAIN_SECONDS
         return None
 
+    def _count(self, message: Track | Features) -> None:
+        """Count the frames missing before a message, unless its object was not there."""
+        if self._about is not None and isinstance(message, Track):
+            # The version of an object's model never falls: if it does, another object begins under the same name.
+            if message.model_version < self._version:
+                self._gaps.begin(message.seq)
+            self._version = message.model_version
+        self._gaps.take(message.seq)
+
     def _withdraw_announcement(self) -> None:
         """Tell pipelines at this endpoint not to wait for this subscriber any more."""
         if self._announcement is not None:
@@ -192,7 +234,7 @@ class Subscription(Generic[Message]):
     def _ended(self) -> bool:
         if self.end is None or monotonic() < self._close_time:
             return False
-        if self._channel.keeps == "every":
+        if self._channel.keeps == "every" and self._about is None:  # one object may have been forgotten before
             self._gaps.take(self.end.seq)
         return True
 
@@ -212,11 +254,11 @@ class Subscription(Generic[Message]):
 
 @overload
 def subscribe(
-    endpoint: str, channel: Literal["tracks"], *, timeout: float | None = ..., keys: str = ...
+    endpoint: str, channel: Literal["tracks"], *, object: str | None = ..., timeout: float | None = ..., keys: str = ...
 ) -> Subscription[Track]: ...
 @overload
 def subscribe(
-    endpoint: str, channel: Literal["models"], *, timeout: float | None = ..., keys: str = ...
+    endpoint: str, channel: Literal["models"], *, object: str | None = ..., timeout: float | None = ..., keys: str = ...
 ) -> Subscription[Model]: ...
 @overload
 def subscribe(
@@ -224,7 +266,12 @@ def subscribe(
 ) -> Subscription[Health]: ...
 @overload
 def subscribe(
-    endpoint: str, channel: Literal["samples"], *, timeout: float | None = ..., keys: str = ...
+    endpoint: str,
+    channel: Literal["samples"],
+    *,
+    object: str | None = ...,
+    timeout: float | None = ...,
+    keys: str = ...,
 ) -> Subscription[Sample]: ...
 @overload
 def subscribe(
@@ -234,7 +281,14 @@ def subscribe(
 def subscribe(
     endpoint: str, channel: Literal["previews"], *, timeout: float | None = ..., keys: str = ...
 ) -> Subscription[Preview]: ...
-def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys: str = "") -> Subscription[Any]:
+def subscribe(
+    endpoint: str,
+    channel: str,
+    *,
+    object: str | None = None,
+    timeout: float | None = None,
+    keys: str = "",
+) -> Subscription[Any]:
     """Subscribe to a channel of a running pipeline.
 
     Parameters
@@ -244,6 +298,9 @@ def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys
         only running pipeline of this user.
     channel : str
         "tracks", "models", "health", "samples", "features" or "previews".
+    object : str or None
+        Name of the one object whose tracks, models or samples are received; "" for the object without a name, None for
+        all objects.
     timeout : float or None
         Seconds without a message after which iteration raises `SilenceError`; None to wait without limit.
     keys : str
@@ -251,11 +308,13 @@ def subscribe(endpoint: str, channel: str, *, timeout: float | None = None, keys
 
     Raises
     ------
+    ObjectError
+        If `object` is not a valid name.
     ServiceError
-        If there is no such channel, if `endpoint` is empty and not exactly one pipeline runs, or if the keys cannot be
-        read.
+        If there is no such channel, or its messages are not about one object each; if `endpoint` is empty and not
+        exactly one pipeline runs; or if the keys cannot be read.
     """
-    return Subscription(endpoint, channel, timeout=timeout, keys=keys)
+    return Subscription(endpoint, channel, object=object, timeout=timeout, keys=keys)
 
 
 def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_TIMEOUT_SECONDS) -> Endpoint:

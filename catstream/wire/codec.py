@@ -111,15 +111,15 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
         raise ProtocolError(
             f"expected {expected}, got {len(data)} bytes that are not its msgpack: {error}", "msgpack"
         ) from None
+    if isinstance(envelope, list) and len(envelope) > 1 and (version := envelope[0]) != VERSION:
+        raise ProtocolError(
+            f"expected version {VERSION} of the protocol, got {_brief(version)}: run the same catstream", "version"
+        )
     if not isinstance(envelope, list) or len(envelope) != 4:
         raise ProtocolError(
             f"expected {expected} as [version, kind, object, fields], got something else in msgpack", "envelope"
         )
-    version, name, about, fields = envelope
-    if version != VERSION:
-        raise ProtocolError(
-            f"expected version {VERSION} of the protocol, got {_brief(version)}: run the same catstream", "version"
-        )
+    _, name, about, fields = envelope
     kind = KINDS.get(name) if isinstance(name, str) else None
     if kind not in kinds:
         raise ProtocolError(f"expected {expected}, got {_brief(name)}", "kind")
@@ -128,7 +128,10 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
     except msgspec.ValidationError as error:
         raise ProtocolError(f"{name}: {error}", "type") from None
     if about != getattr(message, "object", ""):
-        raise ProtocolError(f"{name}: its topic is of the object {_brief(about)}, and its fields are not", "envelope")
+        raise ProtocolError(
+            f"{name}: expected one object, got {_brief(about)} in the envelope and another one in the fields",
+            "envelope",
+        )
     check_message(message)
     return message
 
@@ -140,7 +143,7 @@ def opening(kind: type, about: str | None = None) -> bytes:
 
 
 def topic_of(data: bytes | memoryview) -> bytes:
-    """The topic of a message: the bytes before its fields; all of the data if it is not a message.
+    """The topic of a message: the bytes before its fields; the first bytes of the data if it is not a message.
 
     >>> topic_of(encode(End(1, "over"))) == opening(End, "")
     True
@@ -152,7 +155,7 @@ def topic_of(data: bytes | memoryview) -> bytes:
         for _ in range(3):
             reader.skip()
     except (ValueError, msgpack.exceptions.UnpackException):
-        return bytes(data)
+        return bytes(data[:_LONGEST_TOPIC])
     return bytes(data[: reader.tell()])
 
 

@@ -29,6 +29,7 @@ from catstream.wire.socket import ChannelSocket
 __all__ = ["Publisher", "Subscriber"]
 
 _MOST_KEPT = 256  # newest messages that are kept, one of each object
+_MOST_TOPICS = 1024  # topics that a publisher knows the subscribers of, and that a subscriber knows the last message of
 _MAX_CHANGES = 1000  # subscriptions that are processed at once
 _MAX_SUBSCRIPTION_BYTES = 4096
 _REPEAT_SECONDS = 0.2  # without a newer message, after which the last one is sent again
@@ -126,6 +127,8 @@ class Publisher(ChannelSocket[Message]):
             self._reject(
                 "subscription", "a message was dropped: one subscribes to everything, or to messages of a kind"
             )
+        elif subscribes and topic not in self._subscribed and len(self._subscribed) >= _MOST_TOPICS:
+            self._reject("subscription", f"a subscription was not counted: there are {_MOST_TOPICS} others already")
         elif subscribes:
             self._subscribed.add(topic)
             return True
@@ -189,7 +192,7 @@ class Subscriber(ChannelSocket[Message]):
         """The next message as it arrived, None if none arrives before the deadline."""
         if not self._passes_over:
             return self._socket.recv(copy=False) if self._wait(deadline - monotonic()) else None
-        while self._wait(0 if self._arrived else deadline - monotonic()):
+        while len(self._arrived) < _MOST_KEPT and self._wait(0 if self._arrived else deadline - monotonic()):
             frame = self._socket.recv(copy=False)
             self._arrived[topic_of(frame.buffer)] = frame  # in the place of an older one
         return self._arrived.pop(next(iter(self._arrived))) if self._arrived else None
@@ -197,6 +200,8 @@ class Subscriber(ChannelSocket[Message]):
     def _is_repeat(self, message: Message, data: memoryview) -> bool:
         """Whether the last message of the same process or topic was the same: it was sent again to a late joiner."""
         sender = message.process.encode() if isinstance(message, Health) else topic_of(data)
-        before, digest = self._last.get(sender), blake2b(data, digest_size=16).digest()
+        before, digest = self._last.pop(sender, None), blake2b(data, digest_size=16).digest()
         self._last[sender] = digest
+        if len(self._last) > _MOST_TOPICS:
+            del self._last[next(iter(self._last))]
         return before == digest

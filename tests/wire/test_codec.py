@@ -24,6 +24,8 @@ from catstream.messages import (
     Health,
     Model,
     Motion,
+    ObjectFeatures,
+    ObjectPosition,
     Position,
     Preview,
     Run,
@@ -31,9 +33,10 @@ from catstream.messages import (
     Stored,
     Summary,
     Track,
+    Tracks,
     TrainingRows,
 )
-from catstream.schema import LARGEST_INTEGER, Array, Bytes, Field, Named, OnlyWith, Whole, fields
+from catstream.schema import LARGEST_INTEGER, Array, ByObject, Bytes, Field, Name, Named, OnlyWith, Whole, fields
 from catstream.wire.codec import KINDS, VERSION, decode, encode
 
 
@@ -50,26 +53,34 @@ WINDOWS = Window(4.0, 2.0, 25.0, 12.5), Window(4.5, 2.0, 25.0, 12.5), Window(9.0
 DETECTOR = DetectorState(3, "weak", *WINDOWS, False, 2, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
 TRAINING = TrainingRows(array(3, 5), array(3), array(3))
 TREES = {"object": summary(5), "background": summary(5), "loss": summary(7), "extent": summary(7)}
+BOX = Box(4.5, 3.0, 20.0, 10.0)
+TRACK = Track(3, 2, 0.08, "present", BOX, 0.75, 4, 1234.5, "anna")
 EXAMPLES = {
-    "answer": Answer("7f", True, "followed from frame 9 on", 9, Box(4.5, 3.0, 20.0, 10.0), 4),
-    "command": Command("7f", "set-box", Box(4.5, 3.0, 20.0, 10.0), True),
+    "answer": Answer("7f", True, "followed from frame 9 on", 9, BOX, 4, "anna"),
+    "command": Command("7f", "set-box", BOX, True, "anna"),
     "end": End(8, "the source has ended", False, {"sent": 7.0, "stored": 7.0}),
     "features": Features(
         3,
         2,
         0.08,
-        Box(4.5, 3.0, 20.0, 10.0),
-        {"appearance": TRAINING, "extent": TrainingRows(array(1, 5), array(1), array(1))},
-        DETECTOR,
+        {
+            "anna": ObjectFeatures(
+                BOX, {"appearance": TRAINING, "extent": TrainingRows(array(1, 5), array(1), array(1))}, DETECTOR
+            ),
+            "ben": ObjectFeatures(None, begins=True),
+        },
     ),
-    "health": Health("detector", 1.7e9, {"sent": 4.0}, "the disk is full", "walk.mp4"),
-    "model": Model(4, 20, array(5), -0.25, MOTION, {"extent": array(5)}),
-    "position": Position(5, 4, Box(1.0, 2.0, 3.0, 4.0), 2, DETECTOR),
-    "preview": Preview(2, 1280, 720, Box(4.5, 3.0, 20.0, 10.0), b"\xff\xd8\xff\xe0 and so on"),
+    "health": Health(
+        "detector", 1.7e9, {"sent": 4.0}, "the disk is full", "walk.mp4", {"anna": {"present": 1.0}, "ben": {}}
+    ),
+    "model": Model(4, 20, array(5), -0.25, MOTION, {"extent": array(5)}, "anna"),
+    "position": Position(5, 4, {"anna": ObjectPosition(BOX, 2, DETECTOR), "ben": ObjectPosition()}, 1),
+    "preview": Preview(2, 1280, 720, {"anna": BOX, "ben": BOX}, b"\xff\xd8\xff\xe0 and so on"),
     "run": Run("0.1.0", {"coreset.size": "64", "classifier": "joint"}),
-    "sample": Sample(4, 20, TREES, np.array([[1.0, 2.0], [np.nan, np.nan]])),
-    "stored": Stored(5, 7, 2),
-    "track": Track(3, 2, 0.08, "present", Box(4.5, 3.0, 20.0, 10.0), 0.75, 4, 1234.5),
+    "sample": Sample(4, 20, TREES, np.array([[1.0, 2.0], [np.nan, np.nan]]), "anna"),
+    "stored": Stored(5, 7, {"anna": 2}),
+    "track": TRACK,
+    "tracks": Tracks(3, 2, {"anna": TRACK, "ben": Track(3, 2, 0.08, "absent", None, 0.1, 2, object="ben")}),
 }
 MESSAGES = pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
 ALL = tuple(KINDS.values())
@@ -78,19 +89,26 @@ FUZZ = settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
 
 def packed(kind: str, **changes: object) -> bytes:
     """An example as bytes, with some of its fields replaced on the wire."""
-    return msgpack.packb([VERSION, kind, fields_of(kind) | changes])
+    about = getattr(EXAMPLES[kind], "object", "")
+    return msgpack.packb([VERSION, kind, about, fields_of(kind) | changes])
 
 
 def fields_of(kind: str) -> dict[str, Any]:
     """The fields of an example, as they travel."""
-    _, _, sent = msgpack.unpackb(encode(EXAMPLES[kind]))
+    *_, sent = msgpack.unpackb(encode(EXAMPLES[kind]))
     return sent
+
+
+def of_anna(**changes: object) -> bytes:
+    """The example of features as bytes, with some fields of its first object replaced on the wire."""
+    objects = fields_of("features")["objects"]
+    return packed("features", objects=objects | {"anna": objects["anna"] | changes})
 
 
 def retrained(**arrays: object) -> bytes:
     """The example of features as bytes, with some of its training rows replaced on the wire."""
-    training = fields_of("features")["training"]
-    return packed("features", training=training | {"appearance": training["appearance"] | arrays})
+    training = fields_of("features")["objects"]["anna"]["training"]
+    return of_anna(training=training | {"appearance": training["appearance"] | arrays})
 
 
 def plain(dtype: str, shape: list[int], data: bytes) -> dict[str, object]:
@@ -103,6 +121,7 @@ def test_every_kind_has_an_example():
 
 FINITE = st.floats(-1e6, 1e6)
 SIDE = st.floats(0.5, 1e6)
+NAMES = st.just("") | st.from_regex(r"\w[\w.-]{0,63}", fullmatch=True)
 
 
 @st.composite
@@ -127,6 +146,8 @@ def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
         return _map(draw, field, lengths)
     if field.is_message:
         return draw(messages(field.type))
+    if field.limit(Name):
+        return draw(NAMES)
     if array := field.limit(Array):
         return draw(_arrays(array, tuple(_length(draw, side, lengths) for side in array.shape)))
     if limits := field.limit(Bytes):
@@ -137,7 +158,8 @@ def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
 def _map(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> dict[str, Any]:
     named = field.limit(Named)
     if named is None:
-        return {name: _value(draw, field.values, lengths) for name in draw(st.sets(st.text(max_size=8), max_size=3))}
+        names = NAMES if field.limit(ByObject) else st.text(max_size=8)
+        return {name: _value(draw, field.values, lengths) for name in draw(st.sets(names, max_size=3))}
     names = [name for name in named.columns if name in named.required or draw(st.booleans())]
     if field.values.is_message:
         return {name: draw(messages(field.values.type, lengths["d"] + named.columns[name])) for name in names}
@@ -177,13 +199,14 @@ def test_every_message_that_the_schema_allows_arrives_as_it_was_sent(message):
 def test_arrays_arrive_read_only():
     arrived = decode(encode(EXAMPLES["features"]), Features)
     with pytest.raises(ValueError, match="read-only"):
-        arrived.training["appearance"].rows[0, 0] = 1
+        arrived.objects["anna"].training["appearance"].rows[0, 0] = 1
 
 
 def test_arrays_travel_row_by_row_whatever_their_layout():
     rows = TrainingRows(np.asfortranarray(array(3, 5)), array(3), array(3))
-    message = dataclasses.replace(EXAMPLES["features"], training={"appearance": rows})
-    np.testing.assert_array_equal(decode(encode(message), Features).training["appearance"].rows, array(3, 5))
+    message = Features(3, 2, 0.08, {"": ObjectFeatures(BOX, {"appearance": rows})})
+    arrived = decode(encode(message), Features)
+    np.testing.assert_array_equal(arrived.objects[""].training["appearance"].rows, array(3, 5))
 
 
 def test_a_field_of_a_later_version_is_ignored():
@@ -221,7 +244,18 @@ REJECTED = {
     "a tree of another width": packed("sample", trees=TREES_SENT | {"loss": TREES_SENT["object"]}),
     "a sample without the object's tree": packed("sample", trees={"loss": TREES_SENT["loss"]}),
     "a tree of no head": packed("sample", trees=TREES_SENT | {"unknown": TREES_SENT["loss"]}),
-    "training rows of no group": packed("features", training={"unknown": {}}),
+    "training rows of no group": of_anna(training={"unknown": {}}),
+    "a name that is no name": packed("features", objects={"an na": {}}),
+    "a track of a name that is no name": msgpack.packb(
+        [VERSION, "track", "../x", fields_of("track") | {"object": "../x"}]
+    ),
+    "another object in the envelope": msgpack.packb([VERSION, "track", "ann", fields_of("track")]),
+    "an object in the envelope, and none in the fields": msgpack.packb(
+        [VERSION, "stored", "anna", fields_of("stored")]
+    ),
+    "lists in lists, as object": b"\x94\x03\xa3end" + b"\x91" * 1015 + b"\x90\x80",
+    "a number as object": msgpack.packb([VERSION, "track", 1, fields_of("track") | {"object": 1}]),
+    "more objects than a map may have": packed("stored", versions={f"o{i}": 1 for i in range(257)}),
     "rows of another width in another group": retrained(rows=plain("<f4", [3, 4], bytes(48))),
     "a picture that is no JPEG": packed("preview", jpeg=b"<svg onload=...>"),
     "a picture above its limit": packed("preview", jpeg=b"\xff\xd8\xff" + bytes(1 << 19)),
@@ -232,26 +266,26 @@ REJECTED = {
     "a negative seq": packed("track", seq=-1),
     "a seq above 2**53": packed("track", seq=2**53 + 1),
     "a text for a number": packed("track", score="0.5"),
-    "a missing field": msgpack.packb([VERSION, "track", {"seq": 1}]),
-    "another version": msgpack.packb([VERSION + 1, "track", {}]),
-    "a kind that does not exist": msgpack.packb([VERSION, "orders", {}]),
+    "a missing field": msgpack.packb([VERSION, "track", "", {"seq": 1}]),
+    "another version": msgpack.packb([VERSION + 1, "track", "", {}]),
+    "a kind that does not exist": msgpack.packb([VERSION, "orders", "", {}]),
     "no envelope": msgpack.packb({"seq": 1}),
     "nothing": b"",
     "half a message": encode(EXAMPLES["features"])[:-20],
     "more than a message": encode(EXAMPLES["track"]) + b"\x00",
-    "a name twice in a map": b"\x93\x02\xa3end\x82\xa3seq\x01\xa3seq\x02",
-    "a map of bytes": b"\x93\x02\xa3end\x82\xc4\x03seq\x01\xa6reason\xa1x",
-    "a list of four thousand million": b"\x93\x02\xa3end\xdd\xff\xff\xff\xff",
-    "a map of four thousand million": b"\x93\x02\xa3end\xdf\xff\xff\xff\xff",
-    "bytes of four gigabytes": b"\x93\x02\xa3end\xc6\xff\xff\xff\xff",
-    "a text of four gigabytes": b"\x93\x02\xdb\xff\xff\xff\xff",
-    "a list longer than any message's": msgpack.packb([VERSION, "end", [None] * 257]),
+    "a name twice in a map": b"\x94\x03\xa3end\xa0\x82\xa3seq\x01\xa3seq\x02",
+    "a map of bytes": b"\x94\x03\xa3end\xa0\x82\xc4\x03seq\x01\xa6reason\xa1x",
+    "a list of four thousand million": b"\x94\x03\xa3end\xa0\xdd\xff\xff\xff\xff",
+    "a map of four thousand million": b"\x94\x03\xa3end\xa0\xdf\xff\xff\xff\xff",
+    "bytes of four gigabytes": b"\x94\x03\xa3end\xa0\xc6\xff\xff\xff\xff",
+    "a text of four gigabytes": b"\x94\x03\xdb\xff\xff\xff\xff",
+    "a list longer than any message's": msgpack.packb([VERSION, "end", "", [None] * 257]),
     "a reason longer than a page": packed("end", reason="x" * 4097),
-    "an extension type": b"\x93\x02\xa3end\xd4\x05\x00",
-    "a timestamp": b"\x93\x02\xa3end\xd6\xff\x00\x00\x00\x00",
-    "lists in lists, as version": b"\x93" + b"\x91" * 1015 + b"\x90\xa3end\x80",
-    "lists in lists, as kind": b"\x93\x02" + b"\x91" * 1015 + b"\x90\x80",
-    "lists in lists, as fields": b"\x93\x02\xa3end" + b"\x91" * 1015 + b"\x90",
+    "an extension type": b"\x94\x03\xa3end\xa0\xd4\x05\x00",
+    "a timestamp": b"\x94\x03\xa3end\xa0\xd6\xff\x00\x00\x00\x00",
+    "lists in lists, as version": b"\x94" + b"\x91" * 1015 + b"\x90\xa3end\xa0\x80",
+    "lists in lists, as kind": b"\x94\x03" + b"\x91" * 1015 + b"\x90\xa0\x80",
+    "lists in lists, as fields": b"\x94\x03\xa3end\xa0" + b"\x91" * 1015 + b"\x90",
     "lists in lists without end": b"\x91" * 100_000,
 }
 
@@ -265,14 +299,16 @@ def test_a_message_that_violates_its_schema_is_rejected_on_arrival(data):
 @pytest.mark.parametrize(
     "message",
     [
-        dataclasses.replace(
-            EXAMPLES["features"], training={"extent": TrainingRows(array(3, 5, dtype="<f8"), array(3), array(3))}
+        Features(
+            1, 0, 0.0, {"": ObjectFeatures(BOX, {"extent": TrainingRows(array(3, 5, dtype="<f8"), array(3), array(3))})}
         ),
-        dataclasses.replace(EXAMPLES["features"], training={"extent": TrainingRows(array(3, 5), array(4), array(3))}),
+        Features(1, 0, 0.0, {"": ObjectFeatures(BOX, {"extent": TrainingRows(array(3, 5), array(4), array(3))})}),
         dataclasses.replace(EXAMPLES["track"], score=float("nan")),
         dataclasses.replace(EXAMPLES["track"], seq=-1),
+        dataclasses.replace(EXAMPLES["track"], object="an na"),
+        Stored(5, 7, {"an/na": 2}),
     ],
-    ids=["dtype", "shape", "NaN", "negative"],
+    ids=["dtype", "shape", "NaN", "negative", "name", "name in a map"],
 )
 def test_a_message_that_would_be_rejected_on_arrival_is_not_sent(message):
     with pytest.raises(ProtocolError):
@@ -309,14 +345,14 @@ def decoded_or_refused(data: bytes) -> None:
 @FUZZ
 @given(st.sampled_from(ALL), st.data())
 def test_any_value_in_any_field_arrives_whole_or_is_rejected(kind, data):
-    version, name, sent = msgpack.unpackb(encode(data.draw(messages(kind))))
+    version, name, about, sent = msgpack.unpackb(encode(data.draw(messages(kind))))
     place = sent
     while isinstance(inner := place[key := data.draw(st.sampled_from(sorted(place)))], dict) and inner:
         if data.draw(st.booleans()):
             break
         place = inner
     place[key] = data.draw(VALUES)
-    decoded_or_refused(msgpack.packb([version, name, sent]))
+    decoded_or_refused(msgpack.packb([version, name, data.draw(st.just(about) | VALUES), sent]))
 
 
 @FUZZ

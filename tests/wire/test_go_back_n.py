@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from catstream.errors import ProtocolError, StreamRewoundError
-from catstream.messages import Position, Stored
+from catstream.messages import ObjectPosition, Position, Stored
 from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow
 
 STRANGER = b"stranger"
@@ -195,7 +195,7 @@ class Histories(RuleBasedStateMachine):
     def memory_is_bounded(self):
         if self.senders:
             assert len(self.receiver._asking) <= 64
-            assert len(self.sender._samples) <= 65536
+            assert len(self.sender._changes) <= 65536
 
     def teardown(self):
         """Once nothing is lost any more, everything that was sent is taken and stored."""
@@ -219,6 +219,11 @@ class Histories(RuleBasedStateMachine):
 
 TestHistories = Histories.TestCase
 TestHistories.settings = settings(max_examples=150, stateful_step_count=60)
+
+
+def made(**versions):
+    """The objects of a position that have made samples of these versions."""
+    return {name: ObjectPosition(version=version) for name, version in versions.items()}
 
 
 def filled(size, count):
@@ -251,9 +256,9 @@ def test_a_message_that_is_missing_is_reported_at_once_and_then_only_now_and_the
 def test_a_message_that_was_received_before_is_acknowledged_again_each_time():
     window = ReceiveWindow(Position(), size=8)
     window.receive(b"peer", 1, now=0.0)
-    window.acknowledge(Position(1, version=4))
+    window.acknowledge(Position(1, objects=made(anna=4)))
     for peer in (b"peer", b"restarted", b"restarted"):
-        assert window.receive(peer, 1, now=0.0) == [Reply(peer, Stored(1, 1, version=4))]
+        assert window.receive(peer, 1, now=0.0) == [Reply(peer, Stored(1, 1, {"anna": 4}))]
 
 
 def test_a_gap_after_a_gap_is_reported_at_once():
@@ -314,7 +319,9 @@ def test_acknowledgements_go_to_the_peer_of_the_newest_received_message():
     window.receive(b"old", 1, now=0.0)
     window.receive(b"new", 2, now=0.0)
     window.receive(b"old", 2, now=0.0)
-    assert window.acknowledge(Position(1, version=3, unsaved=1)) == [Reply(b"new", Stored(1, 2, 3, 1))]
+    assert window.acknowledge(Position(1, objects=made(anna=3), unsaved=1)) == [
+        Reply(b"new", Stored(1, 2, {"anna": 3}, 1))
+    ]
 
 
 def test_a_message_that_no_sender_can_have_in_flight_is_rejected():
@@ -365,8 +372,29 @@ def test_a_receiver_of_another_stream_is_detected_and_messages_of_an_earlier_sen
 
 def test_a_sample_counts_from_the_message_that_led_to_it_or_an_earlier_one():
     window = filled(size=9, count=9)
-    for reply in (Stored(0, 2, version=1), Stored(0, 3, version=1), Stored(0, 4, version=2), Stored(0, 9, version=5)):
+    for reply in (
+        Stored(0, 2, {"anna": 1}),
+        Stored(0, 3, {"anna": 1}),
+        Stored(0, 4, {"anna": 1, "ben": 2}),
+        Stored(0, 9, {"anna": 5, "ben": 2}),
+    ):
         window.receive(reply, now=0.0)
-    assert window.version == 5
-    assert [window.sample_of(seq) for seq in range(1, 10)] == [1, 1, 1, 2, 5, 5, 5, 5, 5]
-    assert not window._samples, "what was asked for is forgotten"
+    assert window.versions == {"anna": 5, "ben": 2}
+    first, second, third = {"anna": 1}, {"anna": 1, "ben": 2}, {"anna": 5, "ben": 2}
+    assert [window.samples_of(seq) for seq in range(1, 10)] == [*[first] * 3, second, *[third] * 5]
+    assert not window._changes, "what was asked for is forgotten"
+
+
+def test_an_object_that_the_receiver_does_not_name_any_more_has_no_newest_sample():
+    window = filled(size=4, count=4)
+    window.receive(Stored(0, 1, {"anna": 1, "ben": 2}), now=0.0)
+    window.receive(Stored(0, 2, {"ben": 2}), now=0.0)
+    assert window.versions == window.samples_of(2) == {"ben": 2}
+
+
+def test_of_a_flood_of_samples_that_nobody_asks_for_only_some_are_remembered():
+    window = SendWindow("features", 4, now=0.0)
+    for version in range(1, 70_000):
+        window.receive(Stored(0, 0, {"anna": version}), now=0.0)
+    assert len(window._changes) == 65536
+    assert window.samples_of(1) == window.versions == {"anna": 69_999}

@@ -12,7 +12,7 @@ import zmq
 
 import catstream
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import Answer, Command, End, Health, Model, Position, Preview, Run, Sample, Track
+from catstream.messages import Answer, Command, End, Health, Model, Position, Preview, Run, Sample, Track, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, MODELS, RESULTS, TRACKS
 from catstream.wire.codec import encode
@@ -45,7 +45,7 @@ SAID = {
     Sample: End(1, "nothing was learned"),
     Model: Model(1, 1, np.ones(3, np.float32), 0.0),
     Health: Health("detector", 0.0),
-    Preview: Preview(1, 64, 48, None, b"\xff\xd8\xff"),
+    Preview: Preview(1, 64, 48, {}, b"\xff\xd8\xff"),
     Run: End(1, "nothing was learned"),
 }
 
@@ -208,7 +208,7 @@ def test_an_acknowledged_channel_works_with_the_keys_of_the_pipeline(place, unti
     with Receiver(RESULTS, place(), Position(), WINDOW) as receiver, Sender(RESULTS, place(), WINDOW) as sender:
 
         def turn():
-            sender.send(track(sender.sent + 1)) if sender.sent < 50 else sender.poll(0)
+            sender.send(Tracks(seq := sender.sent + 1, seq, {"": track(seq)})) if sender.sent < 50 else sender.poll(0)
             if (message := receiver.receive(0.02)) is not None:
                 taken.append(message.seq)
                 receiver.acknowledge(Position(message.seq))

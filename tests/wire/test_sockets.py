@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from catstream.errors import ProtocolError, ServiceError
-from catstream.messages import End, Health, Model, Position, Sample, Stored, Summary, Track
+from catstream.messages import End, Health, Model, ObjectPosition, Position, Sample, Stored, Summary, Track, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, FEATURES, HEALTH, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.codec import decode, encode
@@ -23,12 +23,21 @@ from catstream.wire.newest import Publisher, Subscriber
 WINDOW = 4
 
 
-def track(seq):
-    return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0)
+def track(seq, name=""):
+    return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0, object=name)
 
 
-def model(version):
-    return Model(version, version, np.full(5, version, np.float32), 0.0)
+def tracks(seq):
+    return Tracks(seq, seq - 1, {"": track(seq)})
+
+
+def model(version, name=""):
+    return Model(version, version, np.full(5, version, np.float32), 0.0, object=name)
+
+
+def made(version, name=""):
+    """The objects of a position, one of which has made a sample."""
+    return {name: ObjectPosition(version=version)}
 
 
 def take(receiver, taken, *, store):
@@ -69,7 +78,7 @@ def test_an_acknowledged_channel_delivers_every_message_once_in_order(endpoint, 
 
         def turn():
             if sender.sent < 50:
-                sender.send(track(sender.sent + 1))
+                sender.send(tracks(sender.sent + 1))
             else:
                 sender.poll(0)
             take(receiver, taken, store=True)
@@ -83,7 +92,7 @@ def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
     taken = []
     with Sender(RESULTS, endpoint, WINDOW) as sender:
         assert sender.ask_position() is None
-        assert sender.send(track(1))
+        assert sender.send(tracks(1))
         with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
 
             def turn():
@@ -102,7 +111,7 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint,
             take(receiver, taken, store=False)
             sender.poll(0.05)
 
-        sender.send(track(1))
+        sender.send(tracks(1))
         for _ in range(10):
             sender.poll(0.05)  # nobody answers: it asks where the receiver is, and will send all again
         for _ in range(10):
@@ -117,32 +126,32 @@ def test_a_sender_knows_which_sample_its_messages_led_to(endpoint, until):
         def turn():
             message = receiver.receive(0.05)
             if message is not None:  # every other message leads to a sample
-                receiver.acknowledge(Position(message.seq, version=message.seq // 2))
+                receiver.acknowledge(Position(message.seq, objects=made(message.seq // 2)))
             sender.poll(0)
 
         led_to = []
         for seq in range(1, 8):
-            sender.send(track(seq))
+            sender.send(tracks(seq))
             until(lambda seq=seq: sender.taken == seq, turn)
         for seq in range(1, 8):
-            led_to.append(sender.sample_of(seq))
+            led_to.append(sender.samples_of(seq).get("", 0))
     assert led_to == [0, 1, 1, 2, 2, 3, 3]
 
 
 def test_a_full_window_accepts_no_more_messages(endpoint, until):
     taken = []
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-        assert [sender.send(track(seq)) for seq in range(1, WINDOW + 2)] == [True] * WINDOW + [False]
+        assert [sender.send(tracks(seq)) for seq in range(1, WINDOW + 2)] == [True] * WINDOW + [False]
 
         def turn():
             sender.poll(0)
             take(receiver, taken, store=False)
 
         until(lambda: sender.taken == WINDOW, turn)
-        assert not sender.send(track(WINDOW + 1)), "taken is not yet stored"
+        assert not sender.send(tracks(WINDOW + 1)), "taken is not yet stored"
         receiver.acknowledge(Position(1))
         until(lambda: sender.stored == 1, lambda: sender.poll(0.05))
-        assert sender.send(track(WINDOW + 1))
+        assert sender.send(tracks(WINDOW + 1))
 
 
 def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
@@ -150,7 +159,7 @@ def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
     with Sender(RESULTS, endpoint, 10) as sender:
         with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
             for seq in range(1, 9):
-                sender.send(track(seq))
+                sender.send(tracks(seq))
 
             def turn():
                 sender.poll(0)
@@ -163,7 +172,7 @@ def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
 
             def on():
                 if sender.sent < 20:
-                    sender.send(track(sender.sent + 1))
+                    sender.send(tracks(sender.sent + 1))
                 sender.poll(0)
                 take(receiver, again, store=True)
 
@@ -177,7 +186,7 @@ def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
     with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
         with Sender(RESULTS, endpoint, 10) as sender:
             for seq in range(1, 6):
-                sender.send(track(seq))
+                sender.send(tracks(seq))
 
             def turn():
                 sender.poll(0)
@@ -197,7 +206,7 @@ def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
 
             def on():
                 if sender.sent < 9:
-                    sender.send(track(sender.sent + 1))
+                    sender.send(tracks(sender.sent + 1))
                 sender.poll(0)
                 take(receiver, taken, store=True)
 
@@ -210,7 +219,7 @@ def test_a_restarted_sender_accepts_a_position_that_advanced_after_its_request(e
     with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
         with Sender(RESULTS, endpoint, 10) as sender:
             for seq in range(1, 6):
-                sender.send(track(seq))
+                sender.send(tracks(seq))
             until(lambda: len(taken) == 5, lambda: (sender.poll(0), take(receiver, taken, store=False)))
         with Sender(RESULTS, endpoint, 10) as sender:
             until(
@@ -223,7 +232,7 @@ def test_a_restarted_sender_accepts_a_position_that_advanced_after_its_request(e
             def on():
                 sender.poll(0)
                 if sender.sent < 9:
-                    sender.send(track(sender.sent + 1))
+                    sender.send(tracks(sender.sent + 1))
                 take(receiver, taken, store=True)
 
             until(lambda: sender.stored == 9, on)
@@ -238,16 +247,16 @@ def test_a_receiver_stores_its_messages_in_a_separate_step_if_the_position_is_re
             found.append(sender.ask_position())
             assert receiver.receive(0) is None
             if receiver.position_requested:
-                receiver.answer(Position(len(taken), version=7))
+                receiver.answer(Position(len(taken), objects=made(7)))
                 assert not receiver.position_requested
 
         with Sender(RESULTS, endpoint, 10) as sender:
             for seq in range(1, 6):
-                sender.send(track(seq))
+                sender.send(tracks(seq))
             until(lambda: len(taken) == 5, lambda: (sender.poll(0), take(receiver, taken, store=False)))
         with Sender(RESULTS, endpoint, 10) as sender:
             until(lambda: found and found[-1], turn)
-    assert found[-1] == Position(5, version=7)
+    assert found[-1] == Position(5, objects=made(7))
 
 
 def test_a_repeated_message_receives_the_same_answer(endpoint, stranger, until):
@@ -255,21 +264,21 @@ def test_a_repeated_message_receives_the_same_answer(endpoint, stranger, until):
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
         sender = stranger(zmq.DEALER, "results")
         for _ in range(2):
-            sender.send(encode(track(1)))
+            sender.send(encode(tracks(1)))
 
         def turn():
             if receiver.receive(0.05) is not None:  # on a full disk
-                receiver.acknowledge(Position(1, version=7, unsaved=1))
+                receiver.acknowledge(Position(1, objects=made(7), unsaved=1))
             if sender.poll(0):
                 told.append(decode(sender.recv(), Stored))
 
         until(lambda: len(told) == 2, turn)
-    assert told == [Stored(1, 1, version=7, unsaved=1)] * 2
+    assert told == [Stored(1, 1, {"": 7}, unsaved=1)] * 2
 
 
 def test_a_receiver_of_another_stream_is_noticed(endpoint, until):
     with Receiver(RESULTS, endpoint, Position(99), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-        sender.send(track(1))
+        sender.send(tracks(1))
 
         def turn():
             receiver.receive(0.05)
@@ -284,7 +293,7 @@ JUNK = [
     [b"not msgpack"],
     [b"", b"two parts"],
     [encode(Health("trainer", 0.0))],
-    [b"\x93\x01" + b"\x91" * 1015 + b"\x90\x80"],
+    [b"\x94\x03" + b"\x91" * 1015 + b"\x90\xa0\x80"],
 ]
 
 
@@ -300,7 +309,7 @@ def test_the_bytes_of_a_stranger_are_counted_and_dropped(endpoint, stranger, unt
             take(receiver, taken, store=True)
 
         until(lambda: receiver.rejected == len(JUNK), turn)
-        sender.send(track(1))
+        sender.send(tracks(1))
         until(lambda: sender.stored == 1, turn)
     assert taken == [1]
 
@@ -326,7 +335,7 @@ def test_a_receiver_with_a_full_queue_survives_its_sender(endpoint):
         assert busy.stdout.readline() == "ready\n"
         with Sender(RESULTS, endpoint, 8) as sender:
             for seq in range(1, 9):
-                sender.send(track(seq))
+                sender.send(tracks(seq))
             for _ in range(5):
                 sender.poll(0.1)
         assert busy.communicate("gone\n", timeout=60)[0] == "1\n"
@@ -338,7 +347,7 @@ def test_a_message_above_the_limit_is_not_even_read(endpoint, stranger, until):
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         other = stranger(zmq.DEALER, "results")
         other.send(bytes(CHANNELS["results"].limit + 1))
-        sender.send(track(1))
+        sender.send(tracks(1))
 
         def turn():
             sender.poll(0)
@@ -352,11 +361,11 @@ def test_a_message_above_the_limit_is_not_even_read(endpoint, stranger, until):
 
 def test_a_reader_that_never_reads_blocks_nobody(endpoint, until):
     messages, long = 8000, "x" * 4000  # more than all buffers on the way hold
-    with Publisher(TRACKS, endpoint) as tracks, Subscriber(TRACKS, endpoint) as idle:
+    with Publisher(TRACKS, endpoint) as publisher, Subscriber(TRACKS, endpoint) as idle:
         heard = []
-        until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(idle.receive_all())))
+        until(lambda: heard, lambda: (publisher.send(track(1)), heard.extend(idle.receive_all())))
         for seq in range(2, messages + 2):
-            tracks.send(End(seq, long))
+            publisher.send(End(seq, long))
         rest = [message.seq for message in iter(lambda: idle.receive(0.2), None)]
     assert rest == sorted(set(rest)), "what arrives is in order"
     assert 0 < len(rest) < messages, "what does not fit is lost, and seq tells"
@@ -388,13 +397,13 @@ def test_a_late_subscriber_receives_the_last_model(endpoint, until):
 
 
 def test_a_late_subscriber_receives_no_old_tracks(endpoint, until):
-    with Publisher(TRACKS, endpoint) as tracks:
-        tracks.send(track(1))
+    with Publisher(TRACKS, endpoint) as publisher:
+        publisher.send(track(1))
         with Subscriber(TRACKS, endpoint) as late:
             got, seq = [], iter(range(2, 10_000))
 
             def turn():
-                tracks.send(track(next(seq)))
+                publisher.send(track(next(seq)))
                 message = late.receive(0.01)
                 if message is not None:
                     got.append(message.seq)

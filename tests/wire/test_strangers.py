@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zmq
 
-from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
 from catstream.errors import ProtocolError
 from catstream.messages import (
     Command,
@@ -17,6 +17,7 @@ from catstream.messages import (
     Features,
     Health,
     Model,
+    ObjectFeatures,
     Position,
     Preview,
     Run,
@@ -38,19 +39,22 @@ PUBLISHED = [name for name, channel in CHANNELS.items() if not channel.acknowled
 
 
 def features(seq, width=5, rows=3):
-    return Features(seq, seq, 0.0, None, {"appearance": TrainingRows.labelled(np.ones((rows, width)), 1)})
+    training = {"appearance": TrainingRows.labelled(np.ones((rows, width)), 1)}
+    return Features(seq, seq, 0.0, {"anna": ObjectFeatures(None, training)})
 
 
 def changed(message, **fields):
     """A message as bytes, with some of its fields replaced on the wire."""
-    version, kind, plain = msgpack.unpackb(encode(message))
-    return msgpack.packb([version, kind, plain | fields])
+    version, kind, about, plain = msgpack.unpackb(encode(message))
+    return msgpack.packb([version, kind, about, plain | fields])
 
 
 def retrained(**arrays):
     """Features as bytes, with some of their training rows replaced on the wire."""
-    _, _, plain = msgpack.unpackb(encode(features(1)))
-    return changed(features(1), training={"appearance": plain["training"]["appearance"] | arrays})
+    *_, plain = msgpack.unpackb(encode(features(1)))
+    part = plain["objects"]["anna"]
+    training = {"appearance": part["training"]["appearance"] | arrays}
+    return changed(features(1), objects={"anna": part | {"training": training}})
 
 
 def rows(dtype, shape, number=1.0):
@@ -62,7 +66,7 @@ def rows(dtype, shape, number=1.0):
 WRONG = {
     "msgpack": [b"GET / HTTP/1.1"],
     "envelope": [msgpack.packb({"seq": 1})],
-    "version": [msgpack.packb([VERSION + 1, "features", {}])],
+    "version": [msgpack.packb([VERSION - 1, "features", {}])],
     "kind": [encode(Health("trainer", 0.0))],
     "type": [changed(features(1), seq="1")],
     "dtype": [retrained(rows=rows("<f8", [3, 5]))],
@@ -70,6 +74,7 @@ WRONG = {
     "width": [encode(features(2, width=6))],
     "finite": [retrained(rows=rows("<f4", [3, 5], float("nan")))],
     "range": [retrained(labels=rows("<f4", [3], 2.0))],
+    "name": [changed(features(1), objects={"an na": {"box": None}})],
     "sequence": [encode(features(2**40))],
     "parts": [b"", encode(features(2))],
 }
@@ -99,9 +104,9 @@ def stranger(endpoint):
 def test_an_invalid_message_is_counted_by_its_reason_and_does_not_affect_the_legitimate_sender(
     reason, endpoint, stranger, until
 ):
-    compressor, before, taken = Compressor(Settings(coreset={"size": 2})), rejected(reason), []
+    forest, before, taken = Forest(Settings(coreset={"size": 2})), rejected(reason), []
     with (
-        Receiver(FEATURES, endpoint, Position(), WINDOW, check=compressor.check_features) as receiver,
+        Receiver(FEATURES, endpoint, Position(), WINDOW, check=forest.check_features) as receiver,
         Sender(FEATURES, endpoint, WINDOW) as sender,
     ):
 
@@ -109,7 +114,7 @@ def test_an_invalid_message_is_counted_by_its_reason_and_does_not_affect_the_leg
             sender.send(features(sender.sent + 1)) if sender.sent < len(taken) + 1 else sender.poll(0.01)
             if (message := receiver.receive(0.01)) is not None:
                 taken.append(message.seq)
-                compressor.take(message)
+                forest.take(message)
                 receiver.acknowledge(Position(message.seq))
 
         until(lambda: sender.stored >= 1, turn)
@@ -117,7 +122,7 @@ def test_an_invalid_message_is_counted_by_its_reason_and_does_not_affect_the_leg
         until(lambda: rejected(reason) == before + 1, turn)
         until(lambda: sender.stored > 5, turn)
     assert taken == list(range(1, len(taken) + 1)), "each once, in order"
-    assert compressor.seq == taken[-1]
+    assert forest.seq == taken[-1]
     assert rejects()["rejected"] >= 1
 
 
@@ -177,7 +182,7 @@ def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(n
         Sample: End(1, "nothing was learned"),
         Model: Model(1, 1, np.ones(3, np.float32), 0.0),
         Health: Health("detector", 0.0),
-        Preview: Preview(1, 64, 48, None, b"\xff\xd8\xff"),
+        Preview: Preview(1, 64, 48, {}, b"\xff\xd8\xff"),
         Run: End(1, "nothing was learned"),
     }[CHANNELS[name].messages[0]]
     before, heard = rejected("subscription"), []
