@@ -37,9 +37,9 @@ _HEALTH_TIMEOUT_SECONDS = 5.0
 #: Seconds between checks of the connections, which report whether the pipeline has rejected the keys.
 _CONNECTION_CHECK_SECONDS = 1.0
 
-#: Public name -> channel. Subscribers get features from the channel of copies.
+#: Public name -> channel. Subscribers get features from the channel of copies; `catstream.control` gets saved models.
 _SUBSCRIBABLE = {
-    **{name: name for name, channel in CHANNELS.items() if not channel.acknowledged and name != "training"},
+    **{name: name for name in ("samples", "models", "tracks", "health", "previews")},
     "features": "training",
 }
 

@@ -27,7 +27,23 @@ def test_a_track_is_one_detection_of_supervision():
         "frame": [2],
         "state": ["present"],
         "model_version": [7],
+        "object": [""],
     }
+
+
+@needs_supervision
+def test_the_objects_of_a_frame_are_detections_with_numbers_that_stay():
+    tracks = [
+        Track(3, 2, 0.1, "present", Box(10.0, 20.0, 30.0, 40.0), 0.9, 7, object="anna"),
+        Track(3, 2, 0.1, "absent", None, 0.1, 7, object="ben"),
+        Track(3, 2, 0.1, "present", Box(1.0, 2.0, 3.0, 4.0), 0.8, 6, object="carl"),
+    ]
+    found, later = catstream.to_supervision(tracks), catstream.to_supervision(reversed(tracks))
+    assert list(found.data["object"]) == ["anna", "carl"]
+    assert np.array_equal(found.xyxy, [[10, 20, 40, 60], [1, 2, 4, 6]])
+    assert len({*found.tracker_id}) == 2
+    assert list(later.tracker_id) == list(found.tracker_id[::-1])
+    assert len(catstream.to_supervision([])) == 0
 
 
 @needs_supervision

@@ -60,7 +60,7 @@ def replay(
       models     how many; a pipeline skips outdated samples, the replay skips none
       identical  recorded models that were reproduced bit for bit
       rows       inserted into the coreset trees
-      levels     of the nodes of the object's tree, oldest first
+      levels     of the nodes of each object's own tree, oldest first
       MB         of all trees in memory
       seconds    of compression and training
       error      mean squared error of the scores of frames that the model had not seen
@@ -94,7 +94,7 @@ def _play(recording: Recording, place: Endpoint, speed: float | None, wait: bool
             player.wait()
         for message in player.play(speed):
             if isinstance(message, Track):
-                status.update(f"at {place}, frame {message.frame} of {recording.counts[Track]} recorded")
+                status.update(f"at {place}, frame {message.frame} of {recording.frames} recorded")
 
 
 def _learn(
@@ -143,7 +143,7 @@ def _learn(
 
 
 def _training_cells(result: Retraining) -> list[str]:
-    levels = " ".join(map(str, result.levels))
+    levels = ", ".join(" ".join(filter(None, [name, *map(str, own)])) for name, own in result.levels.items())
     rows, megabytes = result.counters["rows"], result.counters["bytes"] / 1e6
     return [f"{rows:.0f}", levels, f"{megabytes:.1f}", f"{result.seconds:.2f}"]
 

@@ -29,11 +29,11 @@ __all__ = ["watch"]
 _RATE_SECONDS = 2.0  # interval of the mean rate
 _ROWS = 16  # number of messages that a terminal shows
 _REFRESHES = 8  # per second
-_LEFT = {"state", "process", "counters", "levels"}  # left-aligned columns
+_LEFT = {"object", "state", "process", "counters", "levels"}  # left-aligned columns
 
 
 def _track(message: Track) -> dict[str, str]:
-    return {
+    return _object(message) | {
         "frame": f"{message.frame}",
         "seconds": f"{message.time:.2f}",
         "state": message.state,
@@ -43,12 +43,17 @@ def _track(message: Track) -> dict[str, str]:
     }
 
 
+def _object(message: Track | Model | Sample) -> dict[str, str]:
+    """The cell of the object's name, if it has one."""
+    return {"object": message.object} if message.object else {}
+
+
 def _sides(box: Box | None) -> str:
     return "-" if box is None else ", ".join(f"{side:.0f}" for side in box)
 
 
 def _model(message: Model) -> dict[str, str]:
-    return {
+    return _object(message) | {
         "version": f"{message.version}",
         "frame": f"{message.frame}",
         "|weights|": f"{np.linalg.norm(message.weights):.3f}",
@@ -60,7 +65,7 @@ def _model(message: Model) -> dict[str, str]:
 
 def _sample(message: Sample) -> dict[str, str]:
     trees = {name: message.trees.get(name) for name in HEADS}
-    return {
+    return _object(message) | {
         "version": f"{message.version}",
         "frame": f"{message.frame}",
         "levels": " ".join(map(str, message.trees["object"].levels)),
@@ -111,9 +116,12 @@ _CELLS: dict[str, Callable[[Any], dict[str, str]]] = {
 @click.argument("channel", type=click.Choice(list(_CELLS)))
 @with_endpoint
 @with_wait
+@click.option("--object", "name", metavar="NAME", help="Only the tracks, models or samples of this object.")
 @click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
 @click.option("--count", type=click.IntRange(min=1), help="End after this number of messages.")
-def watch(channel: str, endpoint: str, keys: str, wait: float, as_json: bool, count: int | None) -> None:
+def watch(
+    channel: str, endpoint: str, keys: str, wait: float, name: str | None, as_json: bool, count: int | None
+) -> None:
     """Print the messages of a running pipeline, until it ends or Ctrl-C.
 
     The pipeline does not wait; messages that are dropped because this command
@@ -122,8 +130,8 @@ def watch(channel: str, endpoint: str, keys: str, wait: float, as_json: bool, co
 
     \b
     CHANNEL
-      tracks    state and box of the object in each frame
-      models    the last model, then each new one
+      tracks    state and box of each object in each frame
+      models    the last model of each object, then each new one
       health    the counters of each process, every second
       samples   the samples for the trainer, and the levels of the object's tree
       features  the training rows of each frame
@@ -133,11 +141,12 @@ def watch(channel: str, endpoint: str, keys: str, wait: float, as_json: bool, co
     EXAMPLES
       catstream watch tracks
       catstream watch tracks --json | jq .box
+      catstream watch tracks --object anna
       catstream watch models --endpoint run --count 1 --json
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     seen = 0
-    with Subscription[AnyMessage](endpoint, channel, keys=keys) as messages:
+    with Subscription[AnyMessage](endpoint, channel, object=name, keys=keys) as messages:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(messages.endpoint, messages.keys, wait)
             if as_json:
@@ -168,6 +177,8 @@ def _plain(value: object) -> object:
         return {"bytes": len(value)}
     if isinstance(value, Box):
         return list(value)
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
     if dataclasses.is_dataclass(value):
         return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     return value
@@ -200,10 +211,11 @@ class _Screen:
     def _draw(self) -> Group:
         rows = list(self._rows.values())
         table = Table(box=None, header_style="bold", pad_edge=False)
-        for name in rows[0] if rows else ():
+        columns = max(rows, key=len, default={})  # rows of objects without a name have no cell for it
+        for name in columns:
             table.add_column(name, justify="left" if name in _LEFT else "right")
         for cells in rows:
-            table.add_row(*cells.values())
+            table.add_row(*(cells.get(name, "-") for name in columns))
         rate = len(self._recent()) / _RATE_SECONDS
         line = f"{rate:.0f} a second   {self._messages.missed} missed   {self._messages.endpoint}"
         return Group(table, Text(line, style="dim"))

@@ -1,7 +1,8 @@
 """Recordings: an MCAP file of all messages of a run, each readable even if others are damaged or cut off.
 
 A topic for each kind of message. Messages without arrays are JSON objects of their fields, which Foxglove and other
-programs show as they are; features and models are msgpack, as on the wire. The first message is the `Run`.
+programs show as they are; features and models are msgpack, as on the wire. The tracks and models of all objects are in
+one topic; their field `object` has the name. The first message is the `Run`.
 
 If `seq` of `Features` goes back, a restarted compressor has continued from its checkpoint: the later features replace
 those from the same `seq` on, and the models that were trained on them.
@@ -11,8 +12,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Self, TypeVar
 
@@ -40,7 +41,7 @@ __all__ = ["TOPICS", "Recorded", "Recording", "RecordingWriter"]
 Recorded = Run | Features | Model | Track | Health | End
 _Kind = TypeVar("_Kind", bound=Recorded)
 
-_ENVELOPE = "msgpack, [version, kind, fields]; an array in fields is {dtype, shape, data: bytes row by row}"
+_ENVELOPE = "msgpack, [version, kind, object, fields]; an array in fields is {dtype, shape, data: bytes row by row}"
 
 #: Kind of message -> its topic. Topics are numbered from 1 in this order: a new one comes last.
 TOPICS: dict[type, Topic] = {
@@ -166,8 +167,9 @@ class Recording:
     ----------
     run : the settings of the pipeline
     counts : messages by kind, `counts[Features]` ...; of features and models those that `features` and `models` yield
-    missing : features and tracks that are missing, judged by gaps in `seq`; also before the first and, if the end was
-        recorded, after the last
+    missing : frames whose features or tracks are missing, by the gaps in `seq`; also before the first and, if the end
+        was recorded, after the last
+    frames : number of frames that have a track
     end : the pipeline's `End`, None if the recording ended before it
     damaged : bytes between whole messages that are skipped
     torn : bytes after the last whole message that are skipped
@@ -188,7 +190,8 @@ class Recording:
         self.size = self.damaged = 0
         self._tracks: set[int] = set()
         self._features: list[tuple[int, int]] = []  # seq and place of the features that the trees hold
-        self._models: list[tuple[int, int]] = []  # number of features that each was trained on, and its place
+        # Of each object: number of features that a model was trained on, and its place.
+        self._models: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
         with self._open() as file:
             for entry in entries(file):
                 self.damaged += entry.place - (self.size or entry.place)
@@ -200,7 +203,9 @@ class Recording:
         if not isinstance(first, Run):
             raise RecordingError(f"{path} holds no settings of a run: it was cut off or damaged at its start")
         self.run = first
-        self.counts[Features], self.counts[Model] = len(self._features), len(self._models)
+        self.counts[Features] = len(self._features)
+        self.counts[Model] = sum(map(len, self._models.values()))
+        self.frames = len(self._tracks)
         self.missing = {
             Features: self._missing({seq for seq, _ in self._features}),
             Track: self._missing(self._tracks),
@@ -236,15 +241,15 @@ class Recording:
 
     def features(self) -> Iterator[Features]:
         """The features that the coreset trees hold, in order of `seq`, each once."""
-        return self._at(self._features, Features)
+        return self._at((place for _, place in self._features), Features)
 
     def models(self) -> Iterator[Model]:
-        """The models that were trained on these features."""
-        return self._at(self._models, Model)
+        """The models of all objects that were trained on these features, in the order of recording."""
+        return self._at(sorted(place for models in self._models.values() for _, place in models), Model)
 
-    def _at(self, places: list[tuple[int, int]], kind: type[_Kind]) -> Iterator[_Kind]:
+    def _at(self, places: Iterable[int], kind: type[_Kind]) -> Iterator[_Kind]:
         with self._open() as file:
-            for _, place in places:
+            for place in places:
                 entry = entry_at(file, place)
                 if entry is None:
                     raise RecordingError(f"{self.path} has changed since it was checked: read it again")
@@ -275,13 +280,18 @@ class Recording:
             return
         self.counts[kind] += 1
         if kind is Features:
-            _drop_from(self._features, entry.sequence)
-            _drop_from(self._models, entry.sequence)
+            if (
+                not self._features
+            ):  # an earlier version of the protocol is rejected before anything is played or learned
+                self._decode(entry, Features)
+            for places in (self._features, *self._models.values()):
+                _drop_from(places, entry.sequence)
             self._features.append((entry.sequence, entry.place))
         elif kind is Model:  # a restarted compressor may have it trained again
-            trained = self._decode(entry, Model).frame + 1
-            _drop_from(self._models, trained)
-            self._models.append((trained, entry.place))
+            model = self._decode(entry, Model)
+            places, trained = self._models[model.object], model.frame + 1
+            _drop_from(places, trained)
+            places.append((trained, entry.place))
         elif kind is Track:
             self._tracks.add(entry.sequence)
         elif kind is End:

@@ -8,6 +8,7 @@ import re
 import resource
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,7 +19,7 @@ from mcap.stream_reader import StreamReader
 
 from catstream.box import Box
 from catstream.errors import RecordingError
-from catstream.messages import End, Features, Health, Model, Run, Track, TrainingRows
+from catstream.messages import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
 from catstream.recording.container import MAGIC, pack
 from catstream.recording.file import TOPICS, Recording, RecordingWriter
 from catstream.settings import Settings
@@ -27,15 +28,16 @@ from catstream.wire.codec import decode, encode
 
 def features(seq, value=0.5):
     rows = np.full((1, 3), value, np.float32)
-    return Features(seq, seq - 1, 0.0, None, {"appearance": TrainingRows(rows, rows[0, :1], rows[0, :1])})
+    training = {"appearance": TrainingRows(rows, rows[0, :1], rows[0, :1])}
+    return Features(seq, seq - 1, 0.0, {"": ObjectFeatures(None, training)})
 
 
-def track(seq):
-    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1)
+def track(seq, name=""):
+    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1, object=name)
 
 
-def model(version, frame):
-    return Model(version, frame, np.full(3, version, np.float32), 0.5)
+def model(version, frame, name=""):
+    return Model(version, frame, np.full(3, version, np.float32), 0.5, object=name)
 
 
 def read(path):
@@ -162,7 +164,9 @@ def test_features_that_a_restarted_compressor_receives_again_replace_the_earlier
     path = written([features(1), model(1, 0), features(2), features(3, 0.125), model(2, 2)])
     written([features(3, 0.75), model(2, 2), features(4)], resume=True)
     recording = Recording(path)
-    taken = [(message.seq, float(message.training["appearance"].rows[0, 0])) for message in recording.features()]
+    taken = [
+        (message.seq, float(message.objects[""].training["appearance"].rows[0, 0])) for message in recording.features()
+    ]
     assert taken == [(1, 0.5), (2, 0.5), (3, 0.75), (4, 0.5)]
     assert [model.version for model in recording.models()] == [1, 2]
     assert recording.missing[Features] == 0
@@ -182,6 +186,46 @@ def test_a_model_of_replaced_features_does_not_count_even_if_it_is_received_agai
     recording = Recording(path)
     assert [model.version for model in recording.models()] == [1]
     assert recording.counts[Model] == 1
+
+
+def test_models_of_several_objects_in_one_frame_all_count_and_are_replaced_one_by_one(written):
+    made = [model(1, 0, "anna"), model(2, 0, "ben"), model(4, 2, "ben"), model(3, 1, "anna")]
+    path = written([features(1), *made[:2], features(2), features(3), *made[2:]])
+    assert [message.version for message in Recording(path).models()] == [1, 2, 4, 3], "as they were recorded"
+    written([features(3, 0.75), model(3, 1, "anna"), model(5, 2, "ben")], resume=True)
+    again = Recording(path)
+    assert [(message.object, message.version) for message in again.models()] == [
+        ("anna", 1), ("ben", 2), ("anna", 3), ("ben", 5),
+    ]  # fmt: skip
+    assert again.counts[Model] == 4
+
+
+def test_a_frame_with_a_track_of_any_object_is_not_missing(written):
+    said = [track(1, "anna"), track(2, "anna"), track(2, "ben"), track(3, "ben"), track(5, "ben"), End(6, "its end")]
+    recording = Recording(written(said))
+    assert (recording.counts[Track], recording.frames, recording.missing[Track]) == (5, 4, 1)
+
+
+def test_another_program_tells_the_objects_apart_by_a_field_of_each_message(written):
+    path = written([track(1, "anna"), track(1, "ben"), model(1, 0, "anna"), model(2, 0)])
+    with path.open("rb") as file:
+        said = list(make_reader(file, validate_crcs=True).iter_messages(["tracks", "models"]))
+    tracks = [json.loads(message.data) for _, channel, message in said if channel.topic == "tracks"]
+    models = [msgpack.unpackb(message.data) for _, channel, message in said if channel.topic == "models"]
+    assert [track["object"] for track in tracks] == ["anna", "ben"]
+    assert [(about, fields["object"]) for _, _, about, fields in models] == [("anna", "anna"), ("", "")]
+
+
+@pytest.mark.parametrize("kind", [Features, Model])
+def test_a_recording_of_an_earlier_protocol_is_an_error_of_one_line(written, kind):
+    path = written([])
+    with path.open("r+b") as file:
+        file.truncate(Recording(path).size)
+        file.seek(0, os.SEEK_END)
+        file.write(pack(list(TOPICS).index(kind) + 1, 1, 0, msgpack.packb([2, kind.__name__.lower(), {}])))
+    with pytest.raises(RecordingError, match=r"cannot read: expected version 3 of the protocol, got 2") as raised:
+        Recording(path)
+    assert "\n" not in str(raised.value)
 
 
 def test_missing_messages_are_counted_at_the_start_in_between_and_at_the_end(written):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catstream.errors import RecordingError
-from catstream.messages import Features, Model, TrainingRows
+from catstream.messages import Features, Model, ObjectFeatures, TrainingRows
 from catstream.recording.file import Recording
 from catstream.recording.learning import Prequential, learn, prequential_of_recorded
 from catstream.wire.codec import encode
@@ -22,7 +22,16 @@ def test_equal_settings_give_equal_models_bit_for_bit(said, written):
     assert len(again) > 5
     assert list(map(encode, again)) == list(map(encode, models_of(said)))
     assert result.models == result.identical == recording.counts[Model]
-    assert result.levels[0] > 0
+    assert result.levels[""][0] > 0
+    assert result.prequential == prequential_of_recorded(recording)
+
+
+def test_two_objects_are_learned_again_bit_for_bit_each_with_its_trees(said_of_two, written):
+    recording, again = Recording(written(said_of_two)), []
+    result = learn(recording, recording.settings, keep=again.append)
+    assert list(map(encode, again)) == list(map(encode, models_of(said_of_two)))
+    assert result.identical == result.models == recording.counts[Model]
+    assert {model.object for model in again} == result.levels.keys() == {"anna", "ben"}
     assert result.prequential == prequential_of_recorded(recording)
 
 
@@ -65,7 +74,7 @@ def test_prequential_error_is_weighted_and_a_frame_is_separated_if_all_of_the_ob
     prequential, errors = Prequential(), []
     for objects in ([0.9, 0.8], [0.2, 0.9]):
         rows = np.array([*objects, 0.5, 0.1], np.float32)[:, None] * model.weights / (model.weights @ model.weights)
-        prequential.add(model, Features(1, 0, 0.0, None, {"appearance": TrainingRows(rows, labels, weights)}))
+        prequential.add(model, ObjectFeatures(None, {"appearance": TrainingRows(rows, labels, weights)}))
         errors += [(float(row @ model.weights) + 0.25 - label) ** 2 for row, label in zip(rows, labels, strict=True)]
     assert prequential.error == pytest.approx(np.average(errors, weights=[*weights, *weights]), rel=1e-5)
     assert prequential.separated_share == 0.5

@@ -66,6 +66,14 @@ def test_a_subscriber_receives_all_recorded_messages_until_the_end(said, written
     assert tracks.missed == 0
 
 
+def test_a_subscriber_to_one_object_receives_its_recorded_tracks_and_no_others(said_of_two, written, playing, endpoint):
+    playing(Recording(written([*said_of_two, End(51, "the source has ended")])))
+    with catstream.subscribe(str(endpoint), "tracks", object="ben", timeout=30) as tracks:
+        heard = list(tracks)
+    assert [(track.object, track.frame) for track in heard] == [("ben", frame) for frame in range(20, 50)]
+    assert tracks.missed == 0
+
+
 def test_features_and_settings_travel_too_and_a_cut_recording_has_an_end(said, written, playing, endpoint):
     recording = Recording(written([message for message in said if not isinstance(message, Model)][:40]))
     with Subscriber(TRAINING, endpoint) as training, Subscriber(TRACKS, endpoint):

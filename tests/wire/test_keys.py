@@ -12,7 +12,20 @@ import zmq
 
 import catstream
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import Answer, Command, End, Health, Model, Position, Preview, Run, Sample, Track, Tracks
+from catstream.messages import (
+    Answer,
+    Command,
+    End,
+    Health,
+    Model,
+    Position,
+    Preview,
+    Run,
+    Sample,
+    SavedModel,
+    Track,
+    Tracks,
+)
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, MODELS, RESULTS, TRACKS
 from catstream.wire.codec import encode
@@ -46,6 +59,7 @@ SAID = {
     Model: Model(1, 1, np.ones(3, np.float32), 0.0),
     Health: Health("detector", 0.0),
     Preview: Preview(1, 64, 48, {}, b"\xff\xd8\xff"),
+    SavedModel: SavedModel(1, b"the bytes of a file"),
     Run: End(1, "nothing was learned"),
 }
 

@@ -22,6 +22,7 @@ from catstream.messages import (
     Preview,
     Run,
     Sample,
+    SavedModel,
     Stored,
     Track,
     TrainingRows,
@@ -183,6 +184,7 @@ def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(n
         Model: Model(1, 1, np.ones(3, np.float32), 0.0),
         Health: Health("detector", 0.0),
         Preview: Preview(1, 64, 48, {}, b"\xff\xd8\xff"),
+        SavedModel: SavedModel(1, b"the bytes of a file"),
         Run: End(1, "nothing was learned"),
     }[CHANNELS[name].messages[0]]
     before, heard = rejected("subscription"), []

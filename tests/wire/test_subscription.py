@@ -11,25 +11,30 @@ import pytest
 
 import catstream
 from catstream.box import Box
-from catstream.errors import ServiceError, SilenceError
-from catstream.messages import End, Features, Health, Model, Run, Track, TrainingRows
+from catstream.errors import ObjectError, ServiceError, SilenceError
+from catstream.messages import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
 from catstream.wire.announced import Announcement, readers_of
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
 
-def track(seq):
-    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1)
+def track(seq, name="", version=1):
+    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, version, object=name)
 
 
-def model(version):
-    return Model(version, 10 * version, np.full(5, version, np.float32), 0.5)
+def model(version, name=""):
+    return Model(version, 10 * version, np.full(5, version, np.float32), 0.5, object=name)
 
 
 def features(seq):
     rows = np.full((2, 5), seq, np.float32)
-    return Features(seq, seq - 1, 0.0, None, {"appearance": TrainingRows.labelled(rows, 0, seq)})
+    training = {"appearance": TrainingRows.labelled(rows, 0, seq)}
+    return Features(seq, seq - 1, 0.0, {"": ObjectFeatures(None, training)})
+
+
+def rows_of(features):
+    return features.objects[""].training["appearance"].rows
 
 
 @pytest.fixture
@@ -43,7 +48,7 @@ def attached(endpoint, tracks, channel="tracks", **options):
     """A subscription to which the publisher of tracks is connected: it got the track with seq 1."""
     subscription = catstream.subscribe(str(endpoint), channel, timeout=0.05, **options)
     for _ in range(400):
-        tracks.send(track(1))
+        tracks.send(track(1, options.get("object", "")))
         with contextlib.suppress(SilenceError):
             assert next(subscription).seq == 1
             break
@@ -83,6 +88,66 @@ def test_repeated_numbers_of_a_restarted_detector_do_not_count_as_missed(endpoin
         tracks.send(End(6, "the source has ended"))
         assert [message.seq for message in subscription] == [2, 3, 4, 2, 3, 4, 5]
         assert subscription.missed == 0
+
+
+def test_the_tracks_of_several_objects_in_a_frame_are_no_gap_and_no_repeat(endpoint, tracks):
+    said = [("anna", 2), ("ben", 2), ("ben", 3), ("anna", 3), ("carl", 3), ("anna", 6), ("anna", 7), ("ben", 7)]
+    with attached(endpoint, tracks) as subscription:
+        for name, seq in said:
+            tracks.send(track(seq, name))
+        tracks.send(End(8, "the source has ended"))
+        assert [(message.object, message.seq) for message in subscription] == said
+        assert subscription.missed == 2, "the frames 4 and 5"
+
+
+def test_a_subscriber_to_one_object_receives_no_track_of_an_object_whose_name_begins_the_same(endpoint, tracks):
+    with attached(endpoint, tracks, object="ann") as subscription:
+        for seq in range(2, 20):
+            for name in ("anna", "ann", "", "an", "annas" * 12):
+                tracks.send(track(seq, name))
+        tracks.send(End(20, "the source has ended"))
+        heard = list(subscription)
+    assert [(message.object, message.seq) for message in heard] == [("ann", seq) for seq in range(2, 20)]
+    assert (subscription.end.seq, subscription.missed) == (20, 0)
+
+
+def test_the_object_without_a_name_can_be_received_alone(endpoint, tracks):
+    with attached(endpoint, tracks, object="") as subscription:
+        for name in ("anna", "", "ben"):
+            tracks.send(track(2, name))
+        tracks.send(End(3, "the source has ended"))
+        assert list(subscription) == [track(2)]
+
+
+@pytest.mark.parametrize(
+    ("said", "missed"),
+    [
+        ([(40, 0), (41, 0), (42, 1)], 0),
+        ([(40, 0), (43, 1), (44, 1)], 2),
+        ([(40, 3), (41, 3), (90, 0), (91, 0)], 0),
+        ([(40, 3), (42, 3), (90, 0), (92, 0)], 2),
+    ],
+    ids=["begins late, is forgotten early", "loses two", "begins again", "loses one in each life"],
+)
+def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks, until, said, missed):
+    with catstream.subscribe(str(endpoint), "tracks", object="anna", timeout=20) as subscription:
+        until(lambda: len(tracks._subscribed) == 2, tracks.serve_late_joiners)  # the end has a connection of its own
+        for seq, version in said:
+            tracks.send(track(seq, "anna", version))
+        tracks.send(End(100, "the source has ended"))
+        assert [message.seq for message in subscription] == [seq for seq, _ in said]
+        assert (subscription.missed, subscription.missed_before) == (missed, 0)
+
+
+@pytest.mark.parametrize("channel", ["features", "health", "previews"])
+def test_a_channel_whose_messages_are_about_all_objects_has_none_of_one_object(endpoint, channel):
+    with pytest.raises(ServiceError, match="about all objects: subscribe to tracks, models, samples for one object"):
+        catstream.subscribe(str(endpoint), channel, object="anna")
+
+
+def test_one_object_is_asked_for_by_a_valid_name(endpoint):
+    with pytest.raises(ObjectError, match="'an na' is not a name"):
+        catstream.subscribe(str(endpoint), "tracks", object="an na")
 
 
 def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks):
@@ -152,7 +217,7 @@ def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(end
         subscription.timeout = 20
         heard = list(subscription)
     assert [message.seq for message in heard] == [3, 4, 7]
-    assert np.array_equal(heard[0].training["appearance"].rows, features(3).training["appearance"].rows)
+    assert np.array_equal(rows_of(heard[0]), rows_of(features(3)))
     assert subscription.missed == 2 + 2 + 1
     assert subscription.missed_before == 2
     assert subscription.losses() == "5 missed, 2 of them before this subscriber connected"
