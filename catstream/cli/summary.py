@@ -11,10 +11,10 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from catstream.box import Box
 from catstream.cli import interruptible
 from catstream.cli.interrupts import Interrupts
-from catstream.errors import SettingsError, VideoError
+from catstream.errors import ObjectError, SettingsError, VideoError
+from catstream.names import boxes_by_name, listed, split_name
 from catstream.services.options import with_settings
 from catstream.settings import Settings
 
@@ -31,7 +31,7 @@ _RECORDING = ".mcap"
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("-k", "count", type=click.IntRange(1), default=12, show_default=True, help="Number of images or frames.")
-@click.option("--box", metavar="X,Y,W,H", help="Object in the first frame of a video: the frames that taught most.")
+@click.option("--box", metavar="X,Y,W,H", help="Object in the first frame of a video that is tracked.")
 @click.option("--object", "name", metavar="NAME", help="Object of a recording or run that has several.")
 @click.option("--source", metavar="PATH", help="Video of a recording, if it has moved since.")
 @click.option(
@@ -68,7 +68,8 @@ def summary(
     have most energy outside the span of the coreset before. They are spread over
     time. A video with --box and the folder of a run are tracked again for this,
     with 0.4 MB for each frame in a temporary folder. A recording has the features;
-    only the pictures are read from its video.
+    only the pictures are read from its video. The settings are those of the run;
+    --settings, --preset and --set apply to a video with --box.
 
     \b
     Writes
@@ -96,7 +97,11 @@ def summary(
         if _is_recording(path):
             sheet = _of_recording(Recording(path), count, name, source, console)
         elif box is not None or (path.is_dir() and Job.is_in(path)):
-            job = Job.load(path) if box is None else Job(str(path), {"": Box.parse(box)}, settings=settings)
+            job = (
+                Job.load(path)
+                if box is None
+                else Job(str(path), boxes_by_name(dict([split_name(box)])), settings=settings)
+            )
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-summary-"))
             sheet = _of_recording(_tracked(job, Path(folder), console), count, name, source or job.source, console)
         else:
@@ -206,9 +211,8 @@ def _of_recording(recording: Recording, count: int, name: str | None, source: st
 
 def _object_of(objects: list[str], name: str | None) -> str:
     """Return the name of the object that is summarised."""
-    if name in objects:
-        return str(name)
+    if name is not None and name in objects:
+        return name
     if name is None and len(objects) == 1:
         return objects[0]
-    known = ", ".join(sorted(objects)) or "none"
-    raise SettingsError(f"the objects of this run are {known}: give one of them with --object")
+    raise ObjectError(f"the objects of this run are: {listed(objects)}; give one of them with --object NAME")

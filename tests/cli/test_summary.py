@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from catstream.job import Job
 from catstream.summaries import images
 
 
@@ -85,6 +86,19 @@ def test_bad_input_is_an_error_of_one_line_and_nothing_is_written(arguments, pro
     assert code == 1
     assert any(each in errors.splitlines()[-1] for each in problem.split("|"))
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_object_that_is_not_in_the_run_is_an_error(whole_run, said, tmp_path):
+    code, _, errors = said("summary", whole_run / "rec", "--object", "ben", cwd=tmp_path)
+    assert code == 1
+    assert "the objects of this run are: the object without a name; give one of them with --object NAME" in errors
+
+
+def test_a_run_whose_objects_were_given_by_commands_is_not_tracked_again(video, said, tmp_path):
+    Job(video[0]).save(tmp_path)
+    code, _, errors = said("summary", tmp_path, cwd=tmp_path)
+    assert code == 1
+    assert "record it with `catstream track --record`" in errors
 
 
 def test_an_interrupt_leaves_no_file(folder, said, tmp_path, monkeypatch):
