@@ -1,9 +1,9 @@
-"""Send commands to a running pipeline: select another object, pause, resume, save, stop.
+"""Send commands to a running pipeline: set the box of an object, forget an object, pause, resume, save, stop.
 
     import catstream
 
     with catstream.control("run") as pipeline:
-        pipeline.set_box((120, 80, 64, 48))
+        pipeline.set_box((120, 80, 64, 48), "anna")
 
 A command is resent until it is answered, and is executed once.
 """
@@ -21,6 +21,7 @@ from catstream.box import Box
 from catstream.errors import CommandRejectedError, SilenceError
 from catstream.learned import Learned
 from catstream.messages import Answer, Command, SavedModel, Verb
+from catstream.names import UNNAMED, check_name
 from catstream.wire.channels import SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.endpoint import find
@@ -56,14 +57,39 @@ class Control:
         self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
         self._commands = Requester(self._place)
 
-    def set_box(self, box: str | Iterable[float], *, keep: bool = False) -> Answer:
-        """Set the box of the object in the next frame that is tracked: x, y, w, h in pixels.
+    def set_box(self, box: str | Iterable[float], object: str = UNNAMED, *, keep: bool = False) -> Answer:
+        """Set the box of an object in the next frame that is tracked: x, y, w, h in pixels.
 
         During a pause it is the frame that is held, or the next one of a live source; the pipeline tracks it and stays
-        paused. By default it is a new object, and everything learned of the previous one is dropped. With `keep` it is
-        the same object, and its box is corrected.
+        paused.
+
+        Parameters
+        ----------
+        object : str
+            Name of the object. If no object has this name, it is tracked from that frame on, beside the others. Without
+            a name, the only object is meant.
+        keep : bool
+            Whether the box corrects the position of the same object. By default, another object takes the name, and
+            everything that was learned of the previous one is dropped.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid.
         """
-        return self._ask("set-box", Box.parse(box), keep)
+        return self._ask("set-box", object, Box.parse(box), keep)
+
+    def forget(self, object: str = UNNAMED) -> Answer:
+        """Stop tracking an object, and drop everything that was learned of it; without a name, the only object.
+
+        The other objects continue. If none is left, the run waits for a box, as if it was paused.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid.
+        """
+        return self._ask("forget", object)
 
     def pause(self) -> Answer:
         """Stop processing frames; the frames of a live source are counted as skipped."""
@@ -73,7 +99,7 @@ class Control:
         """Continue processing frames."""
         return self._ask("resume")
 
-    def save(self, path: str | os.PathLike[str], object: str = "") -> Answer:
+    def save(self, path: str | os.PathLike[str], object: str = UNNAMED) -> Answer:
         """Write everything that was learned of an object to a file on this machine, atomically.
 
         The file is written by this process; `catstream.Learned` reads it. The pipeline is not interrupted.
@@ -83,14 +109,16 @@ class Control:
         path : path
             The file.
         object : str
-            Name of the object; empty for the one without a name, or the only one.
+            Name of the object; without a name, the only object is meant.
 
         Raises
         ------
+        ObjectError
+            If the name is not valid.
         ServiceError
             If the file cannot be written.
         """
-        answer = self._ask("save", object=object)
+        answer = self._ask("save", object)
         learned = self._newest(answer.object, answer.version)
         learned.save(path)
         return replace(answer, version=learned.model.version)
@@ -122,8 +150,8 @@ class Control:
             "check the pipeline with catstream status"
         )
 
-    def _ask(self, verb: Verb, box: Box | None = None, keep: bool = False, object: str = "") -> Answer:
-        answer = self._commands.ask(Command(uuid4().hex, verb, box, keep, object), self.timeout)
+    def _ask(self, verb: Verb, name: str = UNNAMED, box: Box | None = None, keep: bool = False) -> Answer:
+        answer = self._commands.ask(Command(uuid4().hex, verb, box, keep, check_name(name)), self.timeout)
         if answer is None:
             raise SilenceError(
                 f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "

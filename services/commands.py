@@ -15,7 +15,7 @@ from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, ObjectError
 from catstream.features.pyramid import Pyramid
 from catstream.messages import Answer, Command
-from catstream.names import UNNAMED, listed
+from catstream.names import UNNAMED, check_count, check_name, listed
 from catstream.services.desired import DesiredState
 
 __all__ = ["STOPPED", "CommandHandler"]
@@ -62,12 +62,7 @@ class CommandHandler:
             elif command.verb == "set-box":
                 self._boxes.append(command)
             else:
-                try:
-                    done, reason = self._apply(command)
-                    name = self._name(command) if command.verb == "save" else None
-                    answers.append(self._answer(command, done, reason, name=name))
-                except ObjectError as error:
-                    answers.append(self._answer(command, False, str(error)))
+                answers.append(self._carried_out(command))
                 answers += self.reject_boxes(f"the pipeline is ending: {self.end_reason}") if self.end_reason else []
         return answers
 
@@ -91,7 +86,7 @@ class CommandHandler:
                     later.append(command)
                     continue
                 given[name], effect = self._begun(name, command, frame, time)
-                answers.append(self._answer(command, True, effect, self._detectors.seq, name))
+                answers.append(self._answer(command, True, effect, name, self._detectors.seq))
             except (BoxError, ObjectError) as error:
                 answers.append(self._answer(command, False, str(error)))
         self._boxes = later
@@ -99,18 +94,19 @@ class CommandHandler:
 
     def _begun(self, name: str, command: Command, frame: Pyramid, time: float) -> tuple[Result, str]:
         """The result of an object at the box of a command, and the effect."""
-        detectors, box, number = self._detectors, command.box, self._detectors.seq
+        detectors, box = self._detectors, command.box
         if box is None:
             raise BoxError("no box was given")
+        at, of_name = f"at {box} in frame {detectors.seq}", f" {name}" if name else ""
         known = detectors.detectors.get(name)
-        of_name = f" {name}" if name else ""
         if command.keep and known is not None and known.model.version:
-            result = detectors.correct(name, frame, box, time)
-            return result, f"the same object{of_name} continues at {box} in frame {number}"
+            return detectors.correct(name, frame, box, time), f"the same object{of_name} continues {at}"
+        if name not in self.desired.objects:
+            check_count(len(self.desired.objects) + 1, detectors.settings.run.objects_most)
         result = detectors.begin(name, frame, box, time)
-        what = f"the object{of_name} begins" if name not in self.desired.objects else f"another object{of_name} begins"
+        article = "another" if name in self.desired.objects else "the"
         self.desired = self.desired.begun(name, box, result[0].seq)
-        return result, f"{what} at {box} in frame {number}"
+        return result, f"{article} object{of_name} begins {at}"
 
     def reject_boxes(self, reason: str) -> list[Answer]:
         """Reject the boxes that wait for a frame, because there is none."""
@@ -127,51 +123,61 @@ class CommandHandler:
         """Clear the command `stop` at the end of the run, so that a resumed detector does not stop at once."""
         self.desired = replace(self.desired, stopped=False)
 
-    def _apply(self, command: Command) -> tuple[bool, str]:
-        """Carry out a command that needs no frame; return whether it was done, and its effect or the error."""
+    def _carried_out(self, command: Command) -> Answer:
+        """Carry out a command that needs no frame; return its answer."""
         seq = self._detectors.seq
         after = f"after frame {seq - 1}" if seq else "before the first frame"
-        if command.verb == "pause":
-            self.desired = replace(self.desired, paused=True)
-            return True, f"paused {after}"
-        if command.verb == "resume":
-            self.desired = replace(self.desired, paused=False)
-            return True, "waiting for a box" if self.desired.holds else f"resumed {after}"
-        if command.verb == "stop":
-            self.desired, self.end_reason = replace(self.desired, stopped=True), STOPPED
-            return True, f"the stream ends {after}"
-        name = self._known(command)
-        if command.verb == "forget":
-            self.desired = self.desired.without(name)
-            self._detectors.detectors.pop(name, None)
-            waits = "" if self.desired.objects else ": no object is left, so the run waits for a box"
-            return True, f"{listed([name])} is followed no more {after}{waits}"
+        match command.verb:
+            case "pause":
+                self.desired = replace(self.desired, paused=True)
+                return self._answer(command, True, f"paused {after}")
+            case "resume":
+                self.desired = replace(self.desired, paused=False)
+                return self._answer(command, True, "waiting for a box" if self.desired.holds else f"resumed {after}")
+            case "stop":
+                self.desired, self.end_reason = replace(self.desired, stopped=True), STOPPED
+                return self._answer(command, True, f"the stream ends {after}")
+        try:
+            name = self._name(command)
+            if not self.desired.objects:
+                raise ObjectError("no object is tracked yet: give one a box first (set-box)")
+            if name not in self.desired.objects:
+                raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.desired.objects)}")
+        except ObjectError as error:
+            return self._answer(command, False, str(error))
+        return self._forget(command, name, after) if command.verb == "forget" else self._save(command, name, after)
+
+    def _forget(self, command: Command, name: str, after: str) -> Answer:
+        """Stop tracking an object; everything learned of it is dropped."""
+        self.desired = self.desired.without(name, self._detectors.seq)
+        self._detectors.detectors.pop(name, None)
+        waits = "" if self.desired.objects else ": no object is left, so the run waits for a box"
+        return self._answer(command, True, f"{listed([name])} is no longer tracked {after}{waits}", name)
+
+    def _save(self, command: Command, name: str, after: str) -> Answer:
+        """The answer with the version of the model; the client writes the file."""
         detector = self._detectors.detectors.get(name)
         if detector is None or not detector.model.version or detector.state is None:
-            return False, "nothing was learned of the object yet: try again once there is a model (catstream status)"
+            why = "nothing was learned of the object yet: try again once there is a model (catstream status)"
+            return self._answer(command, False, why, name)
         if detector.state.first_window is None:
-            return False, "the object of the saved model was not found yet: try again once it was"
-        return True, f"model {detector.model.version} {after}"
-
-    def _known(self, command: Command) -> str:
-        """The name of an object that a command is for; ObjectError if there is none."""
-        name = self._name(command)
-        if name not in self.desired.objects:
-            raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.desired.objects)}")
-        return name
+            why = "the object of the saved model was not found yet: try again once it was"
+            return self._answer(command, False, why, name)
+        return self._answer(command, True, f"model {detector.model.version} {after}", name)
 
     def _name(self, command: Command) -> str:
         """The name of the object that a command is for: without a name, the object that has none, or the only one."""
         names = self.desired.objects
         if command.object or not names or UNNAMED in names:
-            return command.object
+            return check_name(command.object)
         if len(names) > 1:
             raise ObjectError(f"which object? This run has {listed(names)}: give a name")
         return next(iter(names))
 
     def _answer(
-        self, command: Command, done: bool, reason: str, frame: int | None = None, name: str | None = None
+        self, command: Command, done: bool, reason: str, name: str | None = None, frame: int | None = None
     ) -> Answer:
+        """The answer to a command for the object `name`, by default that of the command."""
         name = command.object if name is None else name
         detector = self._detectors.detectors.get(name)
         frame = max(self._detectors.seq - 1, 0) if frame is None else frame

@@ -247,10 +247,9 @@ class DetectorLoop:
                 self._process.allow(_OPEN_SECONDS)
             if seq == each.begins:
                 given[name] = detectors.begin(name, pyramid, each.box, frame.time)
-            elif (
-                each.since <= seq < each.begins
-            ):  # another object had the name: only its track is missing, at the owner
-                given[name] = detectors.add(name).miss(seq, frame.time)
+        for name in self._commands.desired.past_names(seq):  # the frame is repeated
+            if name not in given and name not in detectors.detectors:
+                given[name] = Detector(self._process.settings, name).miss(seq, frame.time)
         return detectors.step(pyramid, frame.time, given)
 
     def send(self, frame: Frame, tracks: Tracks, features: Features) -> None:
@@ -365,7 +364,7 @@ def _desired(process: Process, learned: dict[str, Learned]) -> DesiredState:
         except ProtocolError as error:  # the checkpoints are not affected, so the run continues
             process.trouble = str(error)
             _log.warning("%s", error)
-    boxes = {name: DesiredObject(box, begins=1, since=1) for name, box in job.boxes.items()}
+    boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
     return DesiredState(boxes | {name: DesiredObject(each.box) for name, each in learned.items()})
 
 

@@ -62,6 +62,7 @@ def start(
     desired : the objects, and the first message of each
     state_at : returns the state of a detector from only its last and its first box
     """
+    learned = {name: models[name] for name in positions[0].versions if name in models}
     last = min(positions, key=lambda position: position.seq)
     if not positions[0].versions:
         begins = min((max(each.begins, 1) for each in desired.objects.values()), default=last.seq + 1)
@@ -71,8 +72,8 @@ def start(
         if last.seq < max(each.begins, 1):
             continue  # it begins later
         found = last.objects.get(name, ObjectPosition())
-        if name in models and (state := _state(found, each, state_at)) is not None:
-            objects[name] = state, models[name]
+        if name in learned and (state := _state(found, each, state_at)) is not None:
+            objects[name] = state, learned[name]
         elif each.begins:
             desired = desired.begun(name, found.box or each.box, last.seq + 1)
     return Start(last.seq, objects, desired)

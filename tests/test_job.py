@@ -12,18 +12,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Box
-from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.errors import ObjectError, ProtocolError, ServiceError, SettingsError
 from catstream.job import Job, Results
 from catstream.settings import Settings
 
-JOB = Job("rtsp://me:secret@10.0.0.7/one", Box(1, 2, 30, 40), part=slice(0, None, 1), size=(320, 240), started=1e9)
+JOB = Job(
+    "rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240), started=1e9
+)
 
 numbers = st.none() | st.integers(0, 10**6)
 paths = st.none() | st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).map(Path)
 jobs = st.builds(
     Job,
     source=st.text(),
-    model=paths,
+    boxes=st.dictionaries(st.sampled_from(["", "anna"]), st.just(Box(1, 2, 30, 40))),
+    models=st.dictionaries(st.sampled_from(["ben", "carl"]), st.text("ab/.", min_size=1).map(Path)),
     part=st.builds(slice, numbers, numbers, numbers),
     settings=st.builds(lambda lag: Settings(run={"lag_frames": lag}), st.integers(0, 100)),
     size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
@@ -75,6 +78,14 @@ def test_a_run_is_continued_only_with_the_same_frames_and_training_settings():
         JOB.check_fits(replace(JOB, settings=Settings(coreset={"size": 32})), Path("kept"))
 
 
-def test_a_job_has_a_box_or_a_model():
-    with pytest.raises(SettingsError, match="give one of them"):
-        replace(JOB, model=Path("walker.safetensors"))
+def test_an_object_has_a_box_or_a_model():
+    replace(JOB, models={"ben": Path("walker.safetensors")})
+    with pytest.raises(SettingsError, match=r"anna: a box gives .* give one of them"):
+        replace(JOB, models={"anna": Path("walker.safetensors")})
+
+
+def test_a_job_has_at_most_as_many_objects_as_the_settings_allow():
+    boxes = {str(number): Box(1, 2, 30, 40) for number in range(9)}
+    replace(JOB, boxes=boxes, settings=Settings(run={"objects_most": 9}))
+    with pytest.raises(ObjectError, match=r"9 objects are more than 8: .*run\.objects_most=9"):
+        replace(JOB, boxes=boxes, settings=Settings(run={"objects_most": 8}))

@@ -30,7 +30,8 @@ VERBS = {
     "record": "Record the messages of a running pipeline in one file.",
     "replay": "Replay a recording to subscribers, or train on it again.",
     "status": "Show the state of a running pipeline.",
-    "set-box": "Set the box of the object in a running pipeline.",
+    "set-box": "Set the box of an object in a running pipeline.",
+    "forget": "Stop tracking an object in a running pipeline.",
     "pause": "Pause a running pipeline.",
     "resume": "Resume a paused pipeline.",
     "save": "Save what a pipeline has learned to a file.",
@@ -42,7 +43,7 @@ VERBS = {
 }
 
 #: Module of the commands that share one.
-_MODULES = dict.fromkeys(("set-box", "pause", "resume", "save", "stop"), "steer")
+_MODULES = dict.fromkeys(("set-box", "forget", "pause", "resume", "save", "stop"), "steer")
 
 
 def verb(name: str) -> click.Command:

@@ -47,6 +47,7 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
       rejected   messages that do not conform to the protocol
       trouble    a problem of a process, if there is one
       reports    each process, and the age of its last health report
+      objects    if they have names: the state, score, model and leaves of each
 
     \b
     EXAMPLES
@@ -97,6 +98,7 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
         "endpoint": place,
         "ok": len(reports) == len(_NAMES),
         "state": _state(detector),
+        "objects": _objects(reports),
         "frames": whole(detector, "sent"),
         "frames_per_second": _rate(reports.get("detector", [])),
         "lag": behind("taken"),
@@ -122,6 +124,20 @@ def _state(detector: dict[str, float]) -> str | None:
     if not detector:
         return None
     return "waiting for a box" if detector.get("waiting") else "paused" if detector.get("paused") else "following"
+
+
+def _objects(reports: dict[str, list[Health]]) -> dict[str, dict[str, Any]]:
+    """The figures of each object by name, None for those that are missing."""
+    tracked, learned = (reports[name][-1].objects if name in reports else {} for name in ("detector", "compressor"))
+    return {
+        name: {
+            "state": "present" if counters["present"] else "absent",
+            "score": round(counters["score"], 2),
+            "model_version": int(counters["model_version"]),
+            "leaves": int(learned[name]["leaves"]) if name in learned else None,
+        }
+        for name, counters in tracked.items()
+    }
 
 
 def _rate(history: list[Health]) -> float | None:
@@ -154,5 +170,17 @@ def _format(summary: dict[str, Any]) -> str:
             f"rejected   {sum(summary['rejected'].values())} messages",
             f"reports    {', '.join(history)}",
             *(f"trouble    {name}: {trouble}" for name, trouble in summary["trouble"].items()),
+            *_table(summary["objects"]),
         )
     )
+
+
+def _table(objects: dict[str, dict[str, Any]]) -> list[str]:
+    """The lines of a table of the objects; none if there is only one without a name."""
+    width = max(map(len, ["object", *objects]))
+
+    def line(name: str, *cells: object) -> str:
+        return f"{name:<{width}}" + "".join(f"{'-' if cell is None else str(cell):>9}" for cell in cells)
+
+    rows = (line(name or "-", *each.values()) for name, each in objects.items())
+    return ["", line("object", "state", "score", "model", "leaves"), *rows] if any(objects) else []

@@ -1,4 +1,4 @@
-"""`catstream set-box`, `pause`, `resume`, `save` and `stop`: commands to a running pipeline."""
+"""`catstream set-box`, `forget`, `pause`, `resume`, `save` and `stop`: commands to a running pipeline."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from catstream.box import Box
 from catstream.cli.attach import with_endpoint
 from catstream.errors import ServiceError
 from catstream.job import Job
+from catstream.names import UNNAMED, check_name, split_name
 from catstream.state import learned
 from catstream.steering import Control, control
 
-__all__ = ["pause", "resume", "save", "set_box", "stop"]
+__all__ = ["forget", "pause", "resume", "save", "set_box", "stop"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,22 +85,43 @@ def _with_control(command: Callable[..., str]) -> Callable[..., None]:
 
 
 @click.command("set-box", context_settings={"ignore_unknown_options": True})  # -3,40,60,60 is a box
-@click.argument("box", metavar="X,Y,W,H")
+@click.argument("box", metavar="[NAME=]X,Y,W,H")
 @click.option("--keep", is_flag=True, help="Same object: keep what was learned.")
 @_with_control
 def set_box(pipeline: Control, box: str, keep: bool) -> str:
-    """Set the box of the object in a running pipeline.
+    """Set the box of an object in a running pipeline.
 
     X,Y,W,H is the box in pixels in the next frame that is tracked; during a
-    pause of a file, in the frame that is held. By default it is a new object,
-    and everything learned of the previous one is dropped.
+    pause of a file, in the frame that is held. A new NAME begins an object
+    beside the others. Without NAME, the only object is meant. If an object has
+    this name already, another one takes its place, and everything learned of
+    the previous one is dropped.
 
     \b
     EXAMPLES
       catstream set-box 120,80,64,48
-      catstream set-box 118,83,64,48 --keep
+      catstream set-box anna=120,80,64,48
+      catstream set-box anna=118,83,64,48 --keep
     """
-    return pipeline.set_box(Box.parse(box), keep=keep).reason
+    name, value = split_name(box)
+    return pipeline.set_box(Box.parse(value), name, keep=keep).reason
+
+
+@click.command()
+@click.argument("name", default=UNNAMED)
+@_with_control
+def forget(pipeline: Control, name: str) -> str:
+    """Stop tracking an object in a running pipeline.
+
+    Everything learned of the object NAME is dropped, and the other objects
+    continue. Without NAME, the only object is meant. If no object is left, the
+    run waits for `catstream set-box`.
+
+    \b
+    EXAMPLES
+      catstream forget anna
+    """
+    return pipeline.forget(name).reason
 
 
 @click.command()
@@ -132,6 +154,7 @@ def resume(pipeline: Control) -> str:
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
+@click.option("--object", "name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one.")
 @click.option(
     "--state", type=click.Path(path_type=Path), metavar="FOLDER", help="State folder of a run, which may have ended."
 )
@@ -163,7 +186,7 @@ def save(target: _Target, file: Path, state: Path | None, name: str) -> None:
             "--state names the folder of a run, --endpoint and --source a running pipeline: give one"
         )
     else:
-        content = learned(state, Job.load(state).settings, name)
+        content = learned(state, Job.load(state).settings, check_name(name))
         content.save(file)
         version = content.model.version
     click.echo(f"model {version} is in {file}")

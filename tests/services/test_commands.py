@@ -1,38 +1,44 @@
-"""Laws of commands: each is answered once, and what was asked for last holds, in every order."""
+"""Laws of commands: each is answered once, and the last command for an object or a run holds, in every order."""
 
 from __future__ import annotations
 
 import itertools
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from catstream.box import Box
-from catstream.detection.detector import Detector
+from catstream.detection.objects import Detectors
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Command
 from catstream.services.commands import STOPPED, CommandHandler
-from catstream.services.desired import DesiredState
+from catstream.services.desired import DesiredObject, DesiredState, PastObject
 from catstream.settings import Settings
 from catstream.video.demo import render
-from catstream.video.frames import Frame
 
-((IMAGE, TRUTH),) = render(1, (160, 120))
+((IMAGE, _),) = render(1, (160, 120))
+FRAME = Pyramid.of(IMAGE)
 BOXES = [Box(40, 30, 20, 20), Box(400, 30, 20, 20)]  # the second is outside of the frame
+NAMES = ["", "anna", "ben", "carl"]
+MOST = 2
+QUICK = Settings(teaching={"copies": 0}, run={"objects_most": MOST})
 
 
 class Steering(RuleBasedStateMachine):
-    """A handler, the commands that it was given, and what they should have led to."""
+    """A handler, the commands that it was given, and the state that they should have led to."""
 
     def __init__(self):
         super().__init__()
-        self.detector = Detector(Settings(teaching={"copies": 0}))
-        self.handler = CommandHandler(self.detector, DesiredState())
+        self.detectors = Detectors(QUICK)
+        self.handler = CommandHandler(self.detectors, DesiredState())
         self.ids = map(str, itertools.count())
-        self.open, self.paused, self.stopped, self.box = set(), False, False, None
+        self.open, self.paused, self.stopped = set(), False, False
+        self.first = {}  # the message in which each object began
 
-    def give(self, verb, box=None, keep=False):
-        command = Command(next(self.ids), verb, box, keep)
+    def give(self, verb, name="", box=None, keep=False):
+        command = Command(next(self.ids), verb, box, keep, name)
         self.open.add(command.id)
         return self.answered(self.handler.carry_out([command]))
 
@@ -41,41 +47,56 @@ class Steering(RuleBasedStateMachine):
             self.open.remove(answer.id)  # KeyError: answered twice
         return answers
 
+    def meant(self, name):
+        """The object that a name stands for, None if that is not clear."""
+        if name or not self.first or "" in self.first:
+            return name
+        return None if len(self.first) > 1 else next(iter(self.first))
+
     @rule(verb=st.sampled_from(["pause", "resume"]))
     def pause_or_resume(self, verb):
         (answer,) = self.give(verb)
         assert answer.done != self.stopped
         self.paused = self.paused if self.stopped else verb == "pause"
 
-    @rule(box=st.sampled_from(BOXES), keep=st.booleans())
-    def set_box(self, box, keep):
-        answers = self.give("set-box", box, keep)
+    @rule(name=st.sampled_from(NAMES), box=st.sampled_from(BOXES), keep=st.booleans())
+    def set_box(self, name, box, keep):
+        answers = self.give("set-box", name, box, keep)
         assert bool(answers) == self.stopped
         assert not any(answer.done for answer in answers)
 
-    @precondition(lambda self: self.detector.seq < 4)
+    @rule(name=st.sampled_from(NAMES))
+    def forget(self, name):
+        meant = self.meant(name)
+        (answer,) = self.give("forget", name)
+        assert answer.done == (meant in self.first and not self.stopped)
+        if answer.done:
+            assert answer.object == meant
+            del self.first[meant]
+
+    @precondition(lambda self: self.detectors.seq < 4)
     @rule()
     def next_frame(self):
-        found, answers = self.handler.begin(Frame(self.detector.seq, 0.0, IMAGE))
+        given, answers = self.handler.begin(FRAME, 0.0)
         done = [answer for answer in self.answered(answers) if answer.done]
-        assert len(done) == (found is not None)
-        if found is not None:
-            self.box = self.handler.desired.box
-            assert found[0].seq == self.handler.desired.begins == self.detector.seq
-            assert self.box == BOXES[0]
+        assert [answer.object for answer in done] == list(given)
+        self.first |= dict.fromkeys(given, self.detectors.seq + 1)
+        if self.first:
+            tracks, features = self.detectors.step(FRAME, 0.0, given)
+            assert tracks.tracks.keys() == features.objects.keys() == self.first.keys()
 
-    @rule()
-    def save(self):
-        (answer,) = self.give("save")
+    @rule(name=st.sampled_from(NAMES))
+    def save(self, name):
+        (answer,) = self.give("save", name)
         assert not answer.done
-        assert "nothing was learned" in answer.reason
+        assert answer.reason
 
     @rule()
     def lose_the_source(self):
         assert not any(answer.done for answer in self.answered(self.handler.reject_boxes("it is lost")))
         assert not self.open
 
-    @precondition(lambda self: self.detector.seq)
+    @precondition(lambda self: self.detectors.seq)
     @rule()
     def stop(self):
         self.give("stop")
@@ -83,21 +104,101 @@ class Steering(RuleBasedStateMachine):
         assert not self.open
 
     @invariant()
-    def the_desired_state_is_what_was_asked_for_last(self):
+    def the_last_command_of_each_kind_holds(self):
         desired = self.handler.desired
-        assert (desired.paused, desired.stopped, desired.box) == (self.paused, self.stopped, self.box)
+        assert (desired.paused, desired.stopped) == (self.paused, self.stopped)
+        assert desired.objects == {name: DesiredObject(BOXES[0], first) for name, first in self.first.items()}
+        assert self.detectors.detectors.keys() == self.first.keys()
+        assert len(self.first) <= MOST
         assert self.handler.end_reason == (STOPPED if self.stopped else "")
         assert len(self.open) == 0 or self.handler.has_box
 
+    @invariant()
+    def each_message_had_the_tracks_of_the_objects_of_its_time(self):
+        for each in self.handler.desired.past:
+            assert 1 <= each.first <= each.last <= self.detectors.seq
+
 
 TestSteering = Steering.TestCase
-TestSteering.settings = settings(max_examples=30, stateful_step_count=12)
+TestSteering.settings = settings(max_examples=40, stateful_step_count=14)
+
+
+@pytest.fixture
+def handler():
+    """The handler of a run with the objects anna and ben in its first frame."""
+    handler = CommandHandler(Detectors(QUICK), DesiredState())
+    answer(handler, Command("a", "set-box", BOXES[0], object="anna"), Command("b", "set-box", BOXES[0], object="ben"))
+    return handler
+
+
+def answer(handler, *commands):
+    """The answers to commands, whose boxes are for one frame, as done and reason."""
+    answers = handler.carry_out(commands)
+    if handler.has_box:
+        given, later = handler.begin(FRAME, 0.0)
+        answers += later
+        handler._detectors.step(FRAME, 0.0, given)
+    return [(each.done, each.reason) for each in answers]
+
+
+def test_two_boxes_for_two_objects_begin_them_in_one_frame(handler):
+    objects = handler.desired.objects
+    assert objects == {name: DesiredObject(BOXES[0], begins=1) for name in ("anna", "ben")}
+
+
+@pytest.mark.parametrize(
+    ("command", "why"),
+    [
+        (Command("1", "set-box", BOXES[0]), "which object? This run has anna, ben: give a name"),
+        (Command("1", "forget"), "which object? This run has anna, ben: give a name"),
+        (Command("1", "save"), "which object? This run has anna, ben: give a name"),
+        (Command("1", "forget", object="carl"), "there is no object 'carl': the objects are anna, ben"),
+        (Command("1", "save", object="ben"), "nothing was learned of the object yet"),
+        (Command("1", "set-box", BOXES[0], object="carl"), "3 objects are more than 2: follow fewer"),
+        (Command("1", "set-box", BOXES[0], object="an na"), "'an na' is not a name: expected 1 to 64 letters"),
+        (Command("1", "set-box", BOXES[1], object="anna"), "outside the frame"),
+    ],
+    ids=lambda value: f"{value.verb} {value.object}" if isinstance(value, Command) else "",
+)
+def test_a_command_that_cannot_be_carried_out_is_rejected_with_the_reason_and_changes_nothing(handler, command, why):
+    before = handler.desired
+    ((done, reason),) = answer(handler, command)
+    assert not done
+    assert why in reason
+    assert handler.desired == before
+
+
+def test_a_box_for_the_name_of_an_object_begins_another_object_of_that_name(handler):
+    ((done, reason),) = answer(handler, Command("1", "set-box", BOXES[0], object="anna"))
+    assert (done, reason) == (True, f"another object anna begins at {BOXES[0]} in frame 1")
+    assert handler.desired.objects["anna"].begins == 2
+    assert handler.desired.past == (PastObject("anna", 1, 1),)
+
+
+def test_once_the_last_object_was_forgotten_a_paused_run_waits_for_a_box(handler):
+    answer(handler, Command("1", "pause"))
+    assert answer(handler, Command("2", "forget", object="ben")) == [(True, "ben is no longer tracked after frame 0")]
+    waits = "anna is no longer tracked after frame 0: no object is left, so the run waits for a box"
+    assert answer(handler, Command("3", "forget")) == [(True, waits)]
+    assert answer(handler, Command("4", "resume")) == [(True, "waiting for a box")]
+    ((_, reason),) = answer(handler, Command("5", "forget"))
+    assert "no object is tracked yet" in reason
+    answer(handler, Command("6", "set-box", BOXES[0], object="anna"))
+    assert not handler.desired.holds
+
+
+def test_a_frame_that_is_repeated_has_a_track_of_each_object_of_its_time(handler):
+    answer(handler, Command("1", "forget", object="ben"))
+    answer(handler, Command("2", "set-box", BOXES[0], object="anna"))
+    assert handler.desired.past_names(1) == ["ben", "anna"]
+    assert handler.desired.past_names(2) == []
 
 
 def test_a_handler_that_is_released_forgets_that_it_was_stopped():
-    handler = CommandHandler(Detector(Settings()), DesiredState(BOXES[0], begins=1))
+    desired = DesiredState({"": DesiredObject(BOXES[0], begins=1)})
+    handler = CommandHandler(Detectors(QUICK), desired)
     handler.carry_out([Command("1", "stop")])
     assert handler.desired.stopped
     handler.clear_stop()
-    assert handler.desired == DesiredState(BOXES[0], begins=1)
+    assert handler.desired == desired
     assert handler.end_reason == STOPPED

@@ -5,11 +5,16 @@ from __future__ import annotations
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from catstream.messages import End, Position
+from catstream.messages import End, ObjectPosition, Position
 from catstream.services.progress import Progress
 
 WINDOW = 8
 INTERVAL = 3.0
+
+
+def objects(version):
+    """The part of a position for one object."""
+    return {"anna": ObjectPosition(version=version)}
 
 
 class Storing(RuleBasedStateMachine):
@@ -24,7 +29,7 @@ class Storing(RuleBasedStateMachine):
     def store(self, works, urgent):
         if works:
             self.on_disk = self.seq
-        position = Position(self.seq, version=self.seq)
+        position = Position(self.seq, objects=objects(self.seq))
         self.progress = self.progress.after(position, self.now, saved=works, urgent=urgent)
 
     @rule(works=st.booleans())
@@ -59,11 +64,12 @@ class Storing(RuleBasedStateMachine):
 
     @invariant()
     def the_end_is_stored_as_much_as_the_message_before_it(self):
-        acknowledged = self.progress.acknowledgement(9, End(self.seq + 1, "it ended"))
+        now = Position(self.seq, objects=objects(9))
+        acknowledged = self.progress.acknowledgement(now, End(self.seq + 1, "it ended"))
         position = self.progress.position
-        assert (acknowledged.seq, acknowledged.version) == (self.seq + 1, 9)
+        assert (acknowledged.seq, acknowledged.versions) == (self.seq + 1, {"anna": 9})
         assert acknowledged.unsaved == (position.unsaved + 1 if position.unsaved else 0)
-        assert self.progress.acknowledgement(9, None).seq == position.seq
+        assert self.progress.acknowledgement(now, None).seq == position.seq
 
 
 TestStoring = Storing.TestCase

@@ -1,4 +1,4 @@
-"""Laws of resuming: from where a detector continues, whatever the others answer."""
+"""Laws of resuming: the point from which the detectors continue, for all answers of the other processes."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Box, Window
-from catstream.messages import DetectorState, Model, Position
-from catstream.services.desired import DesiredState
+from catstream.messages import DetectorState, Model, ObjectPosition, Position
+from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.resume import agree, start
 
 BOX = Box(1.0, 2.0, 30.0, 40.0)
 STATE = DetectorState(0, "confident", *3 * (Window(*BOX),))
 
+names = st.sampled_from(["", "anna", "ben"])
 seqs = st.integers(0, 50)
 versions = st.integers(0, 9)
-positions = st.builds(
-    Position, seq=seqs, box=st.none() | st.just(BOX), version=versions, detector=st.none() | st.just(STATE)
-)
-models = st.none() | st.builds(Model, versions.filter(bool), seqs, st.just(np.empty(0, np.float32)), st.just(0.0))
-states = st.builds(DesiredState, box=st.none() | st.just(BOX), begins=seqs)
+parts = st.builds(ObjectPosition, st.none() | st.just(BOX), versions, st.none() | st.just(STATE))
+positions = st.builds(Position, seq=seqs, objects=st.dictionaries(names, parts))
+made = st.builds(Model, versions.filter(bool), seqs, st.just(np.empty(0, np.float32)), st.just(0.0))
+models = st.dictionaries(names, made)
+states = st.builds(DesiredState, st.dictionaries(names, st.builds(DesiredObject, st.just(BOX), seqs)))
 histories = st.tuples(st.lists(positions, min_size=1, max_size=2), models, states)
 
 
@@ -35,35 +36,46 @@ def test_no_receiver_misses_a_message(history):
     first = begin(history).seq + 1
     assert all(first <= position.seq + 1 for position in received)
     assert first >= 1
-    assert first == min(position.seq for position in received) + 1 or first == max(desired.begins, 1)
+    begun = {max(each.begins, 1) for each in desired.objects.values()}
+    assert first in {min(position.seq for position in received) + 1, *begun}
 
 
 @given(histories)
-def test_a_detector_state_is_resumed_only_with_its_model_and_for_the_same_object(history):
-    received, model, desired = history
+def test_a_detector_state_is_resumed_only_with_the_model_of_its_object_and_after_the_object_has_begun(history):
+    received, learned, desired = history
     found = begin(history)
-    assert (found.detector is None) == (found.model is None)
-    if found.detector is not None:
-        assert found.model is model
-        assert received[0].version
-        assert found.seq >= max(desired.begins, 1)
+    for name, (_, model) in found.objects.items():
+        assert model is learned[name]
+        assert received[0].versions
+        assert found.seq >= max(desired.objects[name].begins, 1)
 
 
 @given(histories)
-def test_without_a_model_of_the_object_it_begins_at_its_first_frame(history):
+def test_every_object_that_was_wanted_is_still_wanted_and_continues_or_begins_later(history):
+    _, _, desired = history
+    found = begin(history)
+    assert found.desired.objects.keys() == desired.objects.keys()
+    for name, each in found.desired.objects.items():
+        assert name in found.objects or not each.begins or each.begins > found.seq
+
+
+@given(histories)
+def test_if_nothing_was_learned_of_any_object_all_begin_at_their_first_frames(history):
     received, _, desired = history
-    if not received[0].version:
-        assert begin(history).seq < max(desired.begins, 1)
-        assert begin(history).detector is None
+    if not received[0].versions and desired.objects:
+        found = begin(history)
+        assert found.seq < max(min(each.begins for each in desired.objects.values()), 1)
+        assert not found.objects
 
 
-@given(positions, models)
-def test_compressor_and_trainer_agree_if_there_is_no_sample_or_its_model_is_here(features, model):
-    expected = features.version == (0 if model is None or not features.version else model.version)
-    assert agree(features, model) == expected
+@given(positions, models, states)
+def test_compressor_and_trainer_agree_once_the_model_of_every_sample_is_here(features, models, desired):
+    needed = {name: version for name, version in features.versions.items() if name in desired.objects}
+    expected = all(name in models and models[name].version == version for name, version in needed.items())
+    assert agree(features, models, desired) == expected
 
 
-def test_a_state_that_nobody_knows_is_made_of_the_last_and_the_first_box():
+def test_a_state_that_is_not_stored_is_made_of_the_last_and_the_first_box():
     model = Model(1, 5, np.empty(0, np.float32), 0.0)
     made = []
     last, first = Box(5.0, 6.0, 30.0, 40.0), BOX
@@ -72,5 +84,16 @@ def test_a_state_that_nobody_knows_is_made_of_the_last_and_the_first_box():
         made.append(boxes)
         return STATE
 
-    found = start([Position(5, 4, last, 1)], model, DesiredState(first, begins=1), state_at)
-    assert (found.seq, found.detector, made) == (5, STATE, [(last, first)])
+    position = Position(5, 4, {"anna": ObjectPosition(last, 1)})
+    found = start([position], {"anna": model}, DesiredState({"anna": DesiredObject(first, begins=1)}), state_at)
+    assert (found.seq, found.objects, made) == (5, {"anna": (STATE, model)}, [(last, first)])
+
+
+def test_an_object_that_had_learned_nothing_beside_another_begins_anew_where_it_was_last():
+    model = Model(1, 5, np.empty(0, np.float32), 0.0)
+    last = Box(5.0, 6.0, 30.0, 40.0)
+    position = Position(5, 4, {"anna": ObjectPosition(BOX, 1, STATE), "ben": ObjectPosition(last)})
+    desired = DesiredState({name: DesiredObject(BOX, begins=2) for name in ("anna", "ben")})
+    found = start([position], {"anna": model}, desired, lambda _box, _first: STATE)
+    assert found.objects == {"anna": (STATE, model)}
+    assert found.desired.objects["ben"] == DesiredObject(last, begins=6)

@@ -1,0 +1,39 @@
+"""The file of the desired state: it holds all that was commanded."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.box import Box
+from catstream.services.desired import DesiredState
+
+BOX = Box(1.0, 2.0, 30.0, 40.0)
+names = st.sampled_from(["", "anna", "ben"])
+events = st.lists(st.tuples(names, st.booleans()), max_size=9)
+
+
+@given(events, st.booleans(), st.booleans())
+def test_the_state_is_read_as_it_was_written(tmp_path_factory, events, paused, stopped):
+    state = after(events, DesiredState(paused=paused, stopped=stopped))
+    file = tmp_path_factory.mktemp("state") / "desired_state.json"
+    state.save(file)
+    assert DesiredState.load(file) == state
+
+
+@given(events)
+def test_every_message_has_each_name_at_most_once(events):
+    state = after(events)
+    for seq in range(1, len(events) + 2):
+        there = [name for name, each in state.objects.items() if each.begins <= seq]
+        assert sorted({*state.past_names(seq), *there}) == sorted([*state.past_names(seq), *there])
+
+
+def after(events, state=DesiredState()):  # noqa: B008
+    """The state after objects have begun or were forgotten, one event a message."""
+    for seq, (name, begins) in enumerate(events, start=1):
+        if begins:
+            state = state.begun(name, BOX, seq)
+        elif name in state.objects:
+            state = state.without(name, seq - 1)
+    return state
