@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from catstream import storage
 from catstream.box import Box
@@ -31,16 +32,15 @@ class DesiredObject:
 
 @dataclass(frozen=True, slots=True)
 class PastObject:
-    """An object that was forgotten, or replaced by another one of its name.
+    """An object that was forgotten, or replaced by another one of its name: a restarted detector may repeat its frames.
 
-    A restarted detector may have to repeat its last frames. It does not search for the object again, but each of these
-    frames has a track of it.
-
-    first, last  seq of the first and of the last message with a track of it
+    name  its name
+    each  its first box, and the message in which it began
+    last  seq of the last message with a track of it
     """
 
     name: str
-    first: int
+    each: DesiredObject
     last: int
 
 
@@ -71,15 +71,14 @@ class DesiredState:
 
     def without(self, name: str, last: int) -> DesiredState:
         """The state after an object was forgotten; message `last` is the last one with a track of it."""
-        past = self.past
-        if (first := max(self.objects[name].begins, 1)) <= last:
-            past = (*past, PastObject(name, first, last))[-_PAST:]
+        past = (*self.past, PastObject(name, self.objects[name], last))[-_PAST:]
         objects = {other: each for other, each in self.objects.items() if other != name}
         return replace(self, objects=objects, past=past)
 
-    def past_names(self, seq: int) -> list[str]:
-        """The names of the earlier objects of which message `seq` has a track."""
-        return [each.name for each in self.past if each.first <= seq <= each.last]
+    def objects_at(self, seq: int) -> dict[str, DesiredObject]:
+        """The objects of which message `seq` has a track, by name."""
+        past = {was.name: was.each for was in self.past if was.each.begins <= seq <= was.last}
+        return past | {name: each for name, each in self.objects.items() if each.begins <= seq}
 
     def save(self, path: Path) -> None:
         """Write the state to a file atomically.
@@ -103,16 +102,16 @@ class DesiredState:
         """
         try:
             read = json.loads(path.read_text())
-            objects = {
-                check_name(name): DesiredObject(Box(*each["box"]), int(each["begins"]))
-                for name, each in read["objects"].items()
-            }
-            past = (
-                PastObject(check_name(each["name"]), int(each["first"]), int(each["last"])) for each in read["past"]
-            )
+            objects = {check_name(name): _object(each) for name, each in read["objects"].items()}
+            past = (PastObject(check_name(was["name"]), _object(was["each"]), int(was["last"])) for was in read["past"])
             return cls(objects, tuple(past), bool(read["paused"]), bool(read["stopped"]))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ProtocolError(
                 f"the desired state cannot be read from {path} ({error!r}): the run starts with its original boxes, "
                 "repeat later commands"
             ) from None
+
+
+def _object(read: Mapping[str, Any]) -> DesiredObject:
+    """An object as JSON gives it."""
+    return DesiredObject(Box(*read["box"]), int(read["begins"]))

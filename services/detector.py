@@ -138,7 +138,7 @@ class DetectorLoop:
         models: dict[str, Model] = {}
         commands = self._commands
         positions = [self._position(sender) for sender in self._outputs.senders]
-        while not agree(positions[0], models, commands.desired):
+        while not agree(positions, models, commands.desired):
             if (model := self._models.receive(_TURN_SECONDS)) is not None:
                 models[model.object] = model
             positions = [self._position(sender) for sender in self._outputs.senders]
@@ -240,15 +240,15 @@ class DetectorLoop:
         detectors, seq = self.detectors, self.detectors.seq + 1
         for model in self._models.receive_all():
             detectors.adopt(model)
-        for name, each in self._commands.desired.objects.items():
-            if name in given:
-                continue
-            if seq <= max(each.begins, 1):
+        objects = self._commands.desired.objects_at(seq)
+        for name in detectors.detectors.keys() - objects.keys():
+            detectors.forget(name)
+        for name in objects.keys() - given.keys():
+            if seq <= max(objects[name].begins, 1):
                 self._process.allow(_OPEN_SECONDS)
-            if seq == each.begins:
-                given[name] = detectors.begin(name, pyramid, each.box, frame.time)
-        for name in self._commands.desired.past_names(seq):  # the frame is repeated
-            if name not in given and name not in detectors.detectors:
+            if seq == objects[name].begins:
+                given[name] = detectors.begin(name, pyramid, objects[name].box, frame.time)
+            elif name not in detectors.detectors:  # it was forgotten later: see `catstream.services.resume`
                 given[name] = Detector(self._process.settings, name).miss(seq, frame.time)
         return detectors.step(pyramid, frame.time, given)
 

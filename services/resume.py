@@ -26,22 +26,20 @@ class Start:
     desired: DesiredState = field(default_factory=DesiredState)
 
 
-def agree(features: Position, models: Mapping[str, Model], desired: DesiredState) -> bool:
+def agree(positions: Sequence[Position], models: Mapping[str, Model], desired: DesiredState) -> bool:
     """Whether the compressor and the trainer are at the same samples, so that the detectors can continue.
 
     Either of them may have been restarted too, and then repeats its last steps.
 
     Parameters
     ----------
-    features : answer of the compressor
+    positions : answers of the receivers, that of the compressor first
     models : the newest model of each object that was received
     desired : the objects
     """
-    return all(
-        name in models and models[name].version == version
-        for name, version in features.versions.items()
-        if name in desired.objects
-    )
+    versions = positions[0].versions
+    needed = versions.keys() & _continuing(_last(positions), desired).keys()
+    return all(name in models and models[name].version == versions[name] for name in needed)
 
 
 def start(
@@ -52,8 +50,10 @@ def start(
 ) -> Start:
     """Return the start of the detectors: after the last message that every receiver has stored.
 
-    If nothing was learned of any object yet, it is before the first frame of the first of them. If nothing was learned
-    of one of several objects, which takes long with the paper's first tracker only, it begins anew where it was last.
+    An object that was forgotten after that message continues too, until the message after which it was forgotten. If
+    nothing was learned of any object yet, the start is before the first frame of the first of them. If nothing was
+    learned of one of several objects, which takes long with the paper's first tracker only, it begins anew where it was
+    last.
 
     Parameters
     ----------
@@ -62,21 +62,29 @@ def start(
     desired : the objects, and the first message of each
     state_at : returns the state of a detector from only its last and its first box
     """
-    learned = {name: models[name] for name in positions[0].versions if name in models}
-    last = min(positions, key=lambda position: position.seq)
-    if not positions[0].versions:
-        begins = min((max(each.begins, 1) for each in desired.objects.values()), default=last.seq + 1)
-        return Start(min(last.seq, begins - 1), desired=desired)
+    last, versions = _last(positions), positions[0].versions
+    continuing = _continuing(last, desired)
+    if not versions:
+        return Start(min((max(each.begins, 1) - 1 for each in continuing.values()), default=last.seq), desired=desired)
     objects = {}
-    for name, each in desired.objects.items():
-        if last.seq < max(each.begins, 1):
-            continue  # it begins later
+    for name, each in continuing.items():
         found = last.objects.get(name, ObjectPosition())
-        if name in learned and (state := _state(found, each, state_at)) is not None:
-            objects[name] = state, learned[name]
-        elif each.begins:
+        if name in versions and name in models and (state := _state(found, each, state_at)) is not None:
+            objects[name] = state, models[name]
+        elif each.begins and desired.objects.get(name) == each:
             desired = desired.begun(name, found.box or each.box, last.seq + 1)
     return Start(last.seq, objects, desired)
+
+
+def _last(positions: Sequence[Position]) -> Position:
+    """The position that every receiver has stored."""
+    return min(positions, key=lambda position: position.seq)
+
+
+def _continuing(last: Position, desired: DesiredState) -> dict[str, DesiredObject]:
+    """The objects that began before a position and have a track in the message after it, in the order of the trees."""
+    objects = {name: each for name, each in desired.objects_at(last.seq + 1).items() if max(each.begins, 1) <= last.seq}
+    return {name: objects[name] for name in last.objects if name in objects} | objects
 
 
 def _state(

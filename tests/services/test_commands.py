@@ -115,8 +115,8 @@ class Steering(RuleBasedStateMachine):
 
     @invariant()
     def each_message_had_the_tracks_of_the_objects_of_its_time(self):
-        for each in self.handler.desired.past:
-            assert 1 <= each.first <= each.last <= self.detectors.seq
+        for was in self.handler.desired.past:
+            assert 1 <= was.each.begins <= was.last <= self.detectors.seq
 
 
 TestSteering = Steering.TestCase
@@ -172,7 +172,7 @@ def test_a_box_for_the_name_of_an_object_begins_another_object_of_that_name(hand
     ((done, reason),) = answer(handler, Command("1", "set-box", BOXES[0], object="anna"))
     assert (done, reason) == (True, f"another object anna begins at {BOXES[0]} in frame 1")
     assert handler.desired.objects["anna"].begins == 2
-    assert handler.desired.past == (PastObject("anna", 1, 1),)
+    assert handler.desired.past == (PastObject("anna", DesiredObject(BOXES[0], 1), 1),)
 
 
 def test_once_the_last_object_was_forgotten_a_paused_run_waits_for_a_box(handler):
@@ -190,8 +190,9 @@ def test_once_the_last_object_was_forgotten_a_paused_run_waits_for_a_box(handler
 def test_a_frame_that_is_repeated_has_a_track_of_each_object_of_its_time(handler):
     answer(handler, Command("1", "forget", object="ben"))
     answer(handler, Command("2", "set-box", BOXES[0], object="anna"))
-    assert handler.desired.past_names(1) == ["ben", "anna"]
-    assert handler.desired.past_names(2) == []
+    first, other = DesiredObject(BOXES[0], 1), DesiredObject(BOXES[0], 2)
+    assert handler.desired.objects_at(1) == {"anna": first, "ben": first}
+    assert handler.desired.objects_at(2) == {"anna": other}
 
 
 def test_a_handler_that_is_released_forgets_that_it_was_stopped():

@@ -22,11 +22,10 @@ def test_the_state_is_read_as_it_was_written(tmp_path_factory, events, paused, s
 
 
 @given(events)
-def test_every_message_has_each_name_at_most_once(events):
-    state = after(events)
-    for seq in range(1, len(events) + 2):
-        there = [name for name, each in state.objects.items() if each.begins <= seq]
-        assert sorted({*state.past_names(seq), *there}) == sorted([*state.past_names(seq), *there])
+def test_the_objects_of_each_message_are_known_later(events):
+    last = after(events)
+    for seq in range(len(events) + 1):
+        assert last.objects_at(seq) == after(events[:seq]).objects
 
 
 def after(events, state=DesiredState()):  # noqa: B008
