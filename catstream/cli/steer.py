@@ -158,7 +158,6 @@ def resume(pipeline: Control) -> str:
 @click.option(
     "--state", type=click.Path(path_type=Path), metavar="FOLDER", help="State folder of a run, which may have ended."
 )
-@click.option("--object", "name", default="", metavar="NAME", help="Name of the object, if the run has several.")
 @_with_pipeline
 def save(target: _Target, file: Path, state: Path | None, name: str) -> None:
     """Save everything that a pipeline has learned of an object to FILE.
