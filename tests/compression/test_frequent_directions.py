@@ -40,11 +40,13 @@ def in_memory(sketch: FrequentDirections) -> np.ndarray:
 def assert_within_the_bound(sketch: FrequentDirections, rows: np.ndarray) -> None:
     kept, slack = in_memory(sketch).astype(np.float64), ROUNDING * energy(rows)
     exact = rows.astype(np.float64)
-    errors = np.linalg.eigvalsh(exact.T @ exact - kept.T @ kept)  # of all unit vectors y: from the least to the largest
+    _, lengths, basis = np.linalg.svd(exact, full_matrices=False)
+    kept = kept @ basis.T  # in the span of A, which has all rows of C
+    errors = np.linalg.eigvalsh(np.diag(lengths**2) - kept.T @ kept)  # the least and the largest are of unit vectors y
     assert -slack <= errors[0]
     assert errors[-1] <= sketch.dropped_energy / (SIZE + 1) + slack
     assert sketch.dropped_energy <= energy(rows) * (1 + ROUNDING)
-    squares = np.linalg.svd(exact, compute_uv=False) ** 2
+    squares = lengths**2
     assert errors[-1] <= min(squares[k:].sum() / (SIZE + 1 - k) for k in range(SIZE + 1)) + slack
 
 
