@@ -108,7 +108,7 @@ class MultiTracker:
         prepare(self.settings)  # a library is held to one thread if it is there when a call begins
         with one_thread():
             pyramid = Pyramid.of(image)
-            given = {name: detectors.begin(name, pyramid, box, time) for name, box in boxes.items()}
+            given = detectors.begin_all(boxes, pyramid, time)
             # If a box was refused, nothing has changed.
             self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
             self._learn(*detectors.step(pyramid, time, given))
@@ -119,7 +119,8 @@ class MultiTracker:
         Parameters
         ----------
         begin : mapping of str to boxes
-            The boxes of objects that begin in this frame. An object of the same name is forgotten.
+            The boxes of objects that begin in this frame. An object of the same name is forgotten. If one box is
+            refused, no object begins, and the frame counts as not seen.
 
         Returns
         -------
@@ -144,7 +145,7 @@ class MultiTracker:
             )
         with one_thread():
             pyramid = Pyramid.of(image)
-            given = {name: self.detectors.begin(name, pyramid, box, time) for name, box in boxes.items()}
+            given = self.detectors.begin_all(boxes, pyramid, time)
             self._learn(*self.detectors.step(pyramid, time, given))
         return self.tracks
 
@@ -188,7 +189,8 @@ class MultiTracker:
         ServiceError
             If it cannot be written.
         """
-        tracks = Tracks(self.forest.seq, self.forest.frame, self.tracks)
+        last = self.tracks
+        tracks = Tracks(self.forest.seq, self.forest.frame, last)
         arrays, metadata = self.forest.state()
         objects: list[Metadata] = []
         for i, (name, detector) in enumerate(self.detectors.detectors.items()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 
 from catstream.box import Box
 from catstream.detection.detector import Detector, Result
@@ -61,6 +62,22 @@ class Detectors:
         except BaseException:
             if is_new:
                 del self.detectors[name]
+            raise
+
+    def begin_all(self, boxes: Mapping[str, Box], frame: Pyramid, time: float = 0.0) -> dict[str, Result]:
+        """Start several objects with their boxes in the next frame, by name; if one is refused, none of them.
+
+        Raises
+        ------
+        BoxError, ObjectError
+            As `begin` does. Nothing changes.
+        """
+        before = dict(self.detectors)
+        self.detectors = {name: copy(each) if name in boxes else each for name, each in before.items()}
+        try:
+            return {name: self.begin(name, frame, box, time) for name, box in boxes.items()}
+        except BaseException:
+            self.detectors = before
             raise
 
     def correct(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:

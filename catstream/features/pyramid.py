@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from threading import Lock
+
 import cv2
 import numpy as np
 
@@ -18,6 +20,8 @@ _MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for 
 class Pyramid:
     """A frame, and the same at a half, a quarter ... of its size, each made when it is first asked for.
 
+    Several threads may cut from it at the same time.
+
     Parameters
     ----------
     image : uint8 (h, w, 3) BGR, or (h, w) grey, which cuts are then, too
@@ -25,7 +29,7 @@ class Pyramid:
 
     def __init__(self, image: np.ndarray) -> None:
         self.image = np.ascontiguousarray(image)
-        self._halves = [self.image]
+        self._halves, self._lock = [self.image], Lock()
 
     @classmethod
     def of(cls, image: np.ndarray) -> Pyramid:
@@ -48,11 +52,12 @@ class Pyramid:
         ((22, 30, 3), 4)
         """
         level = 0
-        while 2 << level <= scale and min(self._halves[level].shape[:2]) > 1:
-            level += 1
-            if level == len(self._halves):
-                self._halves.append(_half(self._halves[-1]))
-        return self._halves[level], 1 << level
+        with self._lock:
+            while 2 << level <= scale and min(self._halves[level].shape[:2]) > 1:
+                level += 1
+                if level == len(self._halves):
+                    self._halves.append(_half(self._halves[-1]))
+            return self._halves[level], 1 << level
 
     def around(self, window: Window, side: int) -> np.ndarray:
         """A patch of `side` x `side` cells around a window and a margin, in which the window is 64 x 64 pixels."""

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
 from catstream.errors import SettingsError
 from catstream.heads import GROUPS
-from catstream.messages import Features, TrainingRows
+from catstream.messages import Features, ObjectFeatures, TrainingRows
 from catstream.settings import Settings
 
 SETTINGS = Settings(coreset={"size": 8})
@@ -20,14 +20,14 @@ SETTINGS = Settings(coreset={"size": 8})
 
 @pytest.fixture
 def grow(rng):
-    """Gives a compressor so many more messages; returns it."""
+    """Inserts a number of messages into a forest, and returns it."""
 
-    def take(compressor, count=1):
-        for seq in range(compressor.seq + 1, compressor.seq + count + 1):
+    def take(forest, count=1):
+        for seq in range(forest.seq + 1, forest.seq + count + 1):
             rows, labels = rng.normal(size=(4, 9)).astype(np.float32), np.float32([1, 0, 0, 0.5])
             training = {group: TrainingRows.labelled(rows, labels) for group in GROUPS}
-            compressor.take(Features(seq, seq - 1, 0.0, None, training))
-        return compressor
+            forest.take(Features(seq, seq - 1, 0.0, {"": ObjectFeatures(None, training)}))
+        return forest
 
     return take
 
@@ -35,9 +35,9 @@ def grow(rng):
 @pytest.fixture
 def kept(grow, tmp_path):
     """A folder of three checkpoints, after 40, 50 and 60 messages; the store has removed the first."""
-    compressor, store = grow(Compressor(SETTINGS), 30), CheckpointStore(tmp_path)
+    forest, store = grow(Forest(SETTINGS), 30), CheckpointStore(tmp_path)
     for _ in range(3):
-        assert store.save(grow(compressor, 10))
+        assert store.save(grow(forest, 10))
     return tmp_path
 
 
@@ -72,8 +72,8 @@ def test_any_flipped_bit_is_detected(kept, rng):
     """What is loaded is the one or the other, and never anything between."""
     path, whole = newest(kept), newest(kept).read_bytes()
     right = {
-        60: Compressor.load(path, SETTINGS).counters(),
-        50: Compressor.load(min(kept.iterdir()), SETTINGS).counters(),
+        60: Forest.load(path, SETTINGS).counters(),
+        50: Forest.load(min(kept.iterdir()), SETTINGS).counters(),
     }
     noticed = 0
     for place in np.concatenate([np.arange(64), rng.integers(0, len(whole), 60)]):
@@ -108,15 +108,15 @@ def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, m
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     before, store = files(kept), CheckpointStore(kept)
-    compressor = grow(store.load(SETTINGS), 5)
+    forest = grow(store.load(SETTINGS), 5)
     with monkeypatch.context() as disk:
         disk.setattr(os, "fsync", full)
-        assert not store.save(compressor)
+        assert not store.save(forest)
     assert store.failing
     assert "No space left on device" in store.trouble
     assert files(kept) == before
     assert CheckpointStore(kept).load(SETTINGS).seq == 60
-    assert store.save(compressor)
+    assert store.save(forest)
     assert not store.failing
     assert not store.trouble
     assert CheckpointStore(kept).load(SETTINGS).seq == 65

@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
 from catstream.errors import ProtocolError
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Summary
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
@@ -17,8 +19,8 @@ from catstream.training.trainer import Trainer
 def sample():
     image = np.random.default_rng(3).integers(0, 256, (160, 200, 3), np.uint8)
     settings = Settings()
-    _, features = Detector(settings).init(image, (60, 40, 50, 60))
-    return Compressor(settings).take(features)
+    _, features = Detector(settings).init(Pyramid.of(image), 1, 0.0, Box(60, 40, 50, 60))
+    return Compressor(settings).take(0, features, 1)
 
 
 @pytest.mark.parametrize("classifier", ["joint", "least-squares", "one-class"])
@@ -65,3 +67,9 @@ def test_a_direction_in_which_the_object_scores_lower_gives_way_to_the_one_betwe
     model = Trainer(Settings(teaching={"classifier": "one-class"})).train(few)
     between = Trainer(Settings(teaching={"classifier": "least-squares"})).train(few)
     np.testing.assert_allclose(model.weights, between.weights, atol=1e-6)  # BLAS need not round the same twice
+
+
+def test_a_model_is_of_the_object_of_its_sample(sample):
+    model = Trainer(Settings()).train(dataclasses.replace(sample, object="anna"))
+    assert model.object == "anna"
+    assert model.weights.tobytes() == Trainer(Settings()).train(sample).weights.tobytes()

@@ -1,0 +1,340 @@
+"""Laws of the forest: a message counts once, in order; a restart changes nothing; objects do not affect one another."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
+
+from catstream import storage
+from catstream.box import Box, Window
+from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
+from catstream.compression.tree import TREES, CoresetTree
+from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.heads import APPEARANCE, EXTENT, HEADS
+from catstream.messages import DetectorState, Features, Motion, ObjectFeatures, Sample, TrainingRows
+from catstream.settings import Settings
+
+WIDTH = 20
+
+
+@pytest.fixture(params=TREES)
+def settings(request: pytest.FixtureRequest) -> Settings:
+    coreset = {"size": 8, "sample_interval": 4, "reduction": request.param}
+    return Settings(coreset=coreset, search={"motion_frames": 10})
+
+
+@pytest.fixture
+def messages(rng) -> Iterator[Features]:
+    """Features of frames without end: two rows of the object, three of the background, one near miss."""
+
+    def stream() -> Iterator[Features]:
+        for frame in range(10_000):
+            rows = rng.normal(size=(6, WIDTH)).astype(np.float32)
+            labels = np.array([1, 1, 0, 0, 0, 0.5], np.float32)
+            weights = np.array([4, 4, 1, 1, 1, 1], np.float32)
+            box = Box(frame, 10, 20, 30) if frame % 5 else None
+            training = {
+                APPEARANCE: TrainingRows(rows, labels, weights),
+                EXTENT: TrainingRows.labelled(rows[:3], labels[:3]),
+            }
+            yield one_object(frame, ObjectFeatures(box, training))
+
+    return stream()
+
+
+def one_object(frame: int, part: ObjectFeatures, name: str = "") -> Features:
+    return Features(frame + 1, frame, frame / 25, {name: part})
+
+
+def changed(message: Features, **changes: object) -> Features:
+    """The message with other fields of its only object."""
+    ((name, part),) = message.objects.items()
+    return dataclasses.replace(message, objects={name: dataclasses.replace(part, **changes)})
+
+
+def take(forest: Forest, messages: Iterator[Features], count: int) -> list[Sample]:
+    return [sample for _ in range(count) for sample in forest.take(next(messages))]
+
+
+def assert_same(sample: Sample, other: Sample) -> None:
+    assert (sample.version, sample.frame) == (other.version, other.frame)
+    assert_array_equal(sample.centres, other.centres)
+    assert sample.trees.keys() == other.trees.keys()
+    for name, summary in sample.trees.items():
+        expected = other.trees[name]
+        assert_array_equal(summary.rows, expected.rows)
+        assert_array_equal(summary.mean, expected.mean)
+        assert (summary.count, summary.levels) == (expected.count, expected.levels)
+
+
+def test_each_row_is_inserted_into_the_tree_of_its_label(settings, messages):
+    forest = Forest(settings)
+    sample = take(forest, messages, 60)[-1]
+    frames = sample.frame + 1
+    rows = {(APPEARANCE, 1.0): 2, (APPEARANCE, 0.0): 3, (APPEARANCE, None): 6, (EXTENT, None): 3}
+    counts = {name: frames * rows[head.group, head.label] for name, head in HEADS.items()}
+    assert {name: tree.count for name, tree in sample.trees.items()} == counts
+
+
+def test_rows_of_the_loss_tree_give_the_loss_of_any_model(settings, messages, rng):
+    """||A [w; b; -1]||^2 is the weighted squared error, and C keeps it within the energy dropped."""
+    forest, seen = Forest(settings), [next(messages) for _ in range(60)]
+    for message in seen:
+        forest.take(message)
+    trained = [message.objects[""].training[APPEARANCE] for message in seen]
+    tree = forest.compressors[""].trees["loss"]
+    kept = np.vstack([*(node.rows for node in tree.nodes), tree.pending]).astype(np.float64)
+    for _ in range(10):
+        model = rng.normal(size=WIDTH + 2)
+        model[-1] = -1
+        loss = sum(float(m.weights @ (m.rows @ model[:-2] + model[-2] - m.labels) ** 2) for m in trained)
+        approximate = float(np.sum((kept @ model) ** 2))
+        assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
+
+
+def test_an_object_that_begins_again_has_new_trees(settings, messages):
+    forest = Forest(settings)
+    take(forest, messages, 20)
+    before = forest.version
+    assert before
+    forest.take(changed(next(messages), begins=True))
+    assert forest.counters()["rows"] == 2 + 3 + 6 + 3, "those of one frame"
+    assert all(sample.version > before for sample in take(forest, messages, 40)), "no version is used twice"
+
+
+def test_trees_may_be_of_another_class(settings, messages):
+    class Other(CoresetTree):
+        pass
+
+    compressor = Compressor(settings, tree=Other)
+    compressor.take(0, next(messages).objects[""], 1)
+    assert {type(tree) for tree in compressor.trees.values()} == {Other}
+
+
+def test_a_message_stored_already_is_ignored(settings, messages):
+    forest, message = Forest(settings), next(messages)
+    forest.take(message)
+    before = forest.counters()
+    assert forest.take(message) == []
+    assert forest.counters() == before
+
+
+def test_a_missing_message_is_an_error_and_is_still_accepted_later(settings, messages):
+    forest, (first, second) = Forest(settings), (next(messages), next(messages))
+    with pytest.raises(ProtocolError, match="features 2 came after 0: 1 are missing"):
+        forest.take(second)
+    forest.take(first)
+    forest.take(second)
+    assert forest.seq == 2
+
+
+def test_rows_of_another_length_are_rejected_and_nothing_is_stored(settings, messages):
+    forest, (first, second) = Forest(settings), (next(messages), next(messages))
+    forest.take(first)
+    before = forest.counters()
+    with pytest.raises(ProtocolError, match="same settings"):
+        forest.take(changed(second, training={EXTENT: TrainingRows.labelled(np.ones((3, WIDTH - 1)), 1)}))
+    assert forest.counters() == before
+    forest.take(second)
+
+
+def test_frames_that_teach_nothing_count_as_seen(settings, messages):
+    forest, message = Forest(settings), next(messages)
+    forest.take(changed(message, training={}))
+    assert (forest.seq, forest.frame, forest.counters()["rows"]) == (1, 0, 0)
+
+
+def test_versions_count_up_and_samples_keep_their_distance(settings, messages):
+    samples = take(Forest(settings), messages, 400)
+    assert [sample.version for sample in samples] == list(range(1, len(samples) + 1))
+    apart = np.diff([sample.frame for sample in samples])
+    assert apart[0] < settings.coreset.sample_interval, "sooner while the trees are small"
+    assert (apart[len(apart) // 2 :] >= settings.coreset.sample_interval).all()
+
+
+def test_a_sample_is_made_only_if_a_leaf_is_new(settings, messages):
+    forest, idle = Forest(settings), 0
+    take(forest, messages, 40)
+    for _ in range(40):
+        idle += len(forest.take(changed(next(messages), training={})))
+    assert idle <= 1
+
+
+def test_centres_are_sent_in_whole_blocks_with_nan_for_absent_objects(settings, messages):
+    samples = take(Forest(settings), messages, 60)
+    for sample in samples:
+        blocks = (sample.frame + 1) // settings.search.motion_frames
+        assert sample.centres.shape == ((settings.search.motion_frames if blocks else 0), 2)
+        for offset, centre in enumerate(sample.centres):
+            frame = (blocks - 1) * settings.search.motion_frames + offset
+            assert_allclose(centre, (frame + 10, 25) if frame % 5 else (np.nan, np.nan))
+
+
+@pytest.mark.parametrize("count", [0, 1, 37])
+def test_a_saved_forest_continues_bit_for_bit(settings, messages, count, tmp_path):
+    forest = Forest(settings)
+    take(forest, messages, count)
+    forest.save(tmp_path / "state")
+    loaded = Forest.load(tmp_path / "state", settings)
+    assert loaded.counters() == forest.counters()
+    assert_equal(dataclasses.asdict(loaded.position), dataclasses.asdict(forest.position))
+    for _ in range(40):
+        message = next(messages)
+        for sample, again in zip(forest.take(message), loaded.take(message), strict=True):
+            assert_same(sample, again)
+
+
+def test_the_last_sample_can_be_had_again_though_the_trees_have_grown(settings, messages, tmp_path):
+    forest, samples = Forest(settings), []
+    assert forest.last_samples == []
+    while len(samples) < 3:
+        samples += take(forest, messages, 1)
+    assert not take(forest, messages, 2)
+    forest.save(tmp_path / "state")
+    assert_same(Forest.load(tmp_path / "state", settings).last_samples[0], samples[-1])
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, messages, moving, rng, tmp_path):
+    motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
+    detector = DetectorState(7, "lost", *(Window(*rng.random(4)) for _ in range(3)), False, 2)
+    if moving:
+        detector = dataclasses.replace(detector, motion=motion, centre=centre, colour_centroid=rng.random(6))
+    forest = Forest(settings)
+    forest.take(changed(next(messages), detector=detector))
+    forest.save(tmp_path / "state")
+    loaded = Forest.load(tmp_path / "state", settings).compressors[""].detector
+    assert_equal(dataclasses.asdict(loaded), dataclasses.asdict(detector))
+
+
+def test_memory_is_flat_between_doublings(settings, messages):
+    forest = Forest(settings)
+    take(forest, messages, 256)
+    small = forest.counters()["bytes"]
+    take(forest, messages, 256 * 15)
+    assert forest.counters()["bytes"] < 2.5 * small
+
+
+@pytest.mark.parametrize("share", [0, 0.2, 0.9])
+def test_an_incomplete_state_is_rejected(settings, messages, share, tmp_path):
+    forest, path = Forest(settings), tmp_path / "state"
+    take(forest, messages, 37)
+    forest.save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ProtocolError, match="use an older copy"):
+        Forest.load(path, settings)
+
+
+@pytest.mark.parametrize(("energy", "level"), [("0x1p9999", 0), ("nan", 0), ("0x1p3", 10**9)])
+def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path):
+    """Its checksum fits: whoever writes one on purpose sees to that."""
+    forest, path = Forest(settings), tmp_path / "state"
+    take(forest, messages, 37)
+    forest.save(path)
+    arrays, metadata = storage.read(path)
+    metadata["objects"][0]["trees"]["object"]["nodes"][0] |= {"level": level, "energy": energy}
+    storage.write(path, arrays, metadata)
+    with pytest.raises(ProtocolError, match="use an older copy"):
+        Forest.load(path, settings)
+
+
+def test_a_tree_is_no_forest(settings, tmp_path):
+    Compressor(settings).trees["object"].save(tmp_path / "tree")
+    with pytest.raises(ServiceError, match="is of kind None, this catstream reads 'forest 1'"):
+        Forest.load(tmp_path / "tree", settings)
+
+
+def test_a_checkpoint_of_another_version_is_rejected_with_one_line(settings, messages, tmp_path):
+    forest, path = Forest(settings), tmp_path / "000000000001.safetensors"
+    take(forest, messages, 37)
+    arrays, metadata = forest.state()
+    storage.write(path, arrays, metadata | {"kind": "compressor 1"})
+    with pytest.raises(ServiceError, match="is of kind 'compressor 1', this catstream reads 'forest 1'") as error:
+        CheckpointStore(tmp_path).load(settings)
+    assert "\n" not in str(error.value)
+
+
+def test_a_state_of_another_coreset_size_is_rejected(settings, messages, tmp_path):
+    forest = Forest(settings)
+    take(forest, messages, 37)
+    forest.save(tmp_path / "state")
+    with pytest.raises(SettingsError, match="same settings"):
+        Forest.load(tmp_path / "state", settings.but({"coreset.size": 16}))
+
+
+def test_a_state_of_another_reduction_is_rejected(settings, messages, tmp_path):
+    forest = Forest(settings)
+    take(forest, messages, 37)
+    forest.save(tmp_path / "state")
+    (other,) = TREES.keys() - {settings.coreset.reduction}
+    with pytest.raises(SettingsError, match=r"holds trees of coreset.reduction=.*same settings"):
+        Forest.load(tmp_path / "state", settings.but({"coreset.reduction": other}))
+
+
+def merged(seq: int, **parts: Features) -> Features:
+    """One message of several objects, by name."""
+    objects = {name: message.objects[""] for name, message in parts.items()}
+    return Features(seq, seq - 1, (seq - 1) / 25, objects)
+
+
+def test_an_object_of_several_is_learned_as_alone(settings, messages):
+    """Only the numbers of its samples differ: all objects share one count."""
+    several, anna, ben = Forest(settings), Forest(settings), Forest(settings)
+    found: dict[str, list[Sample]] = {"anna": [], "ben": []}
+    alone: dict[str, list[Sample]] = {"anna": [], "ben": []}
+    versions = []
+    for seq in range(1, 80):
+        one, two = (dataclasses.replace(next(messages), seq=seq, frame=seq - 1) for _ in range(2))
+        for sample in several.take(merged(seq, anna=one, ben=two)):
+            found[sample.object].append(sample)
+            versions.append(sample.version)
+        alone["anna"] += anna.take(one)
+        alone["ben"] += ben.take(two)
+    assert versions == list(range(1, len(versions) + 1))
+    assert versions[-1] == several.version == several.counters()["version"]
+    for name in found:
+        for sample, other in zip(found[name], alone[name], strict=True):
+            assert_same(dataclasses.replace(sample, version=other.version), other)
+
+
+def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, messages):
+    forest = Forest(settings)
+    forest.take(merged(1, anna=next(messages), ben=next(messages)))
+    kept = forest.compressors["ben"]
+    forest.take(merged(2, ben=next(messages)))
+    assert forest.compressors == {"ben": kept}
+    assert forest.position.objects.keys() == forest.object_counters().keys() == {"ben"}
+    forest.take(merged(3, ben=next(messages), anna=next(messages)))
+    assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3, "those of one frame"
+
+
+def test_rows_of_another_length_of_one_object_leave_the_others_unchanged(settings, messages):
+    forest = Forest(settings)
+    forest.take(merged(1, anna=next(messages), ben=next(messages)))
+    before = forest.object_counters()
+    bad = changed(next(messages), training={EXTENT: TrainingRows.labelled(np.ones((3, WIDTH - 1)), 1)})
+    with pytest.raises(ProtocolError, match="same settings"):
+        forest.take(merged(2, anna=next(messages), ben=bad))
+    assert forest.object_counters() == before
+    assert forest.seq == 1
+
+
+def test_a_saved_forest_of_several_objects_continues_bit_for_bit(settings, messages, tmp_path):
+    forest = Forest(settings)
+    for seq in range(1, 38):
+        forest.take(merged(seq, anna=next(messages), ben=next(messages)))
+    forest.save(tmp_path / "state")
+    loaded = Forest.load(tmp_path / "state", settings)
+    assert list(loaded.compressors) == ["anna", "ben"]
+    for seq in range(38, 70):
+        message = merged(seq, anna=next(messages), ben=next(messages))
+        for sample, again in zip(forest.take(message), loaded.take(message), strict=True):
+            assert_same(sample, again)
+            assert sample.object == again.object

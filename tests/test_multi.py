@@ -1,0 +1,188 @@
+"""Several objects in one process: each is followed as if it were alone, and they come and go."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from catstream import storage
+from catstream.box import Box
+from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError
+from catstream.multi import MultiTracker
+from catstream.tracker import Tracker
+
+STEPS = {"anna": (4, 1), "ben": (-3, 2), "cleo": (0, -4)}  # pixels a frame
+STARTS = {"anna": (40, 30), "ben": (250, 60), "cleo": (150, 180)}
+
+
+def box_of(name, number):
+    (x, y), (dx, dy) = STARTS[name], STEPS[name]
+    return Box(x + dx * number, y + dy * number, 40, 40)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Frames in which three different patches move over noise; they do not touch one another."""
+    rng = np.random.default_rng(4)
+    background = np.kron(rng.integers(60, 200, (24, 32, 3), np.uint8), np.ones((10, 10, 1), np.uint8))
+    patches = {name: np.kron(rng.integers(0, 256, (5, 5, 3), np.uint8), np.ones((8, 8, 1), np.uint8)) for name in STEPS}
+
+    def drawn(number):
+        frame = background.copy()
+        for name, patch in patches.items():
+            x, y, *_ = map(int, box_of(name, number))
+            frame[y : y + 40, x : x + 40] = patch
+        return frame
+
+    return [drawn(number) for number in range(14)]
+
+
+def followed(frames, names):
+    tracker = MultiTracker()
+    tracker.init(frames[0], {name: box_of(name, 0) for name in names})
+    return [tracker.update(frame) for frame in frames[1:]]
+
+
+def without_version(track):
+    """All objects share one count of versions, so only they differ between several objects and one."""
+    return replace(track, model_version=0)
+
+
+def test_every_object_is_followed(frames):
+    for number, tracks in enumerate(followed(frames, STEPS), start=1):
+        assert list(tracks) == list(STEPS)
+        for name, track in tracks.items():
+            assert (track.object, track.seq, track.frame) == (name, number + 1, number)
+            assert track.box.overlap(box_of(name, number)) > 0.6
+
+
+def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames):
+    together = followed(frames, STEPS)
+    for name in STEPS:
+        alone = followed(frames, [name])
+        assert [without_version(tracks[name]) for tracks in together] == [
+            without_version(tracks[name]) for tracks in alone
+        ]
+
+
+def test_one_unnamed_object_is_that_of_a_tracker(frames):
+    tracker, several = Tracker(), MultiTracker()
+    tracker.init(frames[0], box_of("anna", 0))
+    several.init(frames[0], {"": box_of("anna", 0)})
+    for frame in frames[1:]:
+        tracker.update(frame)
+        assert several.update(frame) == {"": tracker.track}
+
+
+#: In which frame an object begins, and in which it is forgotten, if it is.
+_LIFE = st.tuples(st.integers(1, 12), st.none() | st.integers(1, 12)).map(
+    lambda life: (life[0], life[1] if life[1] is None else min(life[0] + life[1], 13))
+)
+
+
+def lived(frames, lives):
+    """The tracks of objects that begin and are forgotten in frames after the first."""
+    tracker, found = MultiTracker(), []
+    tracker.init(frames[0], {"anna": box_of("anna", 0)})
+    for number, frame in enumerate(frames[1:], start=1):
+        for name, (_, end) in lives.items():
+            if number == end:
+                tracker.forget(name)
+        begin = {name: box_of(name, number) for name, (first, _) in lives.items() if number == first}
+        found.append(tracker.update(frame, begin=begin))
+    return found
+
+
+@settings(max_examples=6)
+@given(lives=st.fixed_dictionaries({"ben": _LIFE, "cleo": _LIFE}))
+def test_objects_that_come_and_go_do_not_affect_one_another(frames, lives):
+    together = lived(frames, lives)
+    for number, tracks in enumerate(together, start=1):
+        present = {name for name, (first, end) in lives.items() if first <= number and (end is None or number < end)}
+        assert set(tracks) == {"anna", *present}
+    for name, life in lives.items():
+        alone = lived(frames, {name: life})
+        assert [without_version(tracks[name]) for tracks in together if name in tracks] == [
+            without_version(tracks[name]) for tracks in alone if name in tracks
+        ]
+
+
+@pytest.mark.parametrize(
+    ("begin", "error"),
+    [
+        ({"ben": (250, 60, 40, 40), "cleo": (-500, 0, 10, 10)}, BoxError),
+        ({"anna": (45, 30, 40, 40), "ben": (250, 60, 0, 40)}, BoxError),
+        ({"ben": (250, 60, 40, 40), "no name": (150, 180, 40, 40)}, ObjectError),
+        ({f"object-{i}": (250, 60, 40, 40) for i in range(1000)}, ObjectError),
+    ],
+    ids=["outside", "an old one and an empty one", "a bad name", "too many"],
+)
+def test_if_one_box_of_several_is_refused_nothing_changes(frames, begin, error):
+    tracker, other = MultiTracker({"run.objects_most": 4}), MultiTracker()
+    for each in (tracker, other):
+        each.init(frames[0], {"anna": box_of("anna", 0)})
+    with pytest.raises(error):
+        tracker.update(frames[1], begin=begin)
+    assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
+
+
+def test_an_invalid_init_keeps_the_objects_before(frames):
+    tracker = MultiTracker()
+    tracker.init(frames[0], {"anna": box_of("anna", 0)})
+    for boxes, error in (({}, ObjectError), ({"ben": (1, 1, 0, 0)}, BoxError), ({"anna": "x"}, BoxError)):
+        with pytest.raises(error):
+            tracker.init(frames[1], boxes)
+    with pytest.raises(FrameError):
+        tracker.update(frames[1][:100])
+    assert list(tracker.update(frames[1])) == ["anna"]
+
+
+def test_forget_drops_one_object_and_an_unknown_one_is_an_error(frames):
+    tracker = MultiTracker()
+    with pytest.raises(BoxError, match="call init"):
+        tracker.forget("anna")
+    tracker.init(frames[0], {name: box_of(name, 0) for name in STEPS})
+    tracker.forget("ben")
+    with pytest.raises(ObjectError, match="there is no object 'ben'"):
+        tracker.forget("ben")
+    assert list(tracker.update(frames[1])) == ["anna", "cleo"]
+    for name in ("anna", "cleo"):
+        tracker.forget(name)
+    assert tracker.update(frames[2]) == {}
+    assert tracker.update(frames[3], begin={"ben": box_of("ben", 3)})["ben"].state == "bootstrapping"
+
+
+@pytest.mark.parametrize("after", [1, 6, 11], ids="after {} frames".format)
+def test_saved_objects_continue_bit_for_bit(frames, after, tmp_path):
+    tracker = MultiTracker()
+    tracker.init(frames[0], {name: box_of(name, 0) for name in ("anna", "ben")})
+    for number in range(1, after):
+        tracker.update(frames[number], begin={"cleo": box_of("cleo", number)} if number == 3 else {})
+    tracker.save(tmp_path / "kept")
+    loaded = MultiTracker.load(tmp_path / "kept")
+    assert loaded.tracks == tracker.tracks
+    assert [loaded.update(frame) for frame in frames[after:]] == [tracker.update(frame) for frame in frames[after:]]
+    loaded.forget("anna")
+    assert "anna" not in loaded.update(frames[-1])
+
+
+def test_saved_objects_with_names_are_not_loaded_as_one(frames, tmp_path):
+    tracker = MultiTracker()
+    tracker.init(frames[0], {"anna": box_of("anna", 0)})
+    tracker.save(tmp_path / "kept")
+    with pytest.raises(ObjectError, match=r"MultiTracker\.load"):
+        Tracker.load(tmp_path / "kept")
+
+
+def test_a_damaged_list_of_objects_is_rejected_with_one_line(frames, tmp_path):
+    tracker = MultiTracker()
+    tracker.init(frames[0], {"anna": box_of("anna", 0)})
+    tracker.save(tmp_path / "kept")
+    arrays, metadata = storage.read(tmp_path / "kept")
+    for objects in ([{"name": "ben"}], [{**metadata["objects"][0], "name": "ben"}], 3):
+        storage.write(tmp_path / "kept", arrays, metadata | {"objects": objects})
+        with pytest.raises(ProtocolError, match="is not a saved tracker") as error:
+            MultiTracker.load(tmp_path / "kept")
+        assert "\n" not in str(error.value)
