@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from catstream.adapters import to_supervision
     from catstream.box import Box
     from catstream.errors import CatstreamError
+    from catstream.finding.search import find
+    from catstream.finding.sightings import Sighting
     from catstream.learned import Learned, merge
     from catstream.messages import Track
     from catstream.multi import MultiTracker
@@ -39,11 +41,13 @@ __all__ = [
     "MultiTracker",
     "Pipeline",
     "Settings",
+    "Sighting",
     "Subscription",
     "Track",
     "Tracker",
     "__version__",
     "control",
+    "find",
     "merge",
     "subscribe",
     "summarize",
@@ -61,10 +65,12 @@ _HOMES = {
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "settings",
+    "Sighting": "finding.sightings",
     "Subscription": "subscription",
     "Track": "messages",
     "Tracker": "tracker",
     "control": "steering",
+    "find": "finding.search",
     "merge": "learned",
     "subscribe": "subscription",
     "summarize": "summaries.images",

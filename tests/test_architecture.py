@@ -23,7 +23,7 @@ LEVELS = [
     {"paper"},
     {"detection", "compression", "training", "wire", "video", "adapters", "job"},
     {"learned"},
-    {"multi", "subscription", "steering", "recording", "sinks", "state"},
+    {"multi", "subscription", "steering", "recording", "sinks", "state", "finding"},
     {"tracker", "summaries"},
     {"services", "web"},
     {"pipeline"},

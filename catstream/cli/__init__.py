@@ -22,6 +22,7 @@ INTERRUPTED = 130
 VERBS = {
     "track": "Track an object in a video.",
     "demo": "Track an object in a rendered demo video.",
+    "find": "Find the objects of saved models in videos, folders and images.",
     "evaluate": "Measure accuracy on annotated sequences, also of other trackers.",
     "loadtest": "Run pipelines under load, and measure latency and losses.",
     "watch": "Print the messages of a running pipeline.",

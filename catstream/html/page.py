@@ -34,6 +34,15 @@ svg .grid { stroke: var(--line); }
 .pictures figcaption { font-size: 13px; margin-top: .35rem; line-height: 1.35; font-variant-numeric: tabular-nums; }
 .pictures b { display: block; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; font-weight: 600; }
 .missing { display: grid; place-items: center; aspect-ratio: 4 / 3; border-radius: 6px; background: var(--soft); }
+.timeline { margin: .2rem 0 .9rem; }
+.lane { position: relative; height: 12px; margin: 3px 0; border-radius: 3px; overflow: hidden;
+  background: var(--soft); }
+.lane i { position: absolute; top: 0; bottom: 0; min-width: 3px; border-radius: 2px; background: var(--colour); }
+.ends { display: flex; justify-content: space-between; line-height: 1.2; }
+.legend span { margin-right: 1.2rem; white-space: nowrap; }
+.legend span::before { content: ""; display: inline-block; width: .8em; height: .8em; margin-right: .4em;
+  border-radius: 2px; background: var(--colour); }
+.file { margin: 0; overflow-wrap: anywhere; }
 pre { background: var(--soft); padding: .8rem; border-radius: 6px; overflow-x: auto; }
 """
 

@@ -1,0 +1,266 @@
+"""`catstream find`: find the objects of saved models in videos, folders and images."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+from rich.progress import Progress, ProgressColumn, Task
+from rich.table import Table
+from rich.text import Text
+
+from catstream.cli import INTERRUPTED, interruptible
+from catstream.cli.interrupts import Interrupts
+from catstream.errors import CatstreamError, VideoError
+from catstream.services.options import with_settings
+from catstream.settings import Settings
+
+if TYPE_CHECKING:
+    from catstream.finding.files import File
+    from catstream.finding.log import FileResult, SearchLog
+    from catstream.finding.search import Search
+
+__all__ = ["find"]
+
+_SHOWN = 12  # intervals that are printed
+
+
+class _Sizes(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
+    name = "LOW,HIGH"
+
+    def convert(self, value: object, param: click.Parameter | None, context: click.Context | None) -> object:
+        if isinstance(value, tuple):
+            return value
+        try:
+            low, high = map(float, str(value).split(","))
+        except ValueError:
+            low, high = 0.0, 0.0
+        if not 0 < low <= high < 100:
+            self.fail(
+                f"{value!r} is not two positive numbers, the smaller one first: for example 0.5,2", param, context
+            )
+        return low, high
+
+
+@click.command()
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
+@click.option(
+    "--model",
+    "models",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    required=True,
+    metavar="FILE",
+    help="Model of an object, written by `catstream save`; may be repeated.",
+)
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("found"),
+    show_default=True,
+    help="Folder for the results.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace existing results, and search all files again.")
+@click.option(
+    "--threshold",
+    type=click.FloatRange(0, 2),
+    default=0.5,
+    show_default=True,
+    metavar="N",
+    help="Least score of a sighting.",
+)
+@click.option(
+    "--every",
+    type=click.FloatRange(0, 3600),
+    default=0.2,
+    show_default=True,
+    metavar="SECONDS",
+    help="Time between two frames of a video that are searched; 0 for every frame.",
+)
+@click.option(
+    "--sizes",
+    type=_Sizes(),
+    default=(0.4, 2.5),
+    metavar="LOW,HIGH",
+    help="Smallest and largest size, as multiples of the learned size.  [default: 0.4,2.5]",
+)
+@with_settings
+def find(
+    settings: Settings,
+    paths: tuple[Path, ...],
+    models: tuple[Path, ...],
+    output: Path,
+    overwrite: bool,
+    threshold: float,
+    every: float,
+    sizes: tuple[float, float],
+) -> None:
+    """Find the objects of saved models in videos, folders and images.
+
+    PATH is a video, an image, or a folder, which is searched with all its
+    subfolders. The images of one folder are treated as one sequence.
+
+    A model is learned by tracking: `catstream track --save-model FILE` and
+    `catstream save FILE` write one. All models are searched at once.
+
+    Of a video, one frame in 0.2 seconds is searched, and the frame in which an
+    object appears or disappears is determined between them. Ctrl-C keeps the
+    results so far. The same command then continues where it was; files that
+    were searched to the end are not searched again, unless they have changed.
+
+    \b
+    Writes
+      OUTPUT/report.html     timelines, and pictures of the best sightings
+      OUTPUT/sightings.csv   a row for each sighting: file, object, frame, time, box, score
+      OUTPUT/intervals.csv   a row for each interval: file, object, begin, end
+      OUTPUT/found.json      both, by file
+      OUTPUT/search.ndjson   the log from which a search is continued
+
+    The score is about 1 on the object; a sighting has at least 0.5. If
+    another thing is taken for the object, raise it with --threshold. If the
+    object is missed, lower it, or track the object a little longer first.
+
+    \b
+    EXAMPLES
+      catstream track walk.mp4 --box 120,80,64,48 --save-model anna.model
+      catstream find --model anna.model holiday.mp4
+      catstream find --model anna.model --model ben.model videos/ photos/ --output found
+      catstream find --model anna.model --every 1 --sizes 0.7,1.5 archive/
+      catstream find --model anna.model --threshold 0.7 --output sure videos/
+    """
+    # Imported here so that --help and the other commands start faster.
+    with interruptible():
+        from catstream.finding.files import find_files
+        from catstream.finding.log import SearchLog
+        from catstream.finding.report import write_report
+        from catstream.finding.search import Search, load_models
+        from catstream.finding.tables import write_tables
+
+    search = Search(load_models(models), settings, threshold, every, sizes)
+    files = find_files(paths)
+    interrupts = Interrupts()
+    with SearchLog(output / "search.ndjson", search.description, overwrite=overwrite) as log:
+        interrupts.install()
+        console = Console(stderr=True, soft_wrap=True)
+        try:
+            _search(search, files, log, interrupts, console)
+            interrupted = False
+        except KeyboardInterrupt:
+            interrupted = True
+        with interrupts.deferred():
+            results = list(log.results.values())
+            write_tables(output, results, search.description)
+            report = write_report(output / "report.html", list(search.models), results)
+    _print(results, report)
+    if interrupted:
+        click.echo("stopped: the results so far are kept; the same command continues", err=True)
+        sys.exit(INTERRUPTED)
+    problems = [f"{problem}" for result in results for problem in result.problems]
+    for problem in problems:
+        click.echo(f"catstream: {problem}", err=True)
+    if problems:
+        raise CatstreamError(f"{len(problems)} problems in {len(files)} files: what could be read was searched")
+
+
+def _search(search: Search, files: list[File], log: SearchLog, interrupts: Interrupts, console: Console) -> None:
+    """Search all files that are not complete, and show the progress."""
+    state = _State(len(files))
+    with Progress(_Line(console), console=console, transient=True, refresh_per_second=8) as progress:
+        task = progress.add_task("", state=state)
+        for number, file in enumerate(files):
+            result = log.begin(file)
+            state.begin(number, result)
+            if result.complete:
+                continue
+
+            def opened(_: float, frames: int | None, result: FileResult = result) -> None:
+                log.note(result, frames=frames)
+
+            def damaged(reason: str, result: FileResult = result) -> None:
+                log.note(result, problem=reason)
+
+            try:
+                for step in search.file(file, result.position, opened=opened, damaged=damaged):
+                    with interrupts.deferred():  # a step is in the log as a whole
+                        log.step(result, step)
+                    state.searched += step.time - state.time
+                    state.time = step.time
+                    progress.update(task)
+            except VideoError as error:
+                log.note(result, problem=str(error))
+            log.note(result, complete=True)
+
+
+@dataclass(slots=True)
+class _State:
+    """The state that the progress line shows.
+
+    files     number of files
+    number    of the file that is searched, from 0
+    result    of this file
+    time      of its last step, in seconds
+    searched  seconds of video that were searched by this command
+    """
+
+    files: int
+    number: int = 0
+    result: FileResult | None = None
+    time: float = 0.0
+    searched: float = 0.0
+    started: float = field(default_factory=perf_counter)
+
+    def begin(self, number: int, result: FileResult) -> None:
+        self.number, self.result, self.time = number, result, result.time
+
+
+class _Line(ProgressColumn):
+    """File, frames and sightings on one line: in a narrow terminal those that matter least are left out."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def render(self, task: Task) -> Text:
+        state: _State = task.fields["state"]
+        result = state.result
+        if result is None:
+            return Text("starting")
+        speed = state.searched / max(perf_counter() - state.started, 1e-6)
+        parts = [
+            f"file {state.number + 1}/{state.files}",
+            f"frame {(result.position or 0) + 1}/{result.frames or '?'}",
+            f"{len(result.sightings)} sightings",
+            f"{speed:.1f} x real time",
+            Path(result.file).name,
+        ]
+        while len(line := "  ".join(parts)) >= self._console.width and len(parts) > 2:
+            parts.pop()
+        return Text(line, no_wrap=True, overflow="ellipsis")
+
+
+def _print(results: list[FileResult], report: Path) -> None:
+    """Print the best intervals, and the path of the report."""
+    from catstream.html.timeline import clock
+
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    intervals = sorted((each for result in results for each in result.intervals), key=lambda each: -each.best.score)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for heading in ("object", "file"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("from", "to", "sightings", "score"):
+        table.add_column(heading, justify="right")
+    for each in intervals[:_SHOWN]:
+        times = clock(each.first.time), clock(each.last.time)
+        table.add_row(each.first.object, each.first.file, *times, str(each.count), f"{each.best.score:.2f}")
+    if intervals:
+        console.print(table)
+    if len(intervals) > _SHOWN:
+        console.print(f"and {len(intervals) - _SHOWN} more intervals")
+    if not intervals:
+        console.print("nothing was found")
+    console.print(f"report: {report}", soft_wrap=True)

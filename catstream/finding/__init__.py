@@ -1,0 +1,1 @@
+"""Finds the objects of saved models in videos, folders and images."""
