@@ -17,8 +17,7 @@ from rich.text import Text
 from catstream.cli import INTERRUPTED, interruptible
 from catstream.cli.interrupts import Interrupts
 from catstream.errors import CatstreamError, VideoError
-from catstream.services.options import with_settings
-from catstream.settings import Settings
+from catstream.settings import RunSettings
 
 if TYPE_CHECKING:
     from catstream.finding.files import File
@@ -89,9 +88,9 @@ class _Sizes(click.ParamType):  # type: ignore[type-arg]  # generic since click 
     metavar="LOW,HIGH",
     help="Smallest and largest size, as multiples of the learned size.  [default: 0.4,2.5]",
 )
-@with_settings
+@click.option("--fps", type=float, default=25.0, show_default=True, metavar="N", help="Images of a folder per second.")
+@click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video.")
 def find(
-    settings: Settings,
     paths: tuple[Path, ...],
     models: tuple[Path, ...],
     output: Path,
@@ -99,6 +98,8 @@ def find(
     threshold: float,
     every: float,
     sizes: tuple[float, float],
+    fps: float,
+    skip_damaged: bool,
 ) -> None:
     """Find the objects of saved models in videos, folders and images.
 
@@ -141,7 +142,8 @@ def find(
         from catstream.finding.search import Search, load_models
         from catstream.finding.tables import write_tables
 
-    search = Search(load_models(models), settings, threshold, every, sizes)
+    reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
+    search = Search(load_models(models), reading, threshold, every, sizes)
     files = find_files(paths)
     interrupts = Interrupts()
     with SearchLog(output / "search.ndjson", search.description, overwrite=overwrite) as log:
@@ -160,11 +162,12 @@ def find(
     if interrupted:
         click.echo("stopped: the results so far are kept; the same command continues", err=True)
         sys.exit(INTERRUPTED)
-    problems = [f"{problem}" for result in results for problem in result.problems]
+    problems = [problem for result in results for problem in result.problems]
     for problem in problems:
         click.echo(f"catstream: {problem}", err=True)
     if problems:
-        raise CatstreamError(f"{len(problems)} problems in {len(files)} files: what could be read was searched")
+        counted = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        raise CatstreamError(f"{counted} in {len(files)} files: what could be read was searched")
 
 
 def _search(search: Search, files: list[File], log: SearchLog, interrupts: Interrupts, console: Console) -> None:

@@ -10,10 +10,11 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
-from catstream.box import Window
+from catstream.box import Box, Window
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection, ScoreMap, fitted, non_maximum_suppression
 from catstream.features.cells import Cells
@@ -42,23 +43,31 @@ _SAME_OVERLAP = 0.3  # above which two windows show the same object
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A window that shows an object, and its score: see `Scan`."""
+    """A window that shows an object, the object's box in it, and the score: see `Scan`."""
 
     window: Window
+    box: Box
     score: float
 
 
 @dataclass(frozen=True, slots=True)
 class _Searched:
-    """A model, its measure of likeness, and a window of the learned size."""
+    """A model, its measure of likeness, a window of the learned size, and the settings that it was learned with."""
 
     model: Model
     likeness: Likeness
     window: Window
+    settings: Settings
 
-    def score(self, scores: ScoreMap, row: int, column: int) -> float:
-        """Score of the window at (row, column) of a map of appearance scores."""
-        return min(1.0, float(scores.scores[row, column])) * self.likeness(scores.row(row, column))
+    @classmethod
+    def of(cls, learned: Learned) -> Self:
+        window = Window.around(learned.box, learned.settings.search.context)
+        return cls(learned.model, learned.likeness(), window, learned.settings)
+
+    def seen(self, scores: ScoreMap, row: int, column: int, window: Window) -> Seen:
+        """A window whose features are at (row, column) of a map of appearance scores."""
+        score = min(1.0, float(scores.scores[row, column])) * self.likeness(scores.row(row, column))
+        return Seen(window, window.box(self.settings.search.context), score)
 
 
 class Scan:
@@ -70,7 +79,6 @@ class Scan:
     Parameters
     ----------
     learned : the models
-    settings : of the search and of the extent
     threshold : least score of a sighting
     sizes : smallest and largest size, as multiples of the learned size
     """
@@ -78,17 +86,14 @@ class Scan:
     def __init__(
         self,
         learned: Iterable[Learned],
-        settings: Settings,
         threshold: float = THRESHOLD,
         sizes: tuple[float, float] = SIZES,
     ) -> None:
-        self._settings, self._threshold = settings, threshold
-        self._models: list[_Searched] = []
+        self._threshold = threshold
+        self._models = [_Searched.of(each) for each in learned]
         self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
-        for number, each in enumerate(learned):
-            window = Window.around(each.box, settings.search.context)
-            self._models.append(_Searched(each.model, each.likeness(), window))
-            for entry in _entries(window, sizes):
+        for number, searched in enumerate(self._models):
+            for entry in _entries(searched.window, sizes):
                 self._grid[entry].append(number)
 
     def __call__(self, image: np.ndarray) -> list[list[Seen]]:
@@ -101,7 +106,7 @@ class Scan:
         frame = Pyramid.of(image)
         found = []
         for searched, windows in zip(self._models, self.windows(frame), strict=True):
-            seen = [self._fitted(frame, each, searched) for each in windows]
+            seen = [_fitted(frame, each.window, searched) for each in windows]
             found.append(_suppressed(each for each in seen if each.score >= self._threshold))
         return found
 
@@ -125,16 +130,16 @@ class Scan:
         appearance = cells.respond_above(searched.model.weights, searched.model.bias, least * searched.likeness.share)
         scores = ScoreMap(cells, appearance, (0.0, 0.0), step)
         places = non_maximum_suppression(appearance, _MOST_MAXIMA, WINDOW // 2)
-        found = [Seen(scores.window(*place), searched.score(scores, *place)) for place in places]
+        found = [searched.seen(scores, *place, scores.window(*place)) for place in places]
         return [each for each in found if each.score >= least]
 
-    def _fitted(self, frame: Pyramid, seen: Seen, searched: _Searched) -> Seen:
-        """A window at its best size and aspect ratio; the learned aspect ratio is likelier than others."""
-        size = math.sqrt(seen.window.area / searched.window.area)
-        likely = searched.window.scaled(size).centred(*seen.window.centre)
-        found = fitted(frame, Detection(0.0, seen.window), likely, searched.model, self._settings.extent)
-        scores = ScoreMap.around(frame, found.window, WINDOW, searched.model)
-        return Seen(found.window, searched.score(scores, 0, 0))
+
+def _fitted(frame: Pyramid, window: Window, searched: _Searched) -> Seen:
+    """A window at its best size and aspect ratio; the learned aspect ratio is likelier than others."""
+    size = math.sqrt(window.area / searched.window.area)
+    likely = searched.window.scaled(size).centred(*window.centre)
+    found = fitted(frame, Detection(0.0, window), likely, searched.model, searched.settings.extent)
+    return searched.seen(ScoreMap.around(frame, found.window, WINDOW, searched.model), 0, 0, found.window)
 
 
 def _entries(window: Window, sizes: tuple[float, float]) -> list[tuple[int, int]]:

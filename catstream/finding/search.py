@@ -19,7 +19,7 @@ from catstream.finding.files import File, find_files
 from catstream.finding.scan import SIZES, THRESHOLD, Scan, Seen
 from catstream.finding.sightings import Sighting
 from catstream.learned import Learned
-from catstream.settings import Settings
+from catstream.settings import RunSettings
 from catstream.threads import one_thread
 from catstream.video.frames import Frame
 
@@ -68,14 +68,14 @@ class Search:
     folder is searched. There are as many threads as cores.
 
     models      name of each object -> its model
-    settings    of the search, of the extent, and for reading files
+    settings    for reading files: the frame rate of images, and whether damage is skipped
     threshold   least score of a sighting
     every       seconds of a video between two frames that are searched, 0 for every frame
     sizes       smallest and largest size that is searched, as multiples of the learned size
     """
 
     models: Mapping[str, Learned]
-    settings: Settings = field(default_factory=Settings)
+    settings: RunSettings = field(default_factory=RunSettings)
     threshold: float = THRESHOLD
     every: float = EVERY
     sizes: tuple[float, float] = SIZES
@@ -88,7 +88,8 @@ class Search:
             "threshold": self.threshold,
             "every": self.every,
             "sizes": list(self.sizes),
-            "settings": self.settings.changed(),
+            "image_rate": self.settings.image_rate,
+            "skip_damaged": self.settings.skip_damaged,
         }
 
     def file(
@@ -111,7 +112,7 @@ class Search:
         VideoError
             At damage, after the steps before it.
         """
-        scan = Scan(list(self.models.values()), self.settings, self.threshold, self.sizes)
+        scan = Scan(self.models.values(), self.threshold, self.sizes)
         before: list[list[Seen]] | None = None
         stretches = self._stretches(file, after or 0, opened, damaged)
         with one_thread(opencv=True), closing(stretches), closing(_scanned(scan, stretches)) as scanned:
@@ -140,7 +141,7 @@ class Search:
             opened(rate, frames)
 
         between: list[Frame] = []
-        for frame, image in file.frames(start, self.settings.run, begin, damaged):
+        for frame, image in file.frames(start, self.settings, begin, damaged):
             if frame.number == start or frame.number % interval == 0:
                 yield _Stretch(frame, between, image)
                 between = []
@@ -154,8 +155,7 @@ class Search:
         for frame, found in frames:
             for name, detections in zip(self.models, found, strict=True):
                 for each in detections:
-                    box = each.window.box(self.settings.search.context)
-                    place = str(file.path), frame.number, frame.time, box
+                    place = str(file.path), frame.number, frame.time, each.box
                     sightings.append(Sighting(name, *place, each.score, stretch.image))
                     images.append(frame.image)
         return Step(stretch.frame.number, stretch.frame.time, sightings, images)
@@ -164,11 +164,11 @@ class Search:
 def find(
     models: str | os.PathLike[str] | Learned | Iterable[str | os.PathLike[str] | Learned],
     paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-    settings: Settings | Mapping[str, object] | None = None,
     *,
     threshold: float = THRESHOLD,
     every: float = EVERY,
     sizes: tuple[float, float] = SIZES,
+    skip_damaged: bool = False,
 ) -> Iterator[Sighting]:
     """Find the objects of saved models in videos, folders and images.
 
@@ -178,8 +178,6 @@ def find(
         Files that `catstream save` wrote. An object without a name gets that of its file.
     paths : path, or iterable of paths
         Videos, images, and folders, which are searched with all their subfolders.
-    settings : Settings or mapping of str
-        Those that are not to have their default.
     threshold : float
         Least score of a sighting; the score is about 1 on the object.
     every : float
@@ -187,6 +185,8 @@ def find(
         or disappears is found in any case.
     sizes : two floats
         Smallest and largest size that is searched, as multiples of the size that was learned.
+    skip_damaged : bool
+        Continue after a damaged place in a video.
 
     Yields
     ------
@@ -207,8 +207,7 @@ def find(
     >>> for sighting in find("dahlia.model", "holiday/"):  # doctest: +SKIP
     ...     print(sighting.file, sighting.time, sighting.box, sighting.score)
     """
-    settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
-    search = Search(load_models(_several(models)), settings, threshold, every, sizes)
+    search = Search(load_models(_several(models)), RunSettings(skip_damaged=skip_damaged), threshold, every, sizes)
     files = find_files(_several(paths))
     return _sightings(search, files)
 

@@ -1,0 +1,47 @@
+"""What the tests of the search share: a model of the demo's dahlia, and one of its pagoda."""
+
+from __future__ import annotations
+
+import pytest
+
+from catstream.box import Box
+from catstream.learned import Learned
+from catstream.tracker import Tracker
+from catstream.video.source import open_source
+
+
+@pytest.fixture(scope="session")
+def video(demo_video):
+    """A short demo video."""
+    return demo_video(60)[0]
+
+
+@pytest.fixture(scope="session")
+def model_files(once, video, demo_video):
+    """Files of two models that were learned from the first frames of the video."""
+
+    def learn(folder):
+        for name, box in (("dahlia", demo_video(60)[1][0]), ("pagoda", Box(4, 60, 70, 70))):
+            tracker = Tracker()
+            with open_source(video, part=slice(16)) as frames:
+                for frame in frames:
+                    if frame.number:
+                        tracker.update(frame.image)
+                    else:
+                        tracker.init(frame.image, box)
+            tracker.learned.save(folder / f"{name}.model")
+
+    folder = once("found-models", learn)
+    return [folder / "dahlia.model", folder / "pagoda.model"]
+
+
+@pytest.fixture(scope="session")
+def learned(model_files):
+    return [Learned.load(file) for file in model_files]
+
+
+@pytest.fixture(scope="session")
+def images(video):
+    """The frames of the video."""
+    with open_source(video) as frames:
+        return [frame.image for frame in frames]

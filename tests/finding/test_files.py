@@ -1,0 +1,81 @@
+"""Which files are searched."""
+
+from __future__ import annotations
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from catstream.errors import VideoError
+from catstream.finding.files import File, find_files
+from catstream.settings import RunSettings
+
+
+@pytest.fixture
+def tree(tmp_path, video):
+    """A folder with videos, images and other files."""
+    for place in ("clips/a.mp4", "clips/deep/b.MP4"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(video, tmp_path / place)
+    (tmp_path / "photos").mkdir()
+    for number in (10, 9, 1):
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), np.full((20 + number, 30, 3), number, np.uint8))
+    (tmp_path / "photos" / "notes.txt").write_text("no picture")
+    (tmp_path / ".hidden").mkdir()
+    shutil.copy(video, tmp_path / ".hidden" / "c.mp4")
+    return tmp_path
+
+
+def frames(file, start=0):
+    problems = []
+    found = [
+        (frame.number, name, frame.image.shape)
+        for frame, name in file.frames(start, RunSettings(), lambda *_: None, problems.append)
+    ]
+    return found, problems
+
+
+def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
+    found = find_files([tree, tree / "clips" / "a.mp4"])
+    kinds = [(str(file.path.relative_to(tree)), file.kind) for file in found]
+    assert kinds == [("clips/a.mp4", "video"), ("clips/deep/b.MP4", "video"), ("photos", "images")]
+
+
+def test_images_of_a_folder_come_in_natural_order_and_may_differ_in_size(tree):
+    found, problems = frames(File(tree / "photos", "images"))
+    assert found == [(0, "1.png", (21, 30, 3)), (1, "9.png", (29, 30, 3)), (2, "10.png", (30, 30, 3))]
+    assert not problems
+
+
+def test_an_unreadable_image_is_reported_and_the_others_are_read(tree):
+    (tree / "photos" / "9.png").write_bytes(b"no picture")
+    found, problems = frames(File(tree / "photos", "images"))
+    assert [name for _, name, _ in found] == ["1.png", "10.png"]
+    assert len(problems) == 1
+    assert "9.png" in problems[0]
+
+
+def test_a_single_image_is_one_frame(tree):
+    (file,) = find_files([tree / "photos" / "10.png"])
+    assert frames(file)[0] == [(0, "", (30, 30, 3))]
+
+
+def test_a_changed_file_has_another_signature(tree):
+    for file in find_files([tree]):
+        before = file.signature
+        assert file.signature == before
+    (tree / "photos" / "11.png").write_bytes(b"new")
+    assert file.signature != before
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("none.mp4", "no file or folder"), ("empty", "neither images nor videos"), ("0", "live"), ("rtsp://a/b", "live")],
+)
+def test_what_cannot_be_searched_is_an_error(tmp_path, name, message, monkeypatch):
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(VideoError, match=message):
+        find_files([name])

@@ -1,0 +1,71 @@
+"""The scan of a frame for several models at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from catstream.detection.search import non_maximum_suppression
+from catstream.features.cells import Cells
+from catstream.features.pyramid import Pyramid
+from catstream.finding import scan as scanning
+from catstream.finding.scan import Scan
+
+
+def plain_windows(frame, learned, threshold):
+    """The best windows of one model, with the score of every window computed to the end."""
+    likeness, found = learned.likeness(), []
+    window = scanning.Window.around(learned.box, learned.settings.search.context)
+    for entry in scanning._entries(window, scanning.SIZES):
+        if not scanning._is_searchable(scanning._window(*entry), frame.size):
+            continue
+        image, (across, down) = frame.resized(scanning._window(*entry), averaged=False)
+        cells = Cells.of(image)
+        scores = cells.respond(learned.model.weights, learned.model.bias)
+        for row, column in non_maximum_suppression(scores, 8, 4):
+            score = min(1.0, float(scores[row, column])) * likeness(cells.row(row, column))
+            if score >= threshold:
+                found.append((score, (column * across, row * down, 8 * across, 8 * down)))
+    return sorted(found, reverse=True)
+
+
+@pytest.mark.parametrize("number", [0, 20, 40, 59])
+@pytest.mark.parametrize("threshold", [0.2, 0.5])
+def test_models_together_find_the_best_windows_of_each_models_plain_scan(learned, images, number, threshold):
+    frame = Pyramid.of(images[number])
+    for each, found in zip(learned, Scan(learned, threshold).windows(frame), strict=True):
+        plain = plain_windows(frame, each, 0.7 * threshold)
+        assert len(found) <= len(plain)
+        if plain:
+            assert found[0].score == pytest.approx(plain[0][0], abs=1e-4)
+            np.testing.assert_allclose(found[0].window, plain[0][1], atol=1e-6)
+        assert all(any(np.allclose(one.window, window) for _, window in plain) for one in found)
+
+
+def test_the_object_is_found_at_its_box(learned, images, demo_video):
+    for number in (20, 40, 59):
+        dahlia, _ = Scan(learned)(images[number])
+        assert dahlia[0].box.overlap(demo_video(60)[1][number]) > 0.6
+        assert dahlia[0].score > 0.7
+
+
+def test_every_sighting_reaches_the_threshold_and_overlaps_no_better_one(learned, images):
+    for found in Scan(learned, 0.1)(images[30]):
+        assert [each.score for each in found] == sorted((each.score for each in found), reverse=True)
+        assert all(each.score >= 0.1 for each in found)
+        assert all(a.window.overlap(b.window) < 0.3 for k, a in enumerate(found) for b in found[:k])
+
+
+def test_models_of_one_size_and_shape_share_the_cells(learned):
+    together, alone = Scan([learned[0], learned[0]]), Scan(learned[:1])
+    assert together._grid.keys() == alone._grid.keys()
+
+
+def test_a_frame_without_the_object_has_no_sighting(learned, rng):
+    noise = rng.integers(0, 256, (240, 320, 3), np.uint8)
+    grey = np.full((240, 320, 3), 128, np.uint8)
+    assert Scan(learned)(noise) == Scan(learned)(grey) == [[], []]
+
+
+def test_a_frame_smaller_than_a_window_has_no_sighting(learned):
+    assert Scan(learned)(np.zeros((9, 12, 3), np.uint8)) == [[], []]

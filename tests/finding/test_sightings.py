@@ -1,0 +1,57 @@
+"""Sightings that follow one another are an interval."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.box import Box
+from catstream.finding.sightings import Linker, Sighting
+
+
+def sighting(time, x=0.0, size=40.0, name="anna", score=0.8):
+    return Sighting(name, "walk.mp4", round(25 * time), time, Box(x, 50.0, size, size), score)
+
+
+def test_an_object_that_moves_is_one_interval():
+    linker = Linker()
+    for step in range(20):
+        linker.add([sighting(0.2 * step, x=15.0 * step, score=0.5 + step % 7 / 10)])
+    (interval,) = linker.intervals
+    assert (interval.first.time, interval.last.time, interval.count) == (0, 0.2 * 19, 20)
+    assert interval.best.score == 1.1
+
+
+def test_a_gap_a_jump_and_a_change_of_size_each_begin_an_interval():
+    linker = Linker()
+    linker.add([sighting(0.0)])
+    linker.add([sighting(0.2, x=300.0)])
+    linker.add([sighting(0.4, size=80.0)])
+    linker.add([sighting(1.2)])
+    linker.add([sighting(2.5)])
+    assert [interval.count for interval in linker.intervals] == [1, 1, 1, 1, 1]
+
+
+def test_two_in_one_frame_are_two_intervals_and_each_goes_on_with_the_nearest():
+    linker = Linker()
+    for step in range(5):
+        linker.add([sighting(0.2 * step, x=2.0 * step), sighting(0.2 * step, x=60.0 - 2 * step)])
+    assert [interval.last.box.x for interval in linker.intervals] == [8.0, 52.0]
+
+
+times = st.lists(st.floats(0, 30), min_size=1, max_size=40)
+
+
+@given(st.data(), times)
+def test_every_sighting_is_in_one_interval_of_its_object(data, moments):
+    linker = Linker()
+    made = []
+    for time in sorted(moments):
+        name = data.draw(st.sampled_from(["anna", "ben"]))
+        made.append(sighting(time, x=data.draw(st.floats(0, 500)), name=name, score=data.draw(st.floats(0.5, 1))))
+        (interval,) = linker.add([made[-1]])
+        assert interval.last is made[-1]
+        assert interval.first.object == name
+        assert interval.best.score >= made[-1].score
+    assert sum(interval.count for interval in linker.intervals) == len(made)
+    assert all(interval.first.time <= interval.best.time <= interval.last.time for interval in linker.intervals)
