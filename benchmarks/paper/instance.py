@@ -1,0 +1,455 @@
+"""Object instance recognition: a model that was learned in one video finds the object in others (paper, section
+"Object Instance Recognition").
+
+Each object is learned by tracking it through the first third of its sequence. It is then searched in frames of the rest
+of this sequence, and in frames of all other sequences, where every sighting is a false alarm. The first frame alone is
+what the other methods know: multi-scale template matching, ORB features with RANSAC, and a model of ours.
+
+In the paper's setting, 76 frames of the object before a plain background are learned, and it is searched before other
+backgrounds, in other lights. The paper shows pictures of this, and no figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import islice
+from pathlib import Path
+from time import perf_counter
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
+
+from groups import CHECK
+from sequences import scratch, sequences
+from table import Table, command, publish
+
+from catstream.box import Box
+from catstream.detection.search import non_maximum_suppression
+from catstream.evaluation.datasets import Sequence
+from catstream.features.cells import Cells
+from catstream.features.pyramid import Pyramid
+from catstream.finding.files import File
+from catstream.finding.scan import Scan, Seen
+from catstream.finding.search import Search
+from catstream.learned import Learned
+from catstream.services.start import SPAWN
+from catstream.threads import one_thread
+from catstream.tracker import Tracker
+from catstream.video import demo
+
+Found = list[tuple[float, Box]]
+Finder = Callable[[np.ndarray], Found]
+
+METHODS = ("catstream, first third", "catstream, first frame", "template matching", "ORB and RANSAC")
+_LEAST = 0.2  # score of a sighting of ours: low, so that precision is known at every recall
+_FACTORS = tuple(1.25**k for k in range(-4, 5))  # sizes at which a template is matched
+_MOST = 4  # sightings of one object in a frame
+_SAME_VIDEO = 4.0  # grey levels by which the first frames of two sequences of one video differ at most
+_PLAIN, _OTHERS = 76, 120  # frames of the paper's setting: learned, and searched with and without the object
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The sightings in one frame: score, and overlap with the object; `present` if the object is there."""
+
+    present: bool
+    sightings: list[tuple[float, float]]
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    found = sequences(options)
+    answers: dict[str, dict[str, list[Answer]]] = {}
+    milliseconds: dict[str, list[float]] = {method: [] for method in METHODS}
+    with ProcessPoolExecutor(options.jobs, mp_context=SPAWN) as pool:
+        tasks = [partial(searched, number, options) for number in range(len(found))]
+        for sequence, (result, spent) in zip(found, (map if options.quick else pool.map)(_call, tasks), strict=True):
+            answers[sequence.name] = result
+            for method in METHODS:
+                milliseconds[method].append(spent[method])
+            print(sequence.name, file=sys.stderr)
+    for title, names in (("all", answers), ("check", [name for name in answers if name in CHECK])):
+        if names:
+            yield _summary(title, {name: answers[name] for name in names}, milliseconds)
+    yield _each(answers)
+    yield _paper(found, *((8, 4) if options.quick else (_PLAIN, _OTHERS)))
+    yield _scans(options, found)
+
+
+def searched(number: int, options: argparse.Namespace) -> tuple[dict[str, list[Answer]], dict[str, float]]:
+    """The answers of each method for the object of a sequence, and its milliseconds a frame."""
+    found = sequences(options)
+    sequence = found[number]
+    store = options.output and options.output / f"{sequence.name}.json"
+    if store and store.exists():
+        result, spent = json.loads(store.read_text())
+        return {name: [Answer(*each) for each in answers] for name, answers in result.items()}, spent
+    with one_thread(opencv=True):
+        finders = finders_of(sequence)
+        own = _spread(sequence, len(sequence) // 3, options.own)
+        tasks = [(image, box) for image, box in _frames(sequence, own)]
+        for other in found:
+            if other is not sequence and not _is_same_video(sequence, other):
+                tasks += [(image, None) for image, _ in _frames(other, _spread(other, 0, options.others))]
+        result, spent = _answers(finders, tasks)
+    if store:
+        store.parent.mkdir(parents=True, exist_ok=True)
+        plain = {name: [(each.present, each.sightings) for each in answers] for name, answers in result.items()}
+        store.write_text(json.dumps([plain, spent]))
+    return result, spent
+
+
+def finders_of(sequence: Sequence) -> dict[str, Finder]:
+    """The methods, each with what it may know of the object."""
+    first = next(iter(sequence.frames()))
+    box = Box(*sequence.boxes[0].tolist())
+    learned = learn(islice(sequence.frames(), max(2, len(sequence) // 3)), box)
+    return dict(zip(METHODS, [ours(learned), ours(learn([first], box)), *others(first, box)], strict=True))
+
+
+def others(first: np.ndarray, box: Box) -> list[Finder]:
+    """The methods that know one image of the object."""
+    return [partial(match_template, cut(first, box)), OrbMatcher(cut(first, box))]
+
+
+def learn(images: Iterator[np.ndarray] | list[np.ndarray], box: Box) -> Learned:
+    tracker = Tracker()
+    for number, image in enumerate(images):
+        if number:
+            tracker.update(image)
+        else:
+            tracker.init(image, box)
+    return tracker.learned
+
+
+def ours(learned: Learned) -> Finder:
+    scan = Scan([learned], _LEAST)
+    return lambda image: [(each.score, each.box) for each in scan(image)[0][:_MOST]]
+
+
+def cut(image: np.ndarray, box: Box) -> np.ndarray:
+    height, width = image.shape[:2]
+    left, top = min(max(0, int(box.x)), width - 2), min(max(0, int(box.y)), height - 2)
+    return image[top : max(top + 2, int(box.y + box.h)), left : max(left + 2, int(box.x + box.w))]
+
+
+def match_template(template: np.ndarray, image: np.ndarray) -> Found:
+    """The places with the highest normalised correlation with a template, of any size."""
+    found: Found = []
+    for factor in _FACTORS:
+        size = max(4, round(template.shape[1] * factor)), max(4, round(template.shape[0] * factor))
+        if size[0] > image.shape[1] or size[1] > image.shape[0]:
+            continue
+        scores = cv2.matchTemplate(
+            image, cv2.resize(template, size, interpolation=cv2.INTER_AREA), cv2.TM_CCOEFF_NORMED
+        )
+        scores[~np.isfinite(scores)] = -1.0  # a uniform window has no correlation
+        for row, column in non_maximum_suppression(scores, _MOST, min(size) // 2):
+            found.append((float(scores[row, column]), Box(column, row, *size)))
+    return _apart(found)
+
+
+class OrbMatcher:
+    """Matches of ORB features that agree on a similarity transform; the score is their number."""
+
+    _SIDE = 200  # of the longer side of the object, to which it is enlarged: ORB finds little in a small image
+
+    def __init__(self, template: np.ndarray) -> None:
+        self._orb = cv2.ORB_create(nfeatures=1000, edgeThreshold=15, patchSize=31)
+        self._scale = max(1.0, self._SIDE / max(template.shape[:2]))
+        large = cv2.resize(template, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_CUBIC)
+        self._size = large.shape[1], large.shape[0]
+        self._points, self._features = self._orb.detectAndCompute(large, None)
+        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+
+    def __call__(self, image: np.ndarray) -> Found:
+        large = cv2.resize(image, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_CUBIC)
+        if self._features is None or len(self._features) < 3 or large.shape[0] * large.shape[1] > 20_000_000:
+            return []
+        points, features = self._orb.detectAndCompute(large, None)
+        if features is None or len(features) < 2:
+            return []
+        pairs = [pair for pair in self._matcher.knnMatch(self._features, features, k=2) if len(pair) == 2]
+        good = [first for first, second in pairs if first.distance < 0.75 * second.distance]
+        if len(good) < 3:
+            return []
+        ours = np.float32([self._points[match.queryIdx].pt for match in good])
+        theirs = np.float32([points[match.trainIdx].pt for match in good])
+        cv2.setRNGSeed(0)
+        matrix, inliers = cv2.estimateAffinePartial2D(ours, theirs, method=cv2.RANSAC, ransacReprojThreshold=5.0)
+        if matrix is None:
+            return []
+        (w, h), corners = self._size, np.array([(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 1)])
+        placed = corners * (w, h, 1) @ matrix.T / self._scale
+        low, high = placed.min(axis=0), placed.max(axis=0)
+        return [(float(inliers.sum()), Box(*map(float, (*low, *np.maximum(high - low, 1e-3)))))]
+
+
+def _answers(
+    finders: dict[str, Finder], tasks: list[tuple[np.ndarray, Box | None]]
+) -> tuple[dict[str, list[Answer]], dict[str, float]]:
+    result: dict[str, list[Answer]] = {}
+    spent: dict[str, float] = {}
+    for method, finder in finders.items():
+        started = perf_counter()
+        found = [finder(image) for image, _ in tasks]
+        spent[method] = 1000 * (perf_counter() - started) / len(tasks)
+        result[method] = [
+            Answer(box is not None, [(score, box.overlap(where) if box else 0.0) for score, where in sightings])
+            for sightings, (_, box) in zip(found, tasks, strict=True)
+        ]
+    return result, spent
+
+
+def marked(answers: list[Answer]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Score of each sighting, whether it is the object (overlap of at least 0.5, once a frame), and frames with it."""
+    scores, right = [], []
+    for answer in answers:
+        hit = False
+        for score, overlap in sorted(answer.sightings, reverse=True):
+            is_right = answer.present and overlap >= 0.5 and not hit
+            hit |= is_right
+            scores.append(score)
+            right.append(is_right)
+    return np.array(scores), np.array(right, bool), sum(answer.present for answer in answers)
+
+
+def average_precision(answers: list[Answer]) -> float:
+    """Mean of the precision at each right sighting, 0 at those that are missing."""
+    scores, right, present = marked(answers)
+    right = right[np.argsort(-scores, kind="stable")]
+    precision = np.cumsum(right) / np.arange(1, len(right) + 1)
+    return float((precision * right).sum() / max(present, 1))
+
+
+def recall_at(answers: list[Answer], rate: float) -> float:
+    """Share of the frames with the object in which it is found, if there is a false alarm in `rate` of all frames."""
+    scores, right, present = marked(answers)
+    wrong = np.sort(scores[~right])[::-1]
+    allowed = int(rate * len(answers))
+    threshold = wrong[allowed] if allowed < len(wrong) else -np.inf
+    return float((scores[right] > threshold).sum() / max(present, 1))
+
+
+def _summary(title: str, answers: dict[str, dict[str, list[Answer]]], milliseconds: dict[str, list[float]]) -> Table:
+    rows = []
+    for method in METHODS:
+        pooled = [answer for each in answers.values() for answer in each[method]]
+        precision = float(np.mean([average_precision(each[method]) for each in answers.values()]))
+        rows.append(
+            (method, precision, recall_at(pooled, 0.01), recall_at(pooled, 0.001), float(np.mean(milliseconds[method])))
+        )
+    present = sum(answer.present for answer in pooled)
+    note = f"{len(answers)} objects; {present} frames with the object, {len(pooled) - present} without; one core"
+    columns = ("method", "mean AP", "recall at 1 false alarm in 100", "in 1,000 frames", "ms a frame")
+    return Table(f"Found again: {title} sequences", columns, rows, note)
+
+
+def _each(answers: dict[str, dict[str, list[Answer]]]) -> Table:
+    rows = [(name, *(average_precision(each[method]) for method in METHODS)) for name, each in answers.items()]
+    return Table("Average precision of each object", ("object", *METHODS), rows)
+
+
+def _paper(found: list[Sequence], learning: int, searched: int) -> Table:
+    """Learned before a plain background, searched before others and in other lights."""
+    rng = np.random.default_rng(0)
+    image, box = next(demo.render(1))
+    assert box is not None
+    flower = cut(image, box)
+    plain = [np.full((240, 320, 3), 190, np.uint8) for _ in range(learning)]
+    shown = [
+        _painted(each, flower, rng, 20, (0.9, 1.1), (0.95, 1.05), centre)
+        for each, centre in zip(plain, _path(learning), strict=True)
+    ]
+    backgrounds = [cv2.resize(next(iter(sequence.frames(len(sequence) // 2))), (320, 240)) for sequence in found]
+    tasks: list[tuple[np.ndarray, Box | None]] = []
+    for number in range(searched):
+        background = backgrounds[number % len(backgrounds)]
+        tasks.append((background, None))
+        tasks.append(_painted(background, flower, rng, 40, (0.6, 1.6), (0.5, 1.4)))
+    learned = learn([each for each, _ in shown], shown[0][1])
+    first = learn([shown[0][0]], shown[0][1])
+    finders = dict(zip(METHODS, [ours(learned), ours(first), *others(*shown[0])], strict=True))
+    result, _ = _answers(finders, tasks)
+    rows = [
+        (name, average_precision(each), recall_at(each, 0.01), recall_at(each, 0.0)) for name, each in result.items()
+    ]
+    columns = ("method", "AP", "recall at 1 false alarm in 100 frames", "without a false alarm")
+    note = f"{learning} frames before a plain background; {searched} frames with and {searched} without the object"
+    return Table("The paper's setting, rendered", columns, rows, note)
+
+
+def _path(frames: int) -> list[tuple[float, float]]:
+    """Centres of the object while it is learned."""
+    turns = np.linspace(0, 2 * np.pi, frames)
+    return [(160 + 60 * np.sin(turn), 120 + 40 * np.sin(2 * turn)) for turn in turns.tolist()]
+
+
+def _painted(
+    background: np.ndarray,
+    flower: np.ndarray,
+    rng: np.random.Generator,
+    degrees: float,
+    sizes: tuple[float, float],
+    lights: tuple[float, float],
+    centre: tuple[float, float] | None = None,
+) -> tuple[np.ndarray, Box]:
+    """A background with the round object, turned and scaled, and all of it in another light."""
+    height, width = background.shape[:2]
+    side = 64 * float(np.exp(rng.uniform(*np.log(sizes))))
+    x, y = centre or (rng.uniform(side / 2, width - side / 2), rng.uniform(side / 2, height - side / 2))
+    rows, columns = flower.shape[:2]
+    matrix = cv2.getRotationMatrix2D(
+        (columns / 2, rows / 2), float(rng.uniform(-degrees, degrees)), side / max(rows, columns)
+    )
+    matrix[:, 2] += np.array([x - columns / 2, y - rows / 2])
+    disc = cv2.ellipse(
+        np.zeros((rows, columns), np.float32),
+        (columns // 2, rows // 2),
+        (int(columns * 0.47), int(rows * 0.47)),
+        0,
+        0,
+        360,
+        1.0,
+        -1,
+    )
+    share = cv2.warpAffine(cv2.GaussianBlur(disc, (0, 0), 1.0), matrix, (width, height))[..., None]
+    placed = cv2.warpAffine(flower, matrix, (width, height))
+    image = (share * placed + (1 - share) * background) * rng.uniform(*lights)
+    noisy = image + rng.normal(scale=3.0, size=image.shape)
+    return noisy.clip(0, 255).astype(np.uint8), Box(x - side / 2, y - side / 2, side, side)
+
+
+def _scans(options: argparse.Namespace, found: list[Sequence]) -> Table:
+    """Models together against each model's plain scan, and the search of a video against its duration."""
+    picked = [sequence for sequence in found if sequence.name not in CHECK]
+    picked = picked[:: max(1, len(picked) // 10)][:10]
+    learned = [learn([next(iter(each.frames()))], Box(*each.boxes[0].tolist())) for each in picked]
+    frames = [image for image, _ in demo.render(2 if options.quick else 300)]
+    rows = []
+    for count in (1, 3) if options.quick else (1, 3, 10):
+        models = [learned[number % len(learned)] for number in range(count)]
+        sample = [Pyramid(image) for image in frames[::30]]
+        with one_thread(opencv=True):
+            together, seconds = _timed(Scan(models), sample)
+            with patch.object(Cells, "respond_above", _every_window):
+                alone = [_timed(Scan([model]), sample) for model in models]
+        plain = sum(spent for _, spent in alone)
+        pairs = zip(zip(*together, strict=True), (found for found, _ in alone), strict=True)
+        same = sum(_agree(one, other[0]) for ours, theirs in pairs for one, other in zip(ours, theirs, strict=True))
+        each = [1000 * spent / len(sample) for spent in (plain, seconds)]
+        agree = f"{same} of {count * len(sample)}"
+        rows.append((count, *each, plain / seconds, agree, _speed(models, frames)))
+    columns = (
+        "models",
+        "plain scan, ms a frame",
+        "together",
+        "ratio",
+        "the same best window",
+        "x real time, all cores",
+    )
+    note = "640x480 pixels; the search of a video of 25 frames/s takes one frame in 0.2 seconds"
+    return Table("Scans", columns, rows, note)
+
+
+def _timed(scan: Scan, frames: list[Pyramid]) -> tuple[list[list[list[Seen]]], float]:
+    """The windows that a scan finds in each frame, and its seconds."""
+    started = perf_counter()
+    found = [scan.windows(frame) for frame in frames]
+    return found, perf_counter() - started
+
+
+def _every_window(cells: Cells, weights: np.ndarray, bias: float, least: float) -> np.ndarray:
+    """Replaces `Cells.respond_above`: the score of every window is computed to the end."""
+    scores = cells.respond(weights, bias)
+    return np.where(scores >= least, scores, -np.inf)
+
+
+def _agree(found: list[Seen], plain: list[Seen]) -> bool:
+    """Whether two scans have the same best window, or both none."""
+    if not found or not plain:
+        return found == plain
+    return bool(np.allclose(found[0].window, plain[0].window)) and abs(found[0].score - plain[0].score) < 1e-4
+
+
+def _speed(models: list[Learned], frames: list[np.ndarray]) -> float:
+    """Duration of a video divided by the time of its search."""
+    from catstream.video.writer import VideoWriter
+
+    path = scratch() / "speed.mp4"
+    if not path.exists():
+        with VideoWriter(path, 25, frames[0].shape[1::-1]) as video:
+            for frame in frames:
+                video.write(frame)
+    search = Search({str(number): model for number, model in enumerate(models)})
+    started = perf_counter()
+    for _ in search.file(File(path, "video")):
+        pass
+    return len(frames) / 25 / (perf_counter() - started)
+
+
+def _apart(found: Found) -> Found:
+    """The best sightings that overlap no better one."""
+    kept: Found = []
+    for score, box in sorted(found, key=lambda each: -each[0]):
+        if len(kept) < _MOST and all(box.overlap(other) < 0.3 for _, other in kept):
+            kept.append((score, box))
+    return kept
+
+
+def _spread(sequence: Sequence, begin: int, count: int) -> tuple[int, ...]:
+    """Numbers of `count` frames at equal distances, from `begin` on."""
+    return tuple(sorted({*np.linspace(begin, len(sequence) - 1, count).round().astype(int).tolist()}))
+
+
+def _frames(sequence: Sequence, numbers: tuple[int, ...]) -> list[tuple[np.ndarray, Box | None]]:
+    """Some frames of a sequence, and the box of the object in each."""
+    boxes = [Box(*sequence.boxes[number].tolist()) for number in numbers]
+    return [
+        (image, box if np.isfinite(box).all() else None)
+        for image, box in zip(_images(sequence.path, sequence.begin, numbers), boxes, strict=True)
+    ]
+
+
+@lru_cache(maxsize=128)
+def _images(path: Path, begin: int, numbers: tuple[int, ...]) -> list[np.ndarray]:
+    from catstream.video.source import open_source
+
+    wanted = {begin + number for number in numbers}
+    with open_source(path) as source:
+        return [frame.image for frame in islice(source, begin + max(numbers) + 1) if frame.number in wanted]
+
+
+def _is_same_video(one: Sequence, other: Sequence) -> bool:
+    """Whether two sequences are of one video: then the object of one is in the other."""
+    first, second = (_images(each.path, each.begin, (0,))[0] for each in (one, other))
+    return first.shape == second.shape and float(cv2.absdiff(first, second).mean()) < _SAME_VIDEO
+
+
+def _call(
+    task: Callable[[], tuple[dict[str, list[Answer]], dict[str, float]]],
+) -> tuple[dict[str, list[Answer]], dict[str, float]]:
+    return task()
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument(
+        "--own", type=int, default=20, help="frames of the rest of each sequence (default: %(default)s)"
+    )
+    parser.add_argument("--others", type=int, default=4, help="frames of each other sequence (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes (default: %(default)s)")
+    parser.add_argument(
+        "--output", type=Path, help="folder for the answers; objects that are complete are not repeated"
+    )
+    options = parser.parse_args()
+    publish(figures(options), options)
