@@ -128,7 +128,7 @@ def learn(images: Iterator[np.ndarray] | list[np.ndarray], box: Box) -> Learned:
             tracker.update(image)
         else:
             tracker.init(image, box)
-    return tracker.learned
+    return tracker.learned()
 
 
 def ours(learned: Learned) -> Finder:

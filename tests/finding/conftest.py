@@ -29,7 +29,7 @@ def model_files(once, video, demo_video):
                         tracker.update(frame.image)
                     else:
                         tracker.init(frame.image, box)
-            tracker.learned.save(folder / f"{name}.model")
+            tracker.learned().save(folder / f"{name}.model")
 
     folder = once("found-models", learn)
     return [folder / "dahlia.model", folder / "pagoda.model"]
