@@ -22,7 +22,7 @@ from catstream.video.preview import jpeg
 __all__ = ["FileResult", "SearchLog"]
 
 _KIND = "catstream find 1"  # and the version of the lines
-_PICTURE = 200  # longer side of a picture in pixels
+_PICTURE = 240  # side of a picture in pixels
 _SURROUNDINGS = 1.7  # side of a picture, as a multiple of the longer side of the object's box
 
 
@@ -191,10 +191,9 @@ def _sighting(file: str, values: Sequence[Any]) -> Sighting:
 
 
 def _picture(image: np.ndarray, box: Box) -> bytes:
-    """A small JPEG of an object with some of its surroundings."""
+    """A small square JPEG of an object with some of its surroundings."""
     height, width = image.shape[:2]
-    side = max(box.w, box.h) * _SURROUNDINGS
-    (x, y), half = box.centre, max(side / 2, 8)
-    left, top = max(0, int(x - half)), max(0, int(y - half))
-    right, bottom = min(width, round(x + half)), min(height, round(y + half))
-    return jpeg(image[top : max(bottom, top + 1), left : max(right, left + 1)], _PICTURE)
+    side = round(np.clip(max(box.w, box.h) * _SURROUNDINGS, 16, min(width, height)))
+    left, top = (round(centre - side / 2) for centre in box.centre)
+    left, top = int(np.clip(left, 0, width - side)), int(np.clip(top, 0, height - side))
+    return jpeg(image[top : top + side, left : left + side], _PICTURE)

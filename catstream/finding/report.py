@@ -8,10 +8,11 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
+from catstream.colours import Colours
 from catstream.finding.log import FileResult
 from catstream.finding.sightings import Interval
 from catstream.html.page import table, write_page
-from catstream.html.timeline import Bar, clock, lane_colours, legend, timeline
+from catstream.html.timeline import Bar, clock, legend, timeline
 
 __all__ = ["write_report"]
 
@@ -31,7 +32,8 @@ def write_report(path: Path, objects: Sequence[str], results: Iterable[FileResul
     names = _short_names([result.file for result in results])
     found = [result for result in results if result.intervals]
     shown = sorted(found, key=lambda result: -len(result.sightings))[:_TIMELINES]
-    colours = lane_colours(objects)
+    palette = Colours()
+    colours = {name: palette.of(name) for name in objects}
     body = [
         "<h1>Found objects</h1>",
         _about(objects, results),
@@ -68,7 +70,7 @@ def _summary(objects: Sequence[str], results: list[FileResult]) -> str:
         files = len({each.first.file for each in intervals})
         shown = "<small>-</small>" if best is None else f"{best:.2f}"
         rows.append([escape(name), files, len(intervals), clock(seconds), shown])
-    return table(("object", "files", "intervals", "time seen", "best score"), rows)
+    return table(("object", "files", "intervals", "seen", "best"), rows)
 
 
 def _sheet(name: str, results: list[FileResult], names: dict[str, str]) -> list[str]:
@@ -79,7 +81,7 @@ def _sheet(name: str, results: list[FileResult], names: dict[str, str]) -> list[
         return []
     more = f" <small>{len(best)} of {len(intervals)} intervals</small>" if len(intervals) > len(best) else ""
     figures = "\n".join(_figure(each, names) for each in best)
-    return [f"<h2>{escape(name)}{more}</h2>", f'<div class="sheet">{figures}</div>']
+    return [f"<h2>{escape(name)}{more}</h2>", f'<div class="pictures">{figures}</div>']
 
 
 def _figure(interval: Interval, names: dict[str, str]) -> str:
@@ -88,8 +90,8 @@ def _figure(interval: Interval, names: dict[str, str]) -> str:
     source = f"data:image/jpeg;base64,{base64.b64encode(interval.picture).decode('ascii')}"
     return (
         f'<figure><img alt="{escape(best.object)} in {escape(file)}" src="{source}"><figcaption>'
-        f'<span title="{escape(best.file)}">{escape(file)}</span>'
-        f"<span>{escape(place)} &middot; <b>{best.score:.2f}</b></span></figcaption></figure>"
+        f'<b title="{escape(best.file)}">{escape(file)}</b>{escape(place)}, score {best.score:.2f}</figcaption>'
+        "</figure>"
     )
 
 

@@ -6,9 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
 
-from catstream.html.plots import COLOURS
-
-__all__ = ["Bar", "clock", "lane_colours", "legend", "timeline"]
+__all__ = ["Bar", "clock", "legend", "timeline"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +49,6 @@ def legend(colours: Mapping[str, str]) -> str:
     """The names of the lanes in their colours."""
     names = "".join(f'<span style="--colour:{colour}">{escape(name)}</span>' for name, colour in colours.items())
     return f'<p class="legend">{names}</p>'
-
-
-def lane_colours(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each name; they repeat if there are many."""
-    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
 
 
 def clock(seconds: float) -> str:
