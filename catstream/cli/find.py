@@ -18,6 +18,7 @@ from catstream.cli import INTERRUPTED, interruptible
 from catstream.cli.interrupts import Interrupts
 from catstream.errors import CatstreamError, VideoError
 from catstream.settings import RunSettings
+from catstream.threads import one_thread
 
 if TYPE_CHECKING:
     from catstream.finding.files import File
@@ -128,11 +129,11 @@ def find(
 
     \b
     EXAMPLES
-      catstream track walk.mp4 --box 120,80,64,48 --save-model anna.model
-      catstream find --model anna.model holiday.mp4
-      catstream find --model anna.model --model ben.model videos/ photos/ --output found
-      catstream find --model anna.model --every 1 --sizes 0.7,1.5 archive/
-      catstream find --model anna.model --threshold 0.7 --output sure videos/
+      catstream track walk.mp4 --box 120,80,64,48 --save-model anna.safetensors
+      catstream find --model anna.safetensors holiday.mp4
+      catstream find --model anna.safetensors --model ben.safetensors videos/ photos/ --output found
+      catstream find --model anna.safetensors --every 1 --sizes 0.7,1.5 archive/
+      catstream find --model anna.safetensors --threshold 0.7 --output sure videos/
     """
     # Imported here so that --help and the other commands start faster.
     with interruptible():
@@ -150,7 +151,8 @@ def find(
         interrupts.install()
         console = Console(stderr=True, soft_wrap=True)
         try:
-            _search(search, files, log, interrupts, console)
+            with one_thread(opencv=True):
+                _search(search, files, log, interrupts, console)
             interrupted = False
         except KeyboardInterrupt:
             interrupted = True

@@ -16,12 +16,13 @@ from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.finding.files import File
 from catstream.finding.search import Step
-from catstream.finding.sightings import Interval, Linker, Sighting
+from catstream.finding.sightings import GAP_SECONDS, Interval, Linker, Sighting
 from catstream.video.preview import jpeg
 
 __all__ = ["FileResult", "SearchLog"]
 
 _KIND = "catstream find 1"  # and the version of the lines
+_GAP_STEPS = 2.5  # longest time between two sightings of an interval, in steps, if these are long
 _PICTURE = 240  # side of a picture in pixels
 _SURROUNDINGS = 1.7  # side of a picture, as a multiple of the longer side of the object's box
 
@@ -32,27 +33,28 @@ class FileResult:
 
     file       path of the video, the image or the folder
     signature  of the file when it was searched, see `File.signature`
+    linker     links its sightings into intervals
     frames     number of its frames, None if unknown
     position   frame of the last step, None before the first one
     time       time of the last step in seconds
     complete   whether the file was searched to its end, or to its damage
     problems   reasons for what could not be read
     sightings  in the order of the frames
-    linker     their intervals
     """
 
     file: str
     signature: list[int]
+    linker: Linker
     frames: int | None = None
     position: int | None = None
     time: float = 0.0
     complete: bool = False
     problems: list[str] = field(default_factory=list)
     sightings: list[Sighting] = field(default_factory=list)
-    linker: Linker = field(default_factory=Linker)
 
     @property
     def intervals(self) -> list[Interval]:
+        """The intervals of all objects, in the order of their first sighting."""
         return self.linker.intervals
 
     def add(self, position: int, time: float, sightings: Sequence[Sighting]) -> list[Interval]:
@@ -119,6 +121,8 @@ class SearchLog:
 
     def note(self, result: FileResult, **facts: Any) -> None:
         """Store facts of a result: `frames`, a `problem`, or that it is `complete`."""
+        if facts.get("problem") in result.problems:  # it was noted before an interruption
+            return
         line = {"of": result.file, **facts}
         self._apply(line)
         self._write(line)
@@ -160,7 +164,8 @@ class SearchLog:
     def _apply(self, line: Mapping[str, Any]) -> None:
         """Change the results as a line says."""
         if "file" in line:
-            self.results[line["file"]] = FileResult(line["file"], line["signature"])
+            linker = Linker(max(GAP_SECONDS, _GAP_STEPS * self.search["every"]))
+            self.results[line["file"]] = FileResult(line["file"], line["signature"], linker)
             return
         result = self.results[line["of"]]
         result.frames = line.get("frames", result.frames)

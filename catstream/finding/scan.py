@@ -23,6 +23,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.learned import Learned
 from catstream.messages import Model
 from catstream.settings import Settings
+from catstream.threads import one_thread
 
 __all__ = ["SIZES", "THRESHOLD", "Scan", "Seen"]
 
@@ -96,6 +97,7 @@ class Scan:
             for entry in _entries(searched.window, sizes):
                 self._grid[entry].append(number)
 
+    @one_thread()
     def __call__(self, image: np.ndarray) -> list[list[Seen]]:
         """Search a frame, uint8 (h, w, 3) BGR.
 

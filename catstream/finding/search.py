@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -20,7 +21,6 @@ from catstream.finding.scan import SIZES, THRESHOLD, Scan, Seen
 from catstream.finding.sightings import Sighting
 from catstream.learned import Learned
 from catstream.settings import RunSettings
-from catstream.threads import one_thread
 from catstream.video.frames import Frame
 
 __all__ = ["EVERY", "Search", "Step", "find", "load_models"]
@@ -29,6 +29,8 @@ _One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
 
 #: Seconds of a video between two frames that are searched.
 EVERY = 0.2
+
+_MOST_BETWEEN = 16  # frames between two that are searched, which are kept for the bisection: bounds the memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,10 @@ class Search:
     threshold: float = THRESHOLD
     every: float = EVERY
     sizes: tuple[float, float] = SIZES
+    _scan: Scan = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._scan = Scan(self.models.values(), self.threshold, self.sizes)
 
     @property
     def description(self) -> dict[str, Any]:
@@ -112,14 +118,13 @@ class Search:
         VideoError
             At damage, after the steps before it.
         """
-        scan = Scan(self.models.values(), self.threshold, self.sizes)
         before: list[list[Seen]] | None = None
         stretches = self._stretches(file, after or 0, opened, damaged)
-        with one_thread(opencv=True), closing(stretches), closing(_scanned(scan, stretches)) as scanned:
+        with closing(stretches), closing(_scanned(self._scan, stretches)) as scanned:
             for stretch, found in scanned:
                 frames: list[tuple[Frame, list[list[Seen]]]] = [(stretch.frame, found)]
                 if before is not None:
-                    frames = [*_bisected(scan, before, stretch, found), *frames]
+                    frames = [*_bisected(self._scan, before, stretch, found), *frames]
                 if before is not None or after is None:
                     yield self._step(file, stretch, frames)
                 before = found
@@ -141,14 +146,17 @@ class Search:
             opened(rate, frames)
 
         between: list[Frame] = []
+        last: Frame | None = None
         for frame, image in file.frames(start, self.settings, begin, damaged):
             if frame.number == start or frame.number % interval == 0:
                 yield _Stretch(frame, between, image)
-                between = []
-            else:
+                between, last = [], None
+                continue
+            last = frame
+            if frame.number % math.ceil(interval / _MOST_BETWEEN) == 0:
                 between.append(frame)
-        if between:
-            yield _Stretch(between[-1], between[:-1])
+        if last is not None:
+            yield _Stretch(last, [frame for frame in between if frame is not last])
 
     def _step(self, file: File, stretch: _Stretch, frames: list[tuple[Frame, list[list[Seen]]]]) -> Step:
         sightings, images = [], []
@@ -204,7 +212,7 @@ def find(
 
     Examples
     --------
-    >>> for sighting in find("dahlia.model", "holiday/"):  # doctest: +SKIP
+    >>> for sighting in find("dahlia.safetensors", "holiday/"):  # doctest: +SKIP
     ...     print(sighting.file, sighting.time, sighting.box, sighting.score)
     """
     search = Search(load_models(_several(models)), RunSettings(skip_damaged=skip_damaged), threshold, every, sizes)

@@ -126,3 +126,12 @@ def test_models_without_a_file_or_with_one_name_are_errors(model_files, tmp_path
     (tmp_path / "cut.model").write_bytes(model_files[0].read_bytes()[:500])
     with pytest.raises(ProtocolError):
         load_models([tmp_path / "cut.model"])
+
+
+def test_long_steps_still_make_intervals_and_bound_the_frames_that_are_kept(model_files, appearing, tmp_path):
+    search = Search(load_models(model_files[:1]), every=1.2)
+    with SearchLog(tmp_path / "log", search.description) as log:
+        result = finished(log, File(appearing, "video"), search)
+    assert [step.frame for step in search.file(File(appearing, "video"))] == [0, 30, 39]
+    assert result.intervals[0].first.frame in (14, 13)
+    assert max(len(stretch.between) for stretch in search._stretches(File(appearing, "video"), 0, print, print)) <= 16
