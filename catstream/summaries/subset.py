@@ -43,7 +43,6 @@ def choose(gram: Float64, products: Float64, k: int) -> tuple[list[int], list[fl
     while len(chosen) < k:
         own = gram.diagonal()
         gains = np.divide(np.sum(products**2, axis=0), own, out=np.zeros(len(own)), where=own > least)
-        gains[chosen] = 0
         best = int(gains.argmax())
         if not gains[best] > 0:
             break
@@ -83,7 +82,6 @@ class _Span:
     """
 
     def __init__(self, gram: Float64, products: Float64, chosen: list[int]) -> None:
-        self._chosen = chosen
         self._least = _DEPENDENT * gram.diagonal()
         inverse = np.linalg.inv(gram[np.ix_(chosen, chosen)])
         self._squares = inverse.diagonal()  # ||z_i||^2
@@ -99,5 +97,4 @@ class _Span:
         own = self._own + inner * self._inner[place]
         energies = self._rest_squares + 2 * inner * (outer @ self._rest) + (outer @ outer) * inner**2
         gains: Float64 = np.divide(energies, own, out=np.zeros(len(own)), where=own > self._least)
-        gains[[number for number in self._chosen if number != self._chosen[place]]] = 0
         return gains

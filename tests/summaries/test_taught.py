@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from catstream.compression.tree import TREES
@@ -75,7 +75,8 @@ def test_each_object_is_measured_by_itself(run, rng):
     assert together[""] == alone[""]
 
 
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=60), st.integers(1, 60))
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=60), st.integers(1, 12))
+@example([0.9, 0.8, *[0.1] * 18], 2)
 def test_k_frames_are_selected_and_spread_over_the_run(novelties, k):
     frames = [TaughtFrame(number, number / 25, None, novelty) for number, novelty in enumerate(novelties)]
     if k > len(frames):
