@@ -13,6 +13,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -22,11 +23,12 @@ from typing import Self
 from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.job import Job
-from catstream.messages import End, Position, Track
+from catstream.messages import Answer, End, ObjectPosition, Position, Track, Tracks
 from catstream.services.loop import PERMANENT_FAILURE
 from catstream.services.start import service_command
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
+from catstream.steering import Control, control
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import CHANNELS, MODELS, RESULTS
 from catstream.wire.endpoint import Endpoint
@@ -138,23 +140,23 @@ class Arena:
 
     Parameters
     ----------
-    source, box : the video, and the box of the object in its first frame
+    source, boxes : the video, and the boxes of the objects in its first frame, by name
     state : folder for the checkpoints
     scratch : folder for logs
 
     Attributes
     ----------
-    tracks : the received tracks, in order
+    tracks : the received tracks of each frame by name, in order
     end : the last message of the stream, None before it was received
     deaths : number of restarts of processes
     links : link of each channel
     """
 
-    def __init__(self, source: str, box: Box, settings: Settings, state: Path, scratch: Path) -> None:
-        self.state, self.tracks, self.deaths = state, list[Track](), 0
+    def __init__(self, source: str, boxes: dict[str, Box], settings: Settings, state: Path, scratch: Path) -> None:
+        self.state, self.tracks, self.deaths = state, list[dict[str, Track]](), 0
         self.end: End | None = None
-        self._settings, self._source, self._first, self._folder = settings, source, box, scratch
-        self._box = box
+        self._settings, self._source, self._boxes, self._folder = settings, source, boxes, scratch
+        self._found = {name: ObjectPosition(box) for name, box in boxes.items()}
         self._clock = scratch / "clock"
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._places: dict[str, Endpoint] = {}
@@ -175,6 +177,8 @@ class Arena:
                 Receiver(RESULTS, self._places["detector"], Position(), self._settings.run.unstored_frames)
             )
             self._models = stack.enter_context(Subscriber(MODELS, self._places["trainer"]))
+            self._control = stack.enter_context(control(str(self._places["detector"]), timeout=_PATIENCE_SECONDS))
+            self._pool = stack.enter_context(ThreadPoolExecutor(1))
             stack.callback(self._stop)
             for name in NAMES:
                 self._start(name)
@@ -185,7 +189,7 @@ class Arena:
         self._stack.close()
 
     def turn(self, seconds: float = 0.01) -> None:
-        """Receive the next track, and restart processes that died.
+        """Receive the tracks of the next frame, and restart processes that died.
 
         Raises
         ------
@@ -195,10 +199,12 @@ class Arena:
         message = self._results.receive(seconds)
         if message is not None:
             self._last_received = monotonic()
-            if isinstance(message, Track):
-                self.tracks.append(message)
-                self._box = message.box or self._box
-                self._results.acknowledge(Position(message.seq, message.frame, self._box))
+            if isinstance(message, Tracks):
+                self.tracks.append(message.tracks)
+                found = {name: ObjectPosition(track.box) for name, track in message.tracks.items() if track.box}
+                lost = {name: self._found.get(name, ObjectPosition()) for name in message.tracks}
+                self._found = lost | found
+                self._results.acknowledge(Position(message.seq, message.frame, self._found))
             else:
                 self._results.acknowledge(Position(message.seq))
                 self.end = message
@@ -231,6 +237,12 @@ class Arena:
         while any(process.poll() is None for process in self._processes.values()) and monotonic() < over:
             self.turn()
 
+    def command(self, give: Callable[[Control], Answer]) -> Answer | None:
+        """Give a command, and call `turn` until it is answered; None if the run has ended before."""
+        answer = self._pool.submit(give, self._control)
+        self.until(answer.done)
+        return None if self.end is not None else answer.result()
+
     def taught(self) -> bool:
         """Return whether a model arrived since the last call."""
         return bool(self._models.receive_all())
@@ -254,8 +266,8 @@ class Arena:
         # Each process meets the others at a link of its own, so each has a job of its own.
         folder = self._folder / f"job-{name}"
         folder.mkdir(exist_ok=True)
-        job = Job(self._source, self._first, settings=self._settings, owned=True, resume=True)
-        state = self.state if name == "compressor" else None
+        job = Job(self._source, self._boxes, settings=self._settings, owned=True, resume=True)
+        state = self.state if name == "compressor" else folder
         file = replace(job, state=state, endpoint=str(self._places[name])).save(folder)
         command = service_command("child", name, str(file), "--parent", str(os.getpid()))
         path = os.pathsep.join([str(self._folder), *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -1,8 +1,10 @@
 """Injects a random schedule of faults into a running pipeline, and checks that no track and no row is lost.
 
 One fault follows the other: processes are killed (kill -9) or frozen (SIGSTOP), links are cut or slowed, the disk is
-full, or the clock is wrong. In lockstep, the trees must contain every message exactly once and be equal, bit for bit,
-to those of a run without faults. Otherwise, the success rate must be as high as without faults.
+full, or the clock is wrong. With several objects, some are forgotten and others begin between the faults. In lockstep,
+the trees must contain every message exactly once and be equal, bit for bit, to those of a run without faults in which
+the same objects begin and are forgotten in the same frames. Otherwise, the success rate must be as high as without
+faults.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -25,11 +27,12 @@ from sequences import named, scratch
 from table import Table, command, publish
 
 from catstream.box import Box
-from catstream.compression.compressor import Compressor
-from catstream.errors import ServiceError
+from catstream.compression.forest import Forest
+from catstream.errors import BoxError, ServiceError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.metrics import score
 from catstream.messages import Track
+from catstream.multi import MultiTracker
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
 from catstream.tracker import Tracker
@@ -41,7 +44,13 @@ SECONDS = (0.1, 1.0)  # duration of a freeze, a cut, a slow link or a full disk
 DELAY = (0.005, 0.05)  # delay of each 64 KiB on a slow link
 HOUR = 3600.0
 FULL = "disk full"
+FIRST = "first"  # name of the object whose true boxes are known; with one object, it has a name too
+PATCH = 40  # width and height of the other objects, pixels
+FORGET = 0.6  # probability that an object that is tracked is forgotten, and not replaced
 RUNS = {"lockstep": Settings(run={"lockstep": True}), "default": Settings()}
+
+#: The tracks of a frame, by name.
+Tracks = dict[str, Track]
 
 Fault = Callable[[Arena, np.random.Generator], None]
 
@@ -105,41 +114,61 @@ FAULTS: dict[str, tuple[Fault, float]] = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A change of the objects during a run, from a frame on: an object begins at a box, or is forgotten (None)."""
+
+    frame: int
+    name: str
+    box: Box | None
+
+
 @dataclass(slots=True)
 class Ordeal:
     """The results of a run with faults.
 
     recovery  of each kind of fault: seconds from its end to the next track and the next model
-    tracks    of each frame
+    tracks    of each frame, by name
     totals    features messages `sent` and `stored`, from the last message of the stream
     deaths    how often a process was started again
-    learned   the compressor, from its last checkpoint
+    learned   the forest, from the last checkpoint
+    changes   the objects that began or were forgotten between the faults
     """
 
     recovery: dict[str, list[float]]
-    tracks: list[Track]
+    tracks: list[Tracks]
     totals: dict[str, float]
     deaths: int
-    learned: Compressor
+    learned: Forest
+    changes: list[Change]
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     cycles, modes = (1, ["lockstep"]) if options.quick else (options.cycles, list(RUNS))
     source, truth = long(named(options, "TLD_01_david"), 30 if options.quick else 25 * cycles + 100)
-    box, faults, times, ends = Box(*map(float, truth[0])), schedule(cycles, options.seed), [], []
-    calm = undisturbed(source, box)
+    boxes = patches(source, Box(*map(float, truth[0])), options.objects)
+    faults, times, ends = schedule(cycles, options.seed), [], []
     for label in [options.run] if options.run else modes:
-        run = endure(source, box, RUNS[label], faults, options.seed)
+        run = endure(source, boxes, RUNS[label], faults, options.seed)
+        calm = undisturbed(source, boxes, run.changes)
         times += [(label, *row) for row in quantiles(run.recovery)]
         same = None if label == "default" else "yes" if identical(run, calm) else "NO"
         sent, stored = (int(run.totals[name]) for name in ("sent", "stored"))
-        success = [score(boxes(tracks), truth).success for tracks in (run.tracks, calm[0])]
-        met, rows = sum(map(len, run.recovery.values())), sum(tree.rows_seen for tree in run.learned.trees.values())
-        ends.append((label, met, run.deaths, sent, stored, len(run.tracks), rows, *success, same))
+        success = [score(found(tracks, FIRST), truth).success for tracks in (run.tracks, calm[0])]
+        met, rows = sum(map(len, run.recovery.values())), int(run.learned.counters()["rows"])
+        wrong = sum(ours.keys() != theirs.keys() for ours, theirs in zip(run.tracks, calm[0], strict=True))
+        objects = len(boxes), len(run.changes), wrong
+        ends.append((label, *objects, met, run.deaths, sent, stored, len(run.tracks), rows, *success, same))
     columns = ("run", "fault", "times", "p50 s", "p99 s", "slowest s")
     yield Table("Recovery", columns, times, "from the end of a fault to the track two frames further, or a new model")
-    columns = ("run", "faults", "restarts", "sent", "stored", "tracks", "rows", "success", "without", "trees the same")
-    note = f"seed {options.seed}; sent, stored: messages of features; rows: in the trees; without: in one process"
+    columns = ("run", "objects", "changes", "wrong", "faults", "restarts", "sent", "stored", "frames")
+    columns = (*columns, "rows", "success", "without", "trees the same")
+    note = (
+        f"seed {options.seed}; changes: objects that began or were forgotten; wrong: frames whose tracks are of other "
+    )
+    note += (
+        "objects than without faults; sent, stored: messages of features; rows: in the trees; without: in one process"
+    )
     yield Table(f"{len(truth)} frames", columns, ends, note)
 
 
@@ -161,8 +190,10 @@ def schedule(cycles: int, seed: int) -> list[str]:
     return [str(name) for name in np.random.default_rng(seed).choice(list(FAULTS), cycles, p=share / share.sum())]
 
 
-def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: int = 0) -> Ordeal:
+def endure(source: str, boxes: dict[str, Box], settings: Settings, faults: list[str], seed: int = 0) -> Ordeal:
     """Track a source to its end with some faults; progress is printed to stderr.
+
+    If there are several objects, one is forgotten or begins before every other fault.
 
     Faults of a full disk need a small file system; they are left out if it cannot be mounted.
 
@@ -171,7 +202,7 @@ def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: i
     ServiceError
         If the pipeline does not reach its end, or the source is too short for all faults.
     """
-    random, recovery = np.random.default_rng(seed), defaultdict(list)
+    random, recovery, changes = np.random.default_rng(seed), defaultdict(list), list[Change]()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-arena-")))
         if FULL in faults:
@@ -182,11 +213,13 @@ def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: i
                 faults = [name for name in faults if name != FULL]
         with open_source(source) as video:
             frames = video.frames or 0
-        arena = stack.enter_context(Arena(source, box, settings, folder / "state", folder))
+        arena = stack.enter_context(Arena(source, boxes, settings, folder / "state", folder))
         for number, name in enumerate(faults, start=1):
             further(arena, int(random.integers(*CALM)))
             if len(arena.tracks) > frames - LAST:
                 raise ServiceError(f"the video ends before fault {number} of {len(faults)}: use a longer one")
+            if len(boxes) > 1 and number % 2:
+                changes += change(arena, boxes, random)
             arena.taught()
             FAULTS[name][0](arena, random)
             begin = monotonic()
@@ -197,13 +230,29 @@ def endure(source: str, box: Box, settings: Settings, faults: list[str], seed: i
             print(f"{number} of {len(faults)}: {name}, {recovery[name][-1]:.2f} s", file=sys.stderr, flush=True)
         arena.finish()
         return Ordeal(
-            dict(recovery), arena.tracks, dict(arena.end.totals), arena.deaths, learned(folder / "state", settings)
+            dict(recovery),
+            arena.tracks,
+            dict(arena.end.totals),
+            arena.deaths,
+            learned(folder / "state", settings),
+            changes,
         )
 
 
-def learned(state: Path, settings: Settings) -> Compressor:
+def change(arena: Arena, boxes: dict[str, Box], random: np.random.Generator) -> Iterator[Change]:
+    """Forget an object other than the first one, or let it begin again, in its box of the first frame."""
+    name = str(random.choice([name for name in boxes if name != FIRST]))
+    if name in arena.tracks[-1] and random.random() < FORGET:
+        answer = arena.command(lambda control: control.forget(name))
+        yield from [] if answer is None else [Change(answer.frame + 1, name, None)]
+    else:
+        answer = arena.command(lambda control: control.set_box(boxes[name], name))
+        yield from [] if answer is None else [Change(answer.frame, name, boxes[name])]
+
+
+def learned(state: Path, settings: Settings) -> Forest:
     """Load the newest checkpoint in a folder. Raises ValueError if there is none yet."""
-    return Compressor.load(max(state.rglob("*.safetensors"), key=lambda file: file.stat().st_mtime_ns), settings)
+    return Forest.load(max(state.rglob("*.safetensors"), key=lambda file: file.stat().st_mtime_ns), settings)
 
 
 def further(arena: Arena, frames: int) -> None:
@@ -212,35 +261,59 @@ def further(arena: Arena, frames: int) -> None:
     arena.until(lambda: len(arena.tracks) >= goal)
 
 
-def undisturbed(source: str, box: Box) -> tuple[list[Track], Compressor]:
-    """Return the tracks and the compressor of a run in one process."""
-    tracker, tracks = Tracker(), []
+def undisturbed(source: str, boxes: dict[str, Box], changes: list[Change] = []) -> tuple[list[Tracks], Forest]:  # noqa: B006
+    """Return the tracks and the forest of a run in one process, with the same changes of the objects."""
+    tracker, tracks = MultiTracker(), []
     with open_source(source) as frames:
         for frame in frames:
+            now = {each.name: each.box for each in changes if each.frame == frame.number}
+            for name in (name for name, box in now.items() if box is None):
+                tracker.forget(name)
             if tracks:
-                tracker.update(frame.image, frame.time)
+                begun = {name: box for name, box in now.items() if box is not None}
+                tracker.update(frame.image, frame.time, begin=begun or None)
             else:
-                tracker.init(frame.image, box, frame.time)
-            tracks.append(tracker.track)
-    return tracks, tracker.compressor
+                tracker.init(frame.image, boxes, frame.time)
+            tracks.append(tracker.tracks)
+    return tracks, tracker.forest
 
 
-def identical(run: Ordeal, calm: tuple[list[Track], Compressor]) -> bool:
+def identical(run: Ordeal, calm: tuple[list[Tracks], Forest]) -> bool:
     """Return whether two runs gave the same tracks, and the same trees bit for bit."""
     return run.tracks == calm[0] and fingerprint(run.learned) == fingerprint(calm[1])
 
 
-def boxes(tracks: list[Track]) -> np.ndarray:
-    """Return the boxes of tracks, one row for each frame, NaN if the object is absent."""
-    return np.array([track.box or (np.nan,) * 4 for track in tracks])
+def found(tracks: list[Tracks], name: str) -> np.ndarray:
+    """Return the boxes of an object, one row for each frame, NaN if it is absent."""
+    return np.array([each[name].box or (np.nan,) * 4 for each in tracks])
 
 
-def fingerprint(compressor: Compressor) -> list[tuple[object, object]]:
-    """Return the content of the trees as bytes."""
-    states = [tree.state() for tree in compressor.trees.values()]
-    return [
-        (metadata, {name: (array.shape, array.tobytes()) for name, array in own.items()}) for own, metadata in states
-    ]
+def fingerprint(forest: Forest) -> dict[str, list[tuple[object, object]]]:
+    """Return the content of the trees of each object as bytes."""
+    return {
+        name: [
+            (metadata, {key: (array.shape, array.tobytes()) for key, array in own.items()})
+            for own, metadata in (tree.state() for tree in compressor.trees.values())
+        ]
+        for name, compressor in forest.compressors.items()
+    }
+
+
+def patches(source: str, box: Box, count: int) -> dict[str, Box]:
+    """Return the boxes of several objects in the first frame: the object, and patches beside it that can be tracked."""
+    with open_source(source) as frames:
+        image = next(iter(frames)).image
+    places = ((x, y) for y in range(8, image.shape[0] - PATCH, PATCH) for x in range(8, image.shape[1] - PATCH, PATCH))
+    chosen = {FIRST: box}
+    for x, y in places:
+        patch = Box(float(x), float(y), float(PATCH), float(PATCH))
+        if len(chosen) < count and not patch.overlap(box):
+            with suppress(BoxError):  # it looks like its surroundings
+                Tracker().init(image, patch)
+                chosen[f"patch-{len(chosen)}"] = patch
+    if len(chosen) < count:
+        raise ServiceError(f"the first frame has room for {len(chosen)} objects: give --objects {len(chosen)}")
+    return chosen
 
 
 def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, float, float, float]]:
@@ -253,6 +326,7 @@ def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, floa
 if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--cycles", type=int, default=200, help="number of faults (default: %(default)s)")
+    parser.add_argument("--objects", type=int, default=1, help="number of objects (default: %(default)s)")
     parser.add_argument("--run", choices=list(RUNS), help="only this one of the two runs")
     parser.add_argument("--seed", type=int, default=0, help="seed of the schedule (default: %(default)s)")
     options = parser.parse_args()

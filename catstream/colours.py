@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 __all__ = ["PALETTE", "Colours", "rgb"]
 
-#: Colours as #rrggbb: distinguishable for colour-blind people, and light enough for dark text on them. In a picture, draw
-#: each beside a dark line, so that it is visible on a light ground too.
+#: Colours as #rrggbb: distinguishable for colour-blind people, and light enough for dark text on them. In a picture,
+#: draw each beside a dark line, so that it is visible on a light ground too.
 PALETTE = (
     "#ff922b", "#3586ff", "#fedd38", "#e123c2", "#bae0b4", "#fd0304", "#76c6fe", "#5a8667", "#b7a59c",
 )  # fmt: skip

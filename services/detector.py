@@ -243,11 +243,13 @@ class DetectorLoop:
         objects = self._commands.desired.objects_at(seq)
         for name in detectors.detectors.keys() - objects.keys():
             detectors.forget(name)
-        for name in objects.keys() - given.keys():
-            if seq <= max(objects[name].begins, 1):
+        for name, each in objects.items():  # in the order in which they began, in which the samples are numbered
+            if name in given:
+                continue
+            if seq <= max(each.begins, 1):
                 self._process.allow(_OPEN_SECONDS)
-            if seq == objects[name].begins:
-                given[name] = detectors.begin(name, pyramid, objects[name].box, frame.time)
+            if seq == each.begins:
+                given[name] = detectors.begin(name, pyramid, each.box, frame.time)
             elif name not in detectors.detectors:  # it was forgotten later: see `catstream.services.resume`
                 given[name] = Detector(self._process.settings, name).miss(seq, frame.time)
         return detectors.step(pyramid, frame.time, given)

@@ -11,7 +11,7 @@ from hypothesis import strategies as some
 
 from catstream.colours import PALETTE, Colours, rgb
 
-#: Linear red, green, blue as people of each kind of vision see them (Machado, Oliveira and Fernandes, 2009, severity 1).
+#: Linear red, green, blue as people of each kind of vision see them (Machado and others, 2009, severity 1).
 VISIONS = {
     "normal": np.eye(3),
     "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],

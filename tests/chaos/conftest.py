@@ -19,8 +19,8 @@ def video(demo_video):
 
 @pytest.fixture(scope="session")
 def calm(video):
-    """Tracks of the same video in one process, undisturbed, and what it learned."""
+    """Tracks of the same video in one process without faults, and the trees."""
     import chaos
 
     path, boxes = video
-    return chaos.undisturbed(path, boxes[0])
+    return chaos.undisturbed(path, {chaos.FIRST: boxes[0]})
