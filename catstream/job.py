@@ -33,19 +33,20 @@ class Results:
     output      folder of the results files, None for none
     video       whether an annotated video is among the results files
     write       further files of tracks
-    save_model  file for the model that was learned, None for none
+    models      files for what was learned of each object, by name; a file without a name is for the only object
     """
 
     output: Path | None = None
     video: bool = False
     write: tuple[Path, ...] = ()
-    save_model: Path | None = None
+    models: dict[str, Path] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, metadata: Metadata) -> Results:
         """Return the results that `asdict` and JSON converted to this metadata."""
         write = tuple(Path(file) for file in metadata["write"])
-        return cls(_path(metadata["output"]), bool(metadata["video"]), write, _path(metadata["save_model"]))
+        models = {name: Path(file) for name, file in metadata["models"].items()}
+        return cls(_path(metadata["output"]), bool(metadata["video"]), write, models)
 
 
 @dataclass(frozen=True, slots=True)

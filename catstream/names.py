@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 
 from catstream.box import Box
-from catstream.errors import ObjectError
+from catstream.errors import BoxError, ObjectError
 
-__all__ = ["UNNAMED", "Boxes", "boxes_by_name", "check_count", "check_name", "listed", "split_name"]
+__all__ = ["UNNAMED", "Boxes", "boxes_by_name", "check_boxes", "check_count", "check_name", "listed", "split_name"]
 
 #: The name of an object that has none.
 UNNAMED = ""
@@ -65,9 +66,29 @@ def boxes_by_name(boxes: Boxes) -> dict[str, Box]:
     >>> boxes_by_name("120,80,64,48")
     {'': Box(x=120.0, y=80.0, w=64.0, h=48.0)}
     """
-    if isinstance(boxes, Mapping):
-        return {check_name(name): Box.parse(box) for name, box in boxes.items()}
-    return {UNNAMED: Box.parse(boxes)}
+    if not isinstance(boxes, Mapping):
+        return {UNNAMED: Box.parse(boxes)}
+    parsed = {}
+    for name, box in boxes.items():
+        with _errors_about(check_name(name)):
+            parsed[name] = Box.parse(box)
+    return parsed
+
+
+def check_boxes(boxes: Mapping[str, Box], width: int, height: int) -> None:
+    """Raise BoxError, with the name of the object, if tracking cannot start with one of the boxes in such a frame."""
+    for name, box in boxes.items():
+        with _errors_about(name):
+            box.validated(width, height)
+
+
+@contextmanager
+def _errors_about(name: str) -> Iterator[None]:
+    """Add the name of an object to a BoxError."""
+    try:
+        yield
+    except BoxError as error:
+        raise BoxError(f"{name}: {error}" if name else str(error)) from None
 
 
 def check_count(count: int, most: int) -> None:

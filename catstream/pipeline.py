@@ -24,7 +24,7 @@ from catstream.features import COMPILING
 from catstream.job import Job, Results
 from catstream.learned import Learned
 from catstream.messages import End, Health, ObjectPosition, Position, Track, Tracks
-from catstream.names import UNNAMED, Boxes, boxes_by_name, check_name
+from catstream.names import UNNAMED, Boxes, boxes_by_name, check_boxes, check_name
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.state import began, learned, locked, position
@@ -90,8 +90,9 @@ class Pipeline:
         after the last checkpoint: tracks of the last second may be repeated.
     results : Results
         The files that the program writes, stored in the state folder for the program that resumes the run.
-    save_model : path
-        File for the model, written as by `catstream save` once the processes have ended, however the run ended.
+    save_model : path, or a mapping of names to paths
+        Files for what was learned of the objects, written as by `catstream save` once the processes have ended, however
+        the run ended. One path is for the only object.
 
     Attributes
     ----------
@@ -137,7 +138,7 @@ class Pipeline:
         resume: str | os.PathLike[str] | None = None,
         after: Position | None = None,
         results: Results | None = None,
-        save_model: str | os.PathLike[str] | None = None,
+        save_model: Models | None = None,
     ) -> None:
         if state is not None and resume is not None:
             raise SettingsError("state starts a new run, and resume continues one: give one of them")
@@ -158,15 +159,14 @@ class Pipeline:
         with open_source(job.source, part=job.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
-        for each in job.boxes.values():
-            each.validated(*self.size)
+        check_boxes(job.boxes, *self.size)
         path = job.source if self.live else str(Path(job.source).absolute())
         self._job = replace(job, source=path, size=self.size, settings=job.settings.for_length(self.frames))
         for file in job.models.values():
             Learned.load(file).check_fits(self._job.settings)
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
-        self._record, self._save_model = _path(record), _path(save_model)
+        self._record, self._save_models = _path(record), _files_by_name(save_model)
         self._after = after
         self._found = {name: ObjectPosition(each) for name, each in job.boxes.items()}  # where each object was last
         self._waiting: deque[Track] = deque()  # that were received and not returned yet
@@ -214,8 +214,8 @@ class Pipeline:
             self._found |= start.objects
             self._incoming = stack.enter_context(Receiver(RESULTS, endpoint, start, settings.run.unstored_frames))
             self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
-            if self._save_model is not None:  # from the compressor's last checkpoint
-                stack.enter_context(_saved(self._save_model, self._state or folder, settings))
+            if self._save_models:  # from the compressor's last checkpoint
+                stack.enter_context(_saved(self._save_models, self._state or folder, settings))
             supervisor = Supervisor(self._started(str(endpoint)), folder)
             stack.callback(supervisor.stop)
             self._endpoint, self._supervisor, self._stack = str(endpoint), supervisor, stack.pop_all()
@@ -453,12 +453,13 @@ def _with_objects(job: Job, box: Boxes | None, model: Models | None) -> Job:
     """The job with other objects, if any are given."""
     if box is None and model is None:
         return job
-    files = model if isinstance(model, Mapping) else {} if model is None else {UNNAMED: model}
-    return replace(
-        job,
-        boxes={} if box is None else boxes_by_name(box),
-        models={check_name(name): Path(file).absolute() for name, file in files.items()},
-    )
+    models = {name: file.absolute() for name, file in _files_by_name(model).items()}
+    return replace(job, boxes={} if box is None else boxes_by_name(box), models=models)
+
+
+def _files_by_name(files: Models | None) -> dict[str, Path]:
+    named = files if isinstance(files, Mapping) else {} if files is None else {UNNAMED: files}
+    return {check_name(name): Path(file) for name, file in named.items()}
 
 
 def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
@@ -485,14 +486,24 @@ def _begun(folder: Path, kept: Job | None, job: Job) -> Iterator[None]:
 
 
 @contextmanager
-def _saved(path: Path, state: Path, settings: Settings) -> Iterator[None]:
-    """Save the model to a file afterwards; if the run failed, its error is raised in any case."""
+def _saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterator[None]:
+    """Save what was learned of each object to its file afterwards; an error of the run comes before those of saving."""
     try:
         yield
     except BaseException:
-        try:
-            learned(state, settings).save(path)
-        except CatstreamError as error:
+        for error in _save(files, state, settings):
             _log.warning("%s", error)
         raise
-    learned(state, settings).save(path)
+    for error in _save(files, state, settings):
+        raise error
+
+
+def _save(files: Mapping[str, Path], state: Path, settings: Settings) -> list[CatstreamError]:
+    """Save what was learned of each object to its file; returns the errors of those that could not be saved."""
+    errors: list[CatstreamError] = []
+    for name, file in files.items():
+        try:
+            learned(state, settings, name).save(file)
+        except CatstreamError as error:
+            errors.append(error)
+    return errors

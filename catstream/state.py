@@ -46,6 +46,10 @@ def position(folder: Path, settings: Settings) -> Position:
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
     """Everything that was learned of an object up to the newest valid checkpoint.
 
+    Parameters
+    ----------
+    name : the name of the object; "" also means the only object, if it has a name
+
     Raises
     ------
     ObjectError
@@ -54,6 +58,8 @@ def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
         If there is no checkpoint, or nothing was learned before the newest one.
     """
     forest = CheckpointStore(folder / TREES).load(settings)
+    if name == UNNAMED and len(forest.compressors) == 1:
+        (name,) = forest.compressors
     if forest.compressors and name not in forest.compressors:
         raise ObjectError(f"there is no object {name!r}: the objects are {listed(forest.compressors)}")
     return Learned.of(forest.compressors.get(name) or Compressor(settings, name), settings)

@@ -1,43 +1,83 @@
-"""Options that several commands share: settings, the object, and the frames of a source.
+"""Options that several commands share: settings, the objects, and the frames of a source.
 
 Each decorator adds options to a click command, and passes them on as one argument of the command's function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from pathlib import Path
 from typing import TypeVar, cast
 
 import click
 
-from catstream.box import Box
+from catstream.errors import ObjectError
+from catstream.names import boxes_by_name, split_name
 from catstream.settings import PRESETS, Settings
 
-__all__ = ["with_given", "with_model", "with_object", "with_part", "with_reading", "with_settings"]
+__all__ = ["named", "with_given", "with_model", "with_object", "with_part", "with_reading", "with_settings"]
 
 _Command = TypeVar("_Command", bound=Callable[..., None])
 
-with_model = click.option(
-    "--model", type=click.Path(path_type=Path), metavar="FILE", help="Model of the object, written by `catstream save`."
-)
+
+def with_model(command: _Command) -> _Command:
+    """Add `--model`, which may be repeated, as the argument `models`: a dict of files by the names of the objects."""
+
+    @click.option(
+        "--model",
+        "files",
+        multiple=True,
+        metavar="[NAME=]FILE",
+        help="Model of an object, written by `catstream save`.",
+    )
+    @wraps(command)
+    def wrapped(files: tuple[str, ...], **options: object) -> None:
+        command(models={name: Path(file) for name, file in named("--model", files).items()}, **options)
+
+    return cast(_Command, wrapped)
 
 
 def with_object(command: _Command) -> _Command:
-    """Add `--box` and `--model`, of which at most one may be given, as the arguments `box` and `model`."""
+    """Add `--box` and `--model`, which may be repeated, as the arguments `boxes` and `models`: dicts by name."""
 
-    @click.option("--box", metavar="X,Y,W,H", help="The object in the first frame, in pixels.")
+    @click.option(
+        "--box",
+        "texts",
+        multiple=True,
+        metavar="[NAME=]X,Y,W,H",
+        help="An object in the first frame, in pixels; may be repeated with names.",
+    )
     @with_model
     @wraps(command)
-    def wrapped(box: str | None, model: Path | None, **options: object) -> None:
-        if box is not None and model is not None:
-            raise click.UsageError(
-                "--box gives the position of the object, and --model searches for it: give one of them"
-            )
-        command(box=Box.parse(box) if box is not None else None, model=model, **options)
+    def wrapped(texts: tuple[str, ...], **options: object) -> None:
+        command(boxes=boxes_by_name(named("--box", texts)), **options)
 
     return cast(_Command, wrapped)
+
+
+def named(option: str, texts: Iterable[str]) -> dict[str, str]:
+    """Return the values of an option by the names of the objects, from texts NAME=VALUE; the name "" if it has none.
+
+    Raises
+    ------
+    ObjectError
+        If a name is not valid, or two values have the same name.
+
+    Examples
+    --------
+    >>> named("--box", ["anna=120,80,64,48", "ben=300,90,60,150"])
+    {'anna': '120,80,64,48', 'ben': '300,90,60,150'}
+    """
+    values: dict[str, str] = {}
+    for text in texts:
+        name, value = split_name(text)
+        if name in values and name:
+            raise ObjectError(f"{option} {name}={values[name]} and {option} {text}: give each object its own name")
+        if name in values:
+            raise ObjectError(f"{option} {values[name]} and {option} {text}: give each object a name, NAME={value}")
+        values[name] = value
+    return values
 
 
 def with_part(command: _Command) -> _Command:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -11,6 +12,7 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
 from catstream.messages import Track
+from catstream.names import UNNAMED
 from catstream.pipeline import Pipeline
 from catstream.sinks.sink import STDOUT
 
@@ -42,29 +44,47 @@ class _Line(ProgressColumn):
         return Text("  ".join(parts), no_wrap=True, overflow="ellipsis")
 
 
-class RunProgress:
-    """Counts the tracks of a run, and shows them during the run and at its end."""
+@dataclass(slots=True)
+class _Object:
+    """The counters of an object: frames in which it was tracked, and present; the newest version of its model."""
 
-    def __init__(self, pipeline: Pipeline) -> None:
+    frames: int = 0
+    present: int = 0
+    version: int = 0
+
+
+class RunProgress:
+    """Counts the tracks of a run, and shows them during the run and at its end.
+
+    Parameters
+    ----------
+    names : the objects of the earlier part of a resumed run, in the order in which they appeared
+    """
+
+    def __init__(self, pipeline: Pipeline, names: Iterable[str] = ()) -> None:
         self._pipeline = pipeline
         self._started = time.perf_counter()
         self._first = 0.0
         self._shown = 0.0
-        self.frames = self.present = 0
-        self.version = 0
+        self.frames = 0
+        self._objects = {name: _Object() for name in names}
 
     def progress(self, console: Console) -> Progress:
         progress = Progress(_Line(self._pipeline, console), console=console, transient=True, refresh_per_second=8)
         self._task = progress.add_task("", total=self._pipeline.frames, state="starting", figures=())
         return progress
 
-    def show(self, progress: Progress, found: Track) -> None:
+    def show(self, progress: Progress, tracks: Mapping[str, Track]) -> None:
+        """Count the tracks of a frame, and show them if the last ones were shown a while ago."""
         now = time.perf_counter()
         if not self.frames:
             self._first = now - self._started
         self.frames += 1
-        self.present += found.box is not None
-        self.version = found.model_version
+        for name, track in tracks.items():
+            each = self._objects.setdefault(name, _Object())
+            each.frames += 1
+            each.present += track.box is not None
+            each.version = track.model_version
         if now - self._shown < 0.1:
             return
         self._shown = now
@@ -72,17 +92,19 @@ class RunProgress:
         figures = (
             f"{self._rate(now):.0f} frames/s",
             *([f"{self._detector('skipped'):.0f} skipped"] if self._pipeline.live else []),
-            f"score {found.score:+.2f}",
-            f"model {found.model_version}",
+            *_figures(tracks),
             f"{leaves:.0f} leaves",
         )
-        progress.update(self._task, completed=self.frames, state=found.state, figures=figures)
+        progress.update(self._task, completed=self.frames, state=_state(tracks), figures=figures)
 
     def summary(self, results: Sequence[Path]) -> str:
-        lines = [
-            f"{self.frames} frames, present in {self.present}, {self._rate(time.perf_counter()):.0f} frames/s, "
-            f"first track after {self._first:.2f} s, model version {self.version}"
-        ]
+        """The closing lines of the run."""
+        rate = f"{self._rate(time.perf_counter()):.0f} frames/s, first track after {self._first:.2f} s"
+        if self._objects.keys() == {UNNAMED}:
+            alone = self._objects[UNNAMED]
+            lines = [f"{self.frames} frames, present in {alone.present}, {rate}, model version {alone.version}"]
+        else:
+            lines = [f"{self.frames} frames, {rate}", *self._of_each()]
         if self._pipeline.live:
             lines.append(
                 f"live: {self._detector('skipped'):.0f} frames skipped, "
@@ -98,11 +120,33 @@ class RunProgress:
             lines.append(f"results: {', '.join(written)}")
         return "\n".join(lines)
 
+    def _of_each(self) -> Iterator[str]:
+        """A line for each object; the numbers are the ids in MOT text."""
+        for number, (name, each) in enumerate(self._objects.items(), 1):
+            frames = f"present in {each.present} of {each.frames} frames, model version {each.version}"
+            yield f"  {number} {name or '(no name)'}: {frames}"
+
     def _detector(self, counter: str) -> float:
         return self._pipeline.health.get("detector", {}).get(counter, 0)
 
     def _rate(self, now: float) -> float:
         return (self.frames - 1) / max(now - self._started - self._first, 1e-9)
+
+
+def _state(tracks: Mapping[str, Track]) -> str:
+    """The state of the only object, or how many objects are present."""
+    if len(tracks) == 1:
+        (track,) = tracks.values()
+        return track.state
+    return f"{sum(track.box is not None for track in tracks.values())}/{len(tracks)} present"
+
+
+def _figures(tracks: Mapping[str, Track]) -> list[str]:
+    """Score and model version of the only object, or the name and score of each."""
+    if len(tracks) == 1:
+        (track,) = tracks.values()
+        return [f"score {track.score:+.2f}", f"model {track.model_version}"]
+    return [f"{name or '(no name)'} {track.score:+.2f}" for name, track in tracks.items()]
 
 
 def _shown(path: Path) -> str:

@@ -44,8 +44,8 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
       .ndjson    one JSON object for each track, one per line; also .jsonl
       -          the same, on standard output
       .json      one array of such objects, closed at the end
-      .csv       a row for each frame: frame, seconds, state, box, score, model version
-      .txt       MOT text: frame,1,x,y,w,h,score,-1,-1,-1, counted from 1
+      .csv       a row for each track: frame, seconds, state, box, score, model version, object
+      .txt       MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1
       .sqlite    the table tracks, in write-ahead mode: it can be read meanwhile
       .parquet   written at the end, from the rows in FILE.parquet.sqlite
       .mp4       the frames of a file or folder (--source) with their tracks, with
@@ -62,7 +62,8 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
         check_writable(path)
     interrupts = Interrupts()
     interrupts.install()
-    written, newest, max_repeats, reason = 0, -1, 0, ""
+    written, max_repeats, reason = 0, 0, ""
+    newest: dict[str, int] = {}  # frame of the last track of each object
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             place = wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
@@ -70,19 +71,20 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in tracks:
                 max_repeats = max_repeats or _max_repeats(place)
-                if newest - track.frame > max_repeats:
+                if max(newest.values(), default=-1) - track.frame > max_repeats:
                     reason = ": the run had no end, and another one started"
                     break
-                if track.frame <= newest:  # a restarted detector repeats some frames
+                if track.frame <= newest.get(track.object, -1):  # a restarted detector repeats some frames
                     continue
                 with interrupts.deferred():  # a track is written to all files or to none
                     for each in sinks:
-                        each.write(track)
-                    written, newest = written + 1, track.frame
-                status.update(f"frame {newest}, {tracks.missed} missed")
+                        each.write([track])
+                    written, newest[track.object] = written + 1, track.frame
+                status.update(f"frame {track.frame}, {tracks.missed} missed")
         if tracks.end is not None:
             reason = f": {tracks.end.reason}"
-        click.echo(f"{written} tracks, {tracks.losses()}{reason}", err=True)
+        of = f" of {', '.join(newest)}" if any(newest) else ""
+        click.echo(f"{written} tracks{of}, {tracks.losses()}{reason}", err=True)
 
 
 def _max_repeats(place: Endpoint) -> int:

@@ -1,10 +1,10 @@
-"""`catstream track`: track an object in a video."""
+"""`catstream track`: track objects in a video."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from catstream.job import Job, Results
 from catstream.messages import Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
-from catstream.services.options import with_given, with_object, with_part, with_reading
+from catstream.services.options import named, with_given, with_object, with_part, with_reading
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT
 from catstream.storage import is_writable
@@ -39,7 +39,9 @@ _FOLDER = _FILE = click.Path(path_type=Path)
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--write", type=_FILE, multiple=True, metavar="FILE", help="Also write the tracks to FILE; - for stdout.")
 @click.option("--overwrite", is_flag=True, help="Replace existing results.")
-@click.option("--save-model", type=_FILE, metavar="FILE", help="Save the model to FILE at the end.")
+@click.option(
+    "--save-model", multiple=True, metavar="[NAME=]FILE", help="Save the model of an object to FILE at the end."
+)
 @click.option("--record", type=click.Path(path_type=Path), help="Record the run to a file for `catstream replay`.")
 @click.option(
     "--view",
@@ -61,13 +63,13 @@ def track(
     given: dict[str, object],
     part: slice,
     source: str | None,
-    box: Box | None,
-    model: Path | None,
+    boxes: dict[str, Box],
+    models: dict[str, Path],
     output: Path | None,
     video: bool,
     write: tuple[Path, ...],
     overwrite: bool,
-    save_model: Path | None,
+    save_model: tuple[str, ...],
     record: Path | None,
     view: Address | None,
     token: str | None,
@@ -75,11 +77,15 @@ def track(
     state: Path | None,
     resume: Path | None,
 ) -> None:
-    """Track an object in a video.
+    """Track one or several objects in a video.
 
-    The object is given by its box in the first frame, or by a saved model. If
-    neither is given, tracking starts after `catstream set-box`, or after a box
-    is drawn on the web page.
+    An object is given by its box in the first frame, or by a saved model. If
+    none is given, tracking starts after `catstream set-box`, or after a box is
+    drawn on the web page.
+
+    Several objects have names: --box NAME=X,Y,W,H or --model NAME=FILE for each
+    of them. More can be added, and others forgotten, while the run goes on:
+    `catstream set-box NAME=X,Y,W,H` and `catstream forget NAME`.
 
     SOURCE is a video file, a folder of images, a pattern like
     images/%05d.png, a camera (0 or /dev/video0), or a stream (rtsp://... or
@@ -100,18 +106,20 @@ def track(
       OUTPUT/NAME.txt               x,y,w,h of each frame, nan if the object is absent
       OUTPUT/NAME_confidence.value  score of each frame
       OUTPUT/NAME_time.txt          seconds for each frame
-      OUTPUT/NAME.csv               frame, seconds, state, box, score, model version
+      OUTPUT/NAME.csv               frame, seconds, state, box, score, model version, object
       OUTPUT/NAME.mp4               with --video
 
     NAME is the name of the source, so that several sources can share a folder.
+    NAME.csv has a row for each object and frame. The first three files are of
+    one object: NAME-anna.txt is that of anna.
 
     \b
-    --write FILE, may be repeated; each file contains every frame
+    --write FILE, may be repeated; each file contains every object and frame
       .ndjson .jsonl   one JSON object per line, with the fields of a track
       -                the same, on standard output
       .json            one array of such objects
       .csv             as OUTPUT/NAME.csv
-      .txt             MOT text: frame,1,x,y,w,h,score,-1,-1,-1, counted from 1
+      .txt             MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1
       .sqlite          the table tracks; it can be read during the run
       .parquet         needs pip install "catstream[parquet]"
       .mp4             the frames with their tracks drawn in
@@ -124,6 +132,7 @@ def track(
       catstream track frames/ --box 120,80,64,48 --output out --set coreset.size=128
       catstream track walk.mp4 --box 120,80,64,48 --write tracks.parquet
       catstream track walk.mp4 --box 120,80,64,48 --write - | jq .box
+      catstream track walk.mp4 --box anna=120,80,64,48 --box ben=300,90,60,150 --video --output out
       catstream track walk.mp4 --box 120,80,64,48 --save-model walker.safetensors
       catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
       catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
@@ -144,42 +153,42 @@ def track(
             "--resume continues the existing results, and --overwrite replaces them: give one of them"
         )
     known = Job.load(resume).results if resume is not None else Results()
-    results = _results(known, output, video, write, save_model)
+    saved = {name: Path(file) for name, file in named("--save-model", save_model).items()}
+    results = _results(known, output, video, write, saved)
     pipeline = Pipeline(
         source,
-        box,
+        boxes or None,
         given | ({"run.lockstep": True} if lockstep else {}),
-        model=model,
+        model=models or None,
         part=part,
         state=state,
         record=record,
         resume=resume,
         results=results,
-        save_model=results.save_model,
+        save_model=results.models,
     )
     if view is not None:
         require_extra("view")
-    files = _files(pipeline, results, STDOUT in write)
+    files = _files(pipeline, results, STDOUT in write, [*boxes, *models])
     files.check_writable(
         overwrite=overwrite,
         resumable=state is not None or resume is not None,
         known=[*known.write, *([known.output] if known.output is not None else [])],
     )
-    if save_model is not None:
-        _check_model(save_model, overwrite)
+    _check_models(saved, overwrite)
     if resume is not None:
         pipeline = pipeline.starting_after(files.position())
     output = results.output
     console = Console(stderr=True, soft_wrap=True)
     if resume is not None and pipeline.complete:
-        if box is not None:
+        if boxes:
             raise click.UsageError(f"{_complete(pipeline, resume, output)}: no frame is left for a box")
         if not files.complete:
             with files.opened(resume=True):  # creates new files, and closes those that were not closed
                 pass
         console.print(_complete(pipeline, resume, output), highlight=False)
         return
-    run = RunProgress(pipeline)
+    run = RunProgress(pipeline, files.names() if resume is not None else ())
     serve = partial(_serve, pipeline, view, token, console) if view is not None else None
     try:
         interrupted = _run(pipeline, files, run, console, serve, resumed=resume is not None)
@@ -235,15 +244,15 @@ def _write_tracks(
 ) -> None:
     """Write every track to all files, and show the progress."""
     with run.progress(console) as progress, ExitStack() as stack:
-        write: Callable[[Track, float], None] | None = None
+        write: Callable[[Mapping[str, Track], float], None] | None = None
         moment = time.perf_counter()
-        for track in pipeline:
+        for tracks in pipeline.by_frame():
             # The files are opened with the first track: a run that cannot start does not change older results.
             write = write or stack.enter_context(files.opened(resume=resumed))
             before, moment = moment, time.perf_counter()
             with interrupts.deferred():  # so that a frame is in all results or in none
-                write(track, moment - before)
-                run.show(progress, track)
+                write(tracks, moment - before)
+                run.show(progress, tracks)
 
 
 def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
@@ -256,7 +265,7 @@ def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
 
 
 def _results(
-    known: Results, output: Path | None, video: bool, write: tuple[Path, ...], save_model: Path | None
+    known: Results, output: Path | None, video: bool, write: tuple[Path, ...], models: Mapping[str, Path]
 ) -> Results:
     """The files of a run, including those of its earlier part; the paths are absolute, to resume from any folder."""
     files = tuple(file.absolute() for file in write if file != STDOUT)
@@ -264,11 +273,11 @@ def _results(
         output=output.absolute() if output is not None else known.output,
         video=video or known.video,
         write=files or known.write,
-        save_model=save_model.absolute() if save_model is not None else known.save_model,
+        models={name: file.absolute() for name, file in models.items()} or known.models,
     )
 
 
-def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
+def _files(pipeline: Pipeline, results: Results, stdout: bool, objects: Sequence[str]) -> RunFiles:
     """The files to which the tracks are written, including the standard output if requested."""
     files = RunFiles(
         pipeline.name,
@@ -278,6 +287,7 @@ def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
         results.video,
         [*results.write, *([STDOUT] if stdout else [])],
         pipeline.settings.run.image_rate,
+        objects,
     )
     if files.video and files.output is None:
         raise click.UsageError("--video requires --output, the folder for the video")
@@ -288,14 +298,18 @@ def _files(pipeline: Pipeline, results: Results, stdout: bool) -> RunFiles:
     return files
 
 
-def _check_model(file: Path, overwrite: bool) -> None:
-    if file.exists() and not overwrite:
-        raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
-    if file.is_dir() or not is_writable(file.parent):
-        raise ServiceError(f"cannot write {file}: give a file in a folder that exists and that you may write to")
+def _check_models(files: Mapping[str, Path], overwrite: bool) -> None:
+    """Raise ServiceError if one of the files for models cannot be written."""
+    for name, file in files.items():
+        if file.exists() and not overwrite:
+            raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
+        if file.is_dir() or not is_writable(file.parent):
+            raise ServiceError(f"cannot write {file}: give a file in a folder that exists and that you may write to")
+        if any(file == other for named, other in files.items() if named != name):
+            raise ServiceError(f"{file} is named twice: give each object its own file")
 
 
 def _ways_to_set_box(pipeline: Pipeline, page: bool) -> str:
     place = f"--endpoint {pipeline.endpoint}"
     drawn = "draw one on the page" if page else f"draw one on the page of catstream view {place}"
-    return f"{drawn}, or run catstream set-box X,Y,W,H {place}"
+    return f"{drawn}, or run catstream set-box [NAME=]X,Y,W,H {place}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import IO
 
@@ -65,9 +65,9 @@ class StdoutSink(NdjsonSink):
     def _open(self, _: int | None) -> IO[str]:
         return sys.stdout
 
-    def write(self, track: Track) -> None:
-        """Write a track and flush it."""
-        super().write(track)
+    def write(self, tracks: Sequence[Track]) -> None:
+        """Write the tracks of a frame and flush them."""
+        super().write(tracks)
         with self._translated_errors():
             self._file.flush()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -16,7 +16,7 @@ __all__ = ["LineSink"]
 
 
 class LineSink(ABC):
-    """Base class of text formats: each track is written at once; `line` formats a track, and `track` parses a line.
+    """Base class of text formats: `line` formats a track, and `track` parses a line. Each frame is written at once.
 
     Parameters
     ----------
@@ -51,14 +51,16 @@ class LineSink(ABC):
         for _, track in cls._lines(path):
             yield track
 
-    def write(self, track: Track) -> None:
-        """Add a track."""
-        text = self.line(track)
-        if text is None:
-            return
-        with self._translated_errors():
-            self._file.write(text + "\n")
-        self.rows += 1
+    def write(self, tracks: Sequence[Track]) -> None:
+        """Add the tracks of a frame, in one write."""
+        lines: list[str] = []
+        for track in tracks:
+            if (line := self.line(track)) is not None:
+                lines.append(line + "\n")
+                self.rows += 1
+        if lines:
+            with self._translated_errors():
+                self._file.write("".join(lines))
 
     def close(self) -> None:
         """Close the file."""

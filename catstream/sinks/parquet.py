@@ -7,13 +7,14 @@ A Parquet file cannot be extended. Until the sink is closed, its tracks are rows
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.extras import require_extra
 from catstream.messages import Track
+from catstream.sinks.frames import by_frame
 from catstream.sinks.sqlite import SqliteSink, track_of
 
 __all__ = ["ParquetSink", "database_of"]
@@ -42,9 +43,9 @@ class ParquetSink:
         closed = path.exists() and not self._database.exists()
         self._rows = SqliteSink(self._database, keep)
         if keep is not None and closed:
-            for track in _read(path):
-                if track.frame < keep:
-                    self._rows.write(track)
+            for tracks in by_frame(_read(path)):
+                if tracks[0].frame < keep:
+                    self._rows.write(tracks)
 
     @classmethod
     def tracks(cls, path: Path) -> Iterator[Track]:
@@ -54,9 +55,9 @@ class ParquetSink:
         elif path.exists():
             yield from _read(path)
 
-    def write(self, track: Track) -> None:
-        """Add a track."""
-        self._rows.write(track)
+    def write(self, tracks: Sequence[Track]) -> None:
+        """Add the tracks of a frame."""
+        self._rows.write(tracks)
 
     def close(self) -> None:
         """Write the file, which gets its name once it is complete, and remove the database."""
@@ -92,7 +93,7 @@ def _export(database: Path, path: Path) -> None:
         with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=rw", uri=True)) as tracks:
             names = tracks.execute("SELECT name, type FROM pragma_table_info('tracks')").fetchall()
             schema = arrow.schema([(name, kinds[kind]) for name, kind in names])
-            cursor = tracks.execute("SELECT * FROM tracks ORDER BY frame")
+            cursor = tracks.execute("SELECT * FROM tracks ORDER BY frame, rowid")
             with arrow.parquet.ParquetWriter(part, schema) as writer:
                 while batch := cursor.fetchmany(_ROWS):
                     columns = zip(zip(*batch, strict=True), schema.types, strict=True)

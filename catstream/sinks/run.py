@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
+from typing import NamedTuple
 
+from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import ObjectPosition, Position, Track
+from catstream.names import UNNAMED
+from catstream.sinks.frames import FIRST, by_frame, in_order, objects_of, whole_frames
 from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, file_exists, is_closed, open_sink, reader
 from catstream.storage import is_writable
 from catstream.video import results
@@ -24,9 +29,9 @@ __all__ = ["RunFiles"]
 class RunFiles:
     """The files to which a run writes its tracks.
 
-    A resumed run continues after the last frame that all files hold. Rows after it, which a power cut left in some of
-    the files, are removed. New files, and formats that do not hold all tracks (video, MOT text), start at the first
-    frame again, with the tracks from another file.
+    A resumed run continues after the last frame that all files hold whole, see `catstream.sinks.frames`. Rows after it,
+    which a power cut left in some of the files, are removed. New files, and formats that do not hold all tracks (video,
+    MOT text), start at the first frame again, with the tracks from another file.
 
     name    of the results files: that of the source
     source  of the frames of a video
@@ -35,6 +40,7 @@ class RunFiles:
     video   whether the results include a video
     files   further files for tracks, see `catstream.sinks.sink`
     rate    frames per second of a folder of images
+    objects names of the objects in the first frame, as far as they are known before it
     """
 
     name: str
@@ -44,6 +50,7 @@ class RunFiles:
     video: bool = False
     files: Sequence[Path] = ()
     rate: float = RATE
+    objects: Sequence[str] = ()
 
     def check_writable(self, *, overwrite: bool, resumable: bool, known: Sequence[Path] = ()) -> None:
         """Raise VideoError if one of the files cannot be written; to be called before the run starts.
@@ -92,15 +99,22 @@ class RunFiles:
         if self.output is None and not any(map(reader, self.files)):
             return None
         earlier = self._earlier()
-        frames = min((count for count, _ in earlier), default=0)
-        found = {
-            track.object: ObjectPosition(track.box) for track in self._tracks(earlier, frames) if track.box is not None
-        }
-        return Position(frames, max(frames - 1, 0), found)
+        frames = _common(earlier)
+        boxes: dict[str, Box | None] = {}
+        objects: list[str] = []
+        for tracks in _frames(earlier):
+            objects = [track.object for track in tracks]
+            boxes |= {track.object: track.box for track in tracks if track.box is not None}
+        return Position(frames, max(frames - 1, 0), {name: ObjectPosition(boxes.get(name)) for name in objects})
+
+    def names(self) -> list[str]:
+        """Return the names of the objects in the files, in the order in which they appeared."""
+        return list(dict.fromkeys(track.object for tracks in _frames(self._earlier()) for track in tracks))
 
     @contextmanager
-    def opened(self, *, resume: bool = False) -> Iterator[Callable[[Track, float], None]]:
-        """Yield a function that writes a track, and the seconds that it took, to all files; then close the files.
+    def opened(self, *, resume: bool = False) -> Iterator[Callable[[Mapping[str, Track], float], None]]:
+        """Yield a function that writes the tracks of a frame, and the seconds that it took, to all files; then close
+        the files.
 
         Parameters
         ----------
@@ -112,14 +126,16 @@ class RunFiles:
             If a file cannot be written; also later, from the function and at the end.
         """
         earlier = self._earlier() if resume else []
-        keep = min((count for count, _ in earlier), default=0) if resume else None
+        keep = _common(earlier) if resume else None
         rows: list[ResultsWriter] = []
         sinks: list[Sink] = []
-        restarted: list[Callable[[Track], None]] = []  # write to the files that start at the first frame again
+        restarted: list[Callable[[Sequence[Track]], None]] = []  # write to the files that start at frame 0 again
         with ExitStack() as stack:
             if self.output is not None:
                 new = not (self.output / results.table_file(self.name)).exists()
                 discard(self._video_file())
+                if not resume:
+                    self._discard_objects(self.output)
                 writer = stack.enter_context(ResultsWriter(self.output, self.name, keep=keep))
                 rows.append(writer)
                 restarted += [partial(writer.write, seconds=float("nan"))] if new else []
@@ -132,15 +148,20 @@ class RunFiles:
                 )
                 sinks.append(sink)
                 restarted += [sink.write] if new and file != STDOUT else []
-            for track in self._tracks(earlier, keep or 0) if restarted else ():
+            before = FIRST
+            for tracks in _frames(earlier):
+                before = objects_of(tracks)
                 for write_again in restarted:
-                    write_again(track)
+                    write_again(tracks)
 
-            def write(track: Track, seconds: float) -> None:
+            def write(tracks: Mapping[str, Track], seconds: float) -> None:
+                nonlocal before
+                ordered = in_order(tracks, before)
+                before = objects_of(ordered)
                 for writer in rows:
-                    writer.write(track, seconds)
+                    writer.write(ordered, seconds)
                 for sink in sinks:
-                    sink.write(track)
+                    sink.write(ordered)
 
             yield write
 
@@ -148,25 +169,66 @@ class RunFiles:
         """Return the results files, including the video."""
         if self.output is None:
             return []
-        return [*(self.output / file for file in results.result_files(self.name)), self._video_file()]
+        files = results.result_files(self.name, self.objects or [UNNAMED])
+        return [*(self.output / file for file in files), self._video_file()]
+
+    def _discard_objects(self, folder: Path) -> None:
+        """Remove the files of objects with names that are to be replaced, and those of an earlier run."""
+        earlier = {track.object for track in results.read_tracks(folder, self.name)}
+        for name in {*self.objects, *earlier} - {UNNAMED}:
+            for file in results.object_files(self.name, name):
+                (folder / file).unlink(missing_ok=True)
 
     def _video_file(self) -> Path:
         return (self.output or Path()) / f"{self.name}.mp4"
 
-    def _earlier(self) -> list[tuple[int, Callable[[], Iterator[Track]]]]:
-        """Return the number of frames in each existing file that holds all tracks, and the function that reads them."""
-        found: list[tuple[int, Callable[[], Iterator[Track]]]] = []
+    def _earlier(self) -> list[_Earlier]:
+        """Return the existing files that hold all tracks."""
+        found: list[_Earlier] = []
         if self.output is not None and (self.output / results.table_file(self.name)).exists():
-            count = results.complete_frames(self.output, self.name)
-            found.append((count, partial(results.read_tracks, self.output, self.name)))
+            read = partial(results.read_tracks, self.output, self.name)
+            found.append(_Earlier(read, _frames_before(read, self._complete_rows(self.output, read))))
         for file in self.files:
-            read = reader(file)
-            if read is not None and file_exists(file):
-                found.append((max((track.frame + 1 for track in read(file)), default=0), partial(read, file)))
+            format_reader = reader(file)
+            if format_reader is not None and file_exists(file):
+                read = partial(format_reader, file)
+                found.append(_Earlier(read, _frames_before(read)))
         return found
 
-    @staticmethod
-    def _tracks(earlier: list[tuple[int, Callable[[], Iterator[Track]]]], frames: int) -> Iterator[Track]:
-        """Yield the tracks of the earlier part of the run."""
-        read = earlier[0][1] if earlier else lambda: iter(())
-        return takewhile(lambda track: track.frame < frames, read())
+    def _complete_rows(self, folder: Path, read: Callable[[], Iterator[Track]]) -> int:
+        """Return the number of frames of which the files of all objects in the table have a row."""
+        first: dict[str, int] = {}
+        for tracks in whole_frames(read()):
+            for track in tracks:
+                first.setdefault(track.object, track.frame)
+        # Rows before the first frame of an object can be written again: they have no box.
+        rows = [max(results.complete_rows(folder, self.name, name), frame) for name, frame in first.items()]
+        return min(rows, default=0)
+
+
+class _Earlier(NamedTuple):
+    """A file with the tracks of the earlier part of a run.
+
+    read    yields its tracks
+    frames  number of the last whole frame that it holds, plus one
+    """
+
+    read: Callable[[], Iterator[Track]]
+    frames: int
+
+
+def _frames_before(read: Callable[[], Iterator[Track]], end: int = sys.maxsize) -> int:
+    """Return the number of the last whole frame before `end`, plus one."""
+    return max((tracks[0].frame + 1 for tracks in whole_frames(read()) if tracks[0].frame < end), default=0)
+
+
+def _common(earlier: Sequence[_Earlier]) -> int:
+    """Return the number of the last whole frame that all files hold, plus one."""
+    return min((file.frames for file in earlier), default=0)
+
+
+def _frames(earlier: Sequence[_Earlier]) -> Iterator[list[Track]]:
+    """Yield the tracks of each frame that all files hold."""
+    if earlier:
+        end = _common(earlier)
+        yield from takewhile(lambda tracks: tracks[0].frame < end, by_frame(earlier[0].read()))

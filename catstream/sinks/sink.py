@@ -2,7 +2,7 @@
 
 tracks.ndjson    a JSON object on each line, with the fields of `Track`; also tracks.jsonl, and - for standard output
 tracks.json      one array of such objects
-tracks.csv       a row for each frame, as in the results of `catstream track`
+tracks.csv       a row for each object and frame, as in the results of `catstream track`
 tracks.txt       MOT text, as the tools of MOTChallenge read it
 tracks.sqlite    a table in a database that other programs may read meanwhile
 tracks.parquet   a column store, written when it is closed
@@ -11,7 +11,7 @@ walk.mp4         the video with the tracks drawn in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -35,10 +35,10 @@ STDOUT = Path("-")
 
 
 class Sink(Protocol):
-    """Takes the tracks in order, each frame once. A track that was written survives a crash, except in a video."""
+    """Takes the tracks in the order of frames. A track that was written survives a crash, except in a video."""
 
-    def write(self, track: Track) -> None:
-        """Add a track; raise VideoError if it cannot be written."""
+    def write(self, tracks: Sequence[Track]) -> None:
+        """Add the tracks of a frame; raise VideoError if they cannot be written."""
 
     def close(self) -> None:
         """Complete the file; raise VideoError if it cannot be written. The tracks written before remain."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -16,20 +16,22 @@ __all__ = ["SqliteSink", "track_of"]
 
 _TABLE = """
 CREATE TABLE IF NOT EXISTS tracks (
-    frame         INTEGER PRIMARY KEY,
+    frame         INTEGER NOT NULL,
     seq           INTEGER NOT NULL,
     seconds       REAL NOT NULL,  -- since the start of the source
     state         TEXT NOT NULL,  -- bootstrapping, present, absent
     x REAL, y REAL, w REAL, h REAL,  -- pixels; NULL if absent
     score         REAL NOT NULL,
     model_version INTEGER NOT NULL,
-    pts           REAL  -- time stamp in a live stream
+    pts           REAL,  -- time stamp in a live stream
+    object        TEXT NOT NULL,  -- '' if it has no name
+    PRIMARY KEY (frame, object)
 ) STRICT
 """
 
 
 class SqliteSink:
-    """Tracks as rows of the table `tracks`, each in a transaction of its own.
+    """Tracks as rows of the table `tracks`; those of a frame are one transaction.
 
     Parameters
     ----------
@@ -59,7 +61,7 @@ class SqliteSink:
 
     @classmethod
     def tracks(cls, path: Path) -> Iterator[Track]:
-        """Yield the tracks of a database in order of frames; none if the file does not exist.
+        """Yield the tracks of a database in the order in which they were written; none if the file does not exist.
 
         Raises
         ------
@@ -70,20 +72,25 @@ class SqliteSink:
             return
         try:
             with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as database:
-                for row in database.execute("SELECT * FROM tracks ORDER BY frame"):
+                for row in database.execute("SELECT * FROM tracks ORDER BY frame, rowid"):
                     yield track_of(row)
         except sqlite3.Error as error:
             raise VideoError(f"cannot read {path} ({error}): is it a database of tracks?") from None
 
-    def write(self, track: Track) -> None:
-        """Add a track."""
-        row = (
-            *(track.frame, track.seq, track.time, track.state),
-            *(track.box or [None] * 4),
-            *(track.score, track.model_version, track.pts),
-        )
+    def write(self, tracks: Sequence[Track]) -> None:
+        """Add the tracks of a frame."""
+        rows = [
+            (
+                *(track.frame, track.seq, track.time, track.state),
+                *(track.box or [None] * 4),
+                *(track.score, track.model_version, track.pts, track.object),
+            )
+            for track in tracks
+        ]
         try:
-            self._database.execute("INSERT INTO tracks VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+            self._database.execute("BEGIN")
+            self._database.executemany("INSERT INTO tracks VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            self._database.execute("COMMIT")
         except sqlite3.Error as error:
             raise VideoError(f"cannot write to {self.path} any more: {error}") from None
 
@@ -94,5 +101,5 @@ class SqliteSink:
 
 def track_of(row: tuple[Any, ...]) -> Track:
     """Return the track of a row of the table."""
-    frame, seq, seconds, state, x, y, w, h, score, version, pts = row
-    return Track(seq, frame, seconds, state, None if x is None else Box(x, y, w, h), score, version, pts)
+    frame, seq, seconds, state, x, y, w, h, score, version, pts, name = row
+    return Track(seq, frame, seconds, state, None if x is None else Box(x, y, w, h), score, version, pts, name)

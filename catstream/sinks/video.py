@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.messages import Track
 from catstream.video.annotate import AnnotatedVideo
-from catstream.video.frames import RATE
+from catstream.video.frames import RATE, Frame
 from catstream.video.source import is_live, open_source
 
 __all__ = ["VideoSink"]
 
 
 class VideoSink:
-    """An MP4 of the frames that have a track, with the track drawn in; it gets its name when it is closed.
+    """An MP4 of the frames that have a track, with the tracks drawn in; it gets its name when it is closed.
+
+    The tracks of a frame may be written one after the other.
 
     Parameters
     ----------
@@ -34,21 +37,39 @@ class VideoSink:
             )
         # The pipeline either skips damaged frames or ends at the first: in both cases these are its frames.
         self._frames = open_source(source, part=part, image_rate=image_rate, skip_damaged=True)
+        self._frame: Frame | None = None  # the last one that has a track, which is not in the video yet
+        self._tracks: list[Track] = []
         try:
             self._video = AnnotatedVideo(path, self._frames.rate, self._frames.size, sound=self._frames.sound)
         except VideoError:
             self._frames.close()
             raise
 
-    def write(self, track: Track) -> None:
-        """Draw a track over its frame."""
-        for frame in self._frames:
-            if frame.number == track.frame:
-                self._video.write(frame.image, track, track.time)
-                return
-        raise VideoError(f"the source has no frame {track.frame}: is it what the pipeline follows?")
+    def write(self, tracks: Sequence[Track]) -> None:
+        """Draw tracks over their frame."""
+        for track in tracks:
+            if self._frame is None or track.frame != self._frame.number:
+                self._draw()
+                self._frame = self._read(track.frame)
+            self._tracks.append(track)
 
     def close(self) -> None:
         """Finish the video."""
-        self._frames.close()
-        self._video.close()
+        try:
+            self._draw()
+        finally:
+            self._frames.close()
+            self._video.close()
+
+    def _draw(self) -> None:
+        """Add the last frame that has a track to the video."""
+        frame, tracks = self._frame, self._tracks
+        self._frame, self._tracks = None, []
+        if frame is not None:
+            self._video.write(frame.image, tracks, tracks[0].time)
+
+    def _read(self, number: int) -> Frame:
+        for frame in self._frames:
+            if frame.number == number:
+                return frame
+        raise VideoError(f"the source has no frame {number}: is it what the pipeline follows?")

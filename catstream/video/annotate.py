@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -10,7 +11,9 @@ import cv2
 import numpy as np
 
 from catstream.box import Box
+from catstream.colours import Colours, rgb
 from catstream.messages import Preview, Track
+from catstream.names import UNNAMED
 from catstream.video.writer import VideoWriter
 
 __all__ = ["AnnotatedVideo", "draw", "draw_preview", "thumbnail"]
@@ -21,19 +24,25 @@ _Colour = tuple[int, int, int]
 
 _COLOURS: dict[str, _Colour] = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
 _WHITE, _GREY, _DARK, _ORANGE = (245, 245, 245), (110, 110, 110), (32, 32, 32), (40, 140, 255)
+#: Luminance from which text on a colour is dark.
+_LIGHT = 110
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 #: Height of the line of text below an image that is 640 pixels wide, and the smallest factor by which it is scaled.
 _TEXT_HEIGHT, _MIN_UNIT = 26, 0.75
 
 
-def draw(image: np.ndarray, track: Track) -> np.ndarray:
-    """Draw the box over a copy of a frame, and write state, score and model version below it.
+def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.ndarray:
+    """Draw the boxes over a copy of a frame, and a line of text below it.
+
+    An object that is alone and has no name is drawn in the colour of its state; its state, score and model version are
+    below the frame. Other objects have a colour each and their names at their boxes; their scores are below the frame.
 
     Parameters
     ----------
     image : uint8 (h, w, 3), blue green red
-    track : track of this frame
+    tracks : the tracks of this frame, at least one
+    colours : the colours of the objects, which are kept from frame to frame
 
     Returns
     -------
@@ -44,30 +53,37 @@ def draw(image: np.ndarray, track: Track) -> np.ndarray:
     canvas = np.zeros((height + _text_height(width), width, 3), np.uint8)
     picture = canvas[:height]
     picture[:] = image
-    colour = _COLOURS[track.state]
-    if track.box is not None:
-        x, y, w, h = track.box
-        _draw_box(picture, (x, y), (x + w, y + h), colour, width / 640)
-    _draw_text(canvas[height:], track, colour, unit)
+    is_alone = [track.object for track in tracks] == [UNNAMED]
+    drawn = [(track, _COLOURS[track.state] if is_alone else _bgr(colours.of(track.object))) for track in tracks]
+    for track, colour in drawn:
+        if track.box is not None:
+            x, y, w, h = track.box
+            _draw_box(picture, (x, y), (x + w, y + h), colour, width / 640)
+    for track, colour in drawn:  # over all boxes
+        if track.box is not None:
+            _draw_name(picture, track, colour, unit)
+    if is_alone:
+        _draw_text(canvas[height:], *drawn[0], unit)
+    else:
+        _draw_scores(canvas[height:], drawn, unit)
     return canvas
 
 
-def draw_preview(preview: Preview, track: Track | None) -> bytes:
-    """Draw the track of its frame into a preview, with a line of text below; the line is empty without a track.
+def draw_preview(preview: Preview, tracks: Sequence[Track], colours: Colours) -> bytes:
+    """Draw the tracks of its frame into a preview, with a line of text below; the line is empty without tracks.
 
     Returns
     -------
-    JPEG file, of the same size with and without a track
+    JPEG file, of the same size with and without tracks
     """
     image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         return preview.jpeg
-    if track is None:
+    if not tracks:
         image = np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
     else:
         scale = image.shape[1] / preview.width
-        box = None if track.box is None else Box(*(side * scale for side in track.box))
-        image = draw(image, replace(track, box=box))
+        image = draw(image, [_scaled(track, scale) for track in tracks], colours)
     return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
 
 
@@ -95,6 +111,15 @@ def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int)
     return cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
 
 
+def _scaled(track: Track, scale: float) -> Track:
+    return replace(track, box=None if track.box is None else Box(*(side * scale for side in track.box)))
+
+
+def _bgr(colour: str) -> _Colour:
+    red, green, blue = rgb(colour)
+    return blue, green, red
+
+
 def _text_height(width: int) -> int:
     """Return the height in pixels of the line of text below an image of this width."""
     return round(_TEXT_HEIGHT * max(width / 640, _MIN_UNIT))
@@ -110,6 +135,59 @@ def _draw_box(canvas: np.ndarray, start: _Point, end: _Point, colour: _Colour, u
         for y, down in ((top, 1), (bottom, -1)):
             corner = np.array([(x + way * arm, y), (x, y), (x, y + down * arm)], np.int32)
             cv2.polylines(canvas, [corner], False, colour, max(2, round(3 * unit)), cv2.LINE_AA)
+
+
+def _draw_name(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -> None:
+    """Write the name of an object in dark letters on its colour: above its box, or in it if there is no room above."""
+    if not track.object or track.box is None:
+        return
+    height, width = canvas.shape[:2]
+    scale, thick, margin = 0.45 * unit, max(1, round(unit)), max(2, round(3 * unit))
+    (long, high), below = cv2.getTextSize(track.object, _FONT, scale, thick)
+    deep = high + below + margin
+    left = min(max(round(track.box.x), 0), max(width - long - 2 * margin, 0))
+    top = round(track.box.y) - deep
+    top = min(max(top if top >= 0 else round(track.box.y), 0), height - deep)
+    cv2.rectangle(canvas, (left, top), (left + long + 2 * margin, top + deep), colour, cv2.FILLED)
+    baseline = (left + margin, top + high + margin // 2 + 1)
+    cv2.putText(canvas, track.object, baseline, _FONT, scale, _ink(colour), thick, cv2.LINE_AA)
+
+
+def _ink(colour: _Colour) -> _Colour:
+    """The colour of text on a colour: dark, or white on a dark one."""
+    blue, green, red = colour
+    return _DARK if 0.114 * blue + 0.587 * green + 0.299 * red > _LIGHT else _WHITE
+
+
+def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], unit: float) -> None:
+    """Write the name and score of each object, with a ring in place of the disc if it is absent, and the frame number;
+    if there is not enough room, the number of objects that are left out."""
+    height, width = canvas.shape[:2]
+    canvas[:] = _DARK
+    middle, line, thick = height // 2, height - round(9 * unit), max(1, round(unit))
+
+    def long(text: str) -> int:
+        return cv2.getTextSize(text, _FONT, 0.45 * unit, thick)[0][0]
+
+    def write(text: str, left: int) -> None:
+        cv2.putText(canvas, text, (left, line), _FONT, 0.45 * unit, _WHITE, thick, cv2.LINE_AA)
+
+    gap, left = round(12 * unit), round(8 * unit)
+    end = f"frame {drawn[0][0].frame}"
+    right = width - long(end) - gap
+    if right > left:
+        write(end, right)
+    for count, (track, colour) in enumerate(drawn):
+        text, rest = f"{track.object} {track.score:.2f}".strip(), f"+{len(drawn) - count}"
+        is_last = count == len(drawn) - 1
+        if left + gap + long(text) + (0 if is_last else gap + long(rest)) > right - gap:
+            if left + long(rest) < right:
+                write(rest, left)
+            return
+        disc = cv2.FILLED if track.box is not None else thick
+        cv2.circle(canvas, (left + round(4 * unit), middle), round(4 * unit), colour, disc, cv2.LINE_AA)
+        write(text, left + gap)
+        left += 2 * gap + long(text)
 
 
 def _draw_text(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -> None:
@@ -159,11 +237,12 @@ class AnnotatedVideo:
 
     def __init__(self, path: str | Path, rate: float, size: tuple[int, int], *, sound: Path | None = None) -> None:
         width, height = size
+        self._colours = Colours()
         self._writer = VideoWriter(path, rate, (width, height + _text_height(width)), sound=sound)
 
-    def write(self, image: np.ndarray, track: Track, time: float | None = None) -> None:
-        """Add a frame, uint8 (h, w, 3), with its track. `time` is as in `VideoWriter.write`."""
-        self._writer.write(draw(image, track), time)
+    def write(self, image: np.ndarray, tracks: Sequence[Track], time: float | None = None) -> None:
+        """Add a frame, uint8 (h, w, 3), with its tracks. `time` is as in `VideoWriter.write`."""
+        self._writer.write(draw(image, tracks, self._colours), time)
 
     def close(self) -> None:
         """Finish the file and give it its final name."""

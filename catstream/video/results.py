@@ -1,32 +1,34 @@
-"""Results of a run as text files with one row for each frame. Each row is flushed as it is written.
+"""Results of a run as text files, each row flushed as it is written.
 
-    NAME.txt               x,y,w,h in pixels; nan,nan,nan,nan if the object is absent
-    NAME_confidence.value  the score
-    NAME_time.txt          processing time of the frame in seconds
-    NAME.csv               frame, seconds since the start of the source, state, x, y, w, h, score, model_version
+    NAME.txt               x,y,w,h in pixels of each frame; nan,nan,nan,nan if the object is absent
+    NAME_confidence.value  the score of each frame
+    NAME_time.txt          processing time of each frame in seconds
+    NAME.csv               a row for each object and frame: frame, seconds since the start of the source, state,
+                           x, y, w, h, score, model_version, object
 
-The toolkits of the public benchmarks read the first three. Two lockstep runs
-write the same NAME.txt, NAME_confidence.value and NAME.csv, byte for byte;
-NAME_time.txt is measured and differs between runs.
+The toolkits of the public benchmarks read the first three. They are of one object: an object with a name has its own,
+NAME-OBJECT.txt and so on. Two lockstep runs write the same files, byte for byte, except for the measured NAME_time.txt.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Self, get_args
+from typing import IO, Self, get_args
 
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import State, Track
+from catstream.names import check_name
 
 __all__ = [
     "COLUMNS",
     "ResultsWriter",
-    "complete_frames",
+    "complete_rows",
     "format_row",
+    "object_files",
     "parse_row",
     "read_tracks",
     "result_files",
@@ -34,9 +36,10 @@ __all__ = [
 ]
 
 #: Header of NAME.csv.
-COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version"
+COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version,object"
 
-_ABSENT = "nan,nan,nan,nan"
+#: The row of a frame without a track in each of the files of an object.
+_NOTHING = ("nan,nan,nan,nan", "nan", "nan")
 
 
 def table_file(name: str) -> str:
@@ -44,22 +47,30 @@ def table_file(name: str) -> str:
     return f"{name}.csv"
 
 
-def result_files(name: str) -> tuple[str, ...]:
+def object_files(name: str, thing: str) -> tuple[str, ...]:
+    """Return the names of the files of one object, which have a row for every frame."""
+    stem = f"{name}-{thing}" if thing else name
+    return f"{stem}.txt", f"{stem}_confidence.value", f"{stem}_time.txt"
+
+
+def result_files(name: str, objects: Sequence[str]) -> tuple[str, ...]:
     """Return the names of all results files of a run."""
-    return (*_row_files(name), table_file(name))
+    return (*(file for thing in objects for file in object_files(name, thing)), table_file(name))
 
 
 def format_row(track: Track) -> str:
     """Return the row of a track in NAME.csv."""
     box = ",,," if track.box is None else _sides(track.box)
-    return f"{track.frame},{track.time:.6f},{track.state},{box},{track.score:.6f},{track.model_version}"
+    return f"{track.frame},{track.time:.6f},{track.state},{box},{track.score:.6f},{track.model_version},{track.object}"
 
 
 def parse_row(text: str) -> Track:
     """Return the track of a row of NAME.csv. Raises ValueError if it is not such a row."""
-    frame, seconds, state, x, y, w, h, score, version = text.split(",")
+    frame, seconds, state, x, y, w, h, score, version, thing = text.removesuffix("\n").split(",")
     box = Box(*map(float, (x, y, w, h))) if x else None
-    return Track(int(frame) + 1, int(frame), float(seconds), _state(state), box, float(score), int(version))
+    number = int(frame)
+    name = check_name(thing)
+    return Track(number + 1, number, float(seconds), _state(state), box, float(score), int(version), object=name)
 
 
 def _sides(box: Box) -> str:
@@ -69,16 +80,15 @@ def _sides(box: Box) -> str:
 class ResultsWriter:
     """Writes the results files of one run; a context manager.
 
-    Row k belongs to frame `start + k` of the source. A frame without a track (a live source skipped it) gets a row of
-    nan.
+    Row k of the files of an object belongs to frame k of the source. It is nan in a frame without a track: before the
+    object began, after it was forgotten, or if a live source skipped the frame.
 
     Parameters
     ----------
     directory : folder of the results; it is made if it does not exist
     name : name of the run, usually that of the source
-    start : number of the first frame
-    keep : append to the existing files after the frames before `keep` that are complete in every file; None replaces
-        the files
+    keep : continue the existing files after the frames before `keep`; None replaces the table and the files of an
+        object without a name, and a file of an object with a name must not exist
 
     Raises
     ------
@@ -86,48 +96,68 @@ class ResultsWriter:
         From the constructor if the folder cannot be written to; later if a write fails.
     """
 
-    def __init__(self, directory: str | Path, name: str, start: int = 0, *, keep: int | None = None) -> None:
-        self.directory = Path(directory)
-        self.rows = start
+    def __init__(self, directory: str | Path, name: str, *, keep: int | None = None) -> None:
+        self.directory, self.name = Path(directory), name
+        self.rows = 0
+        self._continues = keep is not None
+        self._objects: dict[str, list[IO[str]]] = {}  # the files of each object that has appeared
         try:
-            with contextlib.ExitStack() as stack:
+            with contextlib.ExitStack() as self._files:
                 self.directory.mkdir(parents=True, exist_ok=True)
+                table = self.directory / table_file(name)
+                objects: list[str] = []
                 if keep is not None:
-                    self.rows = _truncate(self.directory, name, keep)
-                self._boxes, self._scores, self._times, self._tracks = (
-                    stack.enter_context(
-                        (self.directory / file).open("w" if keep is None else "a", encoding="ascii", buffering=1)
-                    )
-                    for file in result_files(name)
-                )
-                if not self._tracks.tell():
-                    self._tracks.write(COLUMNS + "\n")
-                self._files = stack.pop_all()
+                    self.rows, objects = _truncate(table, keep)
+                self._table = self._open(table, "w" if keep is None else "a")
+                if not self._table.tell():
+                    self._table.write(COLUMNS + "\n")
+                for thing in objects:
+                    self._begin(thing)
+                self._files = self._files.pop_all()
         except OSError as error:
             raise VideoError(
                 f"cannot write results to {str(directory)!r} ({error.strerror}): "
                 "give a folder that exists or can be made, and that you have permission to write to"
             ) from None
 
-    def write(self, track: Track, seconds: float) -> None:
-        """Add the track of one frame and its processing time. A frame that already has a row is skipped."""
-        if track.frame < self.rows:
+    def write(self, tracks: Sequence[Track], seconds: float) -> None:
+        """Add the tracks of one frame and its processing time. A frame that already has a row is skipped."""
+        frame = tracks[0].frame
+        if frame < self.rows:
             return
+        found = {track.object: track for track in tracks}
         with self._reporting_errors():
-            for _ in range(track.frame - self.rows):
-                self._row(_ABSENT, "nan", "nan")
-            self._row(_ABSENT if track.box is None else _sides(track.box), f"{track.score:.6f}", f"{seconds:.6f}")
-            self._tracks.write(format_row(track) + "\n")
-        self.rows = track.frame + 1
-
-    def _row(self, box: str, score: str, seconds: str) -> None:
-        for file, text in ((self._boxes, box), (self._scores, score), (self._times, seconds)):
-            file.write(text + "\n")
+            for thing in found:
+                if thing not in self._objects:
+                    self._begin(thing)
+            for thing, files in self._objects.items():
+                row = _row(found[thing], seconds) if thing in found else _NOTHING
+                for file, text, nothing in zip(files, row, _NOTHING, strict=True):
+                    file.write((frame - self.rows) * f"{nothing}\n" + f"{text}\n")
+            self._table.write("".join(format_row(track) + "\n" for track in tracks))
+        self.rows = frame + 1
 
     def close(self) -> None:
         """Close the files."""
         with self._reporting_errors():  # closing retries a row whose write failed
             self._files.close()
+
+    def _begin(self, thing: str) -> None:
+        """Open the files of an object, with a row for each frame so far."""
+        files: list[IO[str]] = []
+        for file, nothing in zip(object_files(self.name, thing), _NOTHING, strict=True):
+            path = self.directory / file
+            if thing and not self._continues and path.exists():
+                raise VideoError(f"{path} exists already: replace it with --overwrite, or give the object another name")
+            ends = _row_ends(path)[: self.rows + 1] if self._continues else [0]
+            if self._continues and path.exists():
+                os.truncate(path, ends[-1])
+            files.append(self._open(path, "a" if self._continues else "w"))
+            files[-1].write((self.rows + 1 - len(ends)) * f"{nothing}\n")
+        self._objects[thing] = files
+
+    def _open(self, path: Path, mode: str) -> IO[str]:
+        return self._files.enter_context(path.open(mode, encoding="utf-8", buffering=1))
 
     @contextlib.contextmanager
     def _reporting_errors(self) -> Iterator[None]:
@@ -149,15 +179,15 @@ def read_tracks(directory: Path, name: str) -> Iterator[Track]:
         yield track
 
 
-def complete_frames(directory: Path, name: str) -> int:
-    """Return the number of frames that are complete in every file."""
-    least = min(len(_row_ends(directory / file)) - 1 for file in _row_files(name))
-    return max((track.frame + 1 for track in read_tracks(directory, name) if track.frame < least), default=0)
+def complete_rows(directory: Path, name: str, thing: str) -> int:
+    """Return the number of rows that are complete in every file of an object."""
+    return min(len(_row_ends(directory / file)) - 1 for file in object_files(name, thing))
 
 
-def _row_files(name: str) -> tuple[str, ...]:
-    """Return the names of the files that have a row for every frame, with or without a track."""
-    return f"{name}.txt", f"{name}_confidence.value", f"{name}_time.txt"
+def _row(track: Track, seconds: float) -> tuple[str, str, str]:
+    """Return the row of a track in each of the files of its object."""
+    box = _NOTHING[0] if track.box is None else _sides(track.box)
+    return box, f"{track.score:.6f}", f"{seconds:.6f}"
 
 
 def _parsed_lines(path: Path) -> Iterator[tuple[int, Track]]:
@@ -166,7 +196,7 @@ def _parsed_lines(path: Path) -> Iterator[tuple[int, Track]]:
         end = len(file.readline())
         for line in file:
             try:
-                track = parse_row(line.decode("ascii"))
+                track = parse_row(line.decode())
             except ValueError:  # an incomplete line, or a block that was never written before a power cut
                 return
             if not line.endswith(b"\n"):
@@ -193,13 +223,13 @@ def _row_ends(path: Path) -> list[int]:
     return ends
 
 
-def _truncate(directory: Path, name: str, keep: int) -> int:
-    """Truncate all files to the same number of complete frames, at most `keep`; return that number."""
-    rows = min(complete_frames(directory, name), keep)
-    for file in _row_files(name):
-        if (directory / file).exists():
-            os.truncate(directory / file, _row_ends(directory / file)[rows])
-    if (path := directory / table_file(name)).exists():
-        ends = [end for end, track in _parsed_lines(path) if track.frame < rows]
-        os.truncate(path, ends[-1] if ends else 0)
-    return rows
+def _truncate(table: Path, keep: int) -> tuple[int, list[str]]:
+    """Truncate `NAME.csv` to the frames before `keep`; return their number, and the names of their objects."""
+    end, rows, objects = 0, 0, dict[str, None]()
+    for end_of_line, track in _parsed_lines(table):
+        if track.frame < keep:
+            end, rows = end_of_line, track.frame + 1
+            objects[track.object] = None
+    if table.exists():
+        os.truncate(table, end)
+    return rows, list(objects)
