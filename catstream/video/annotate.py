@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -143,14 +144,21 @@ def _draw_name(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -
         return
     height, width = canvas.shape[:2]
     scale, thick, margin = 0.45 * unit, max(1, round(unit)), max(2, round(3 * unit))
-    (long, high), below = cv2.getTextSize(track.object, _FONT, scale, thick)
+    text = _plain(track.object)
+    (long, high), below = cv2.getTextSize(text, _FONT, scale, thick)
     deep = high + below + margin
     left = min(max(round(track.box.x), 0), max(width - long - 2 * margin, 0))
     top = round(track.box.y) - deep
     top = min(max(top if top >= 0 else round(track.box.y), 0), height - deep)
     cv2.rectangle(canvas, (left, top), (left + long + 2 * margin, top + deep), colour, cv2.FILLED)
     baseline = (left + margin, top + high + margin // 2 + 1)
-    cv2.putText(canvas, track.object, baseline, _FONT, scale, _ink(colour), thick, cv2.LINE_AA)
+    cv2.putText(canvas, text, baseline, _FONT, scale, _ink(colour), thick, cv2.LINE_AA)
+
+
+def _plain(text: str) -> str:
+    """Replace letters that OpenCV's fonts do not have: by those without accents, or else by question marks."""
+    letters = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
+    return "".join(letters).encode("ascii", "replace").decode()
 
 
 def _ink(colour: _Colour) -> _Colour:
@@ -178,7 +186,7 @@ def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], uni
     if right > left:
         write(end, right)
     for count, (track, colour) in enumerate(drawn):
-        text, rest = f"{track.object} {track.score:.2f}".strip(), f"+{len(drawn) - count}"
+        text, rest = f"{_plain(track.object)} {track.score:.2f}".strip(), f"+{len(drawn) - count}"
         is_last = count == len(drawn) - 1
         if left + gap + long(text) + (0 if is_last else gap + long(rest)) > right - gap:
             if left + long(rest) < right:

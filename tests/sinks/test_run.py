@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import Position, Track
+from catstream.messages import ObjectPosition, Position, Track
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT, open_sink, reader
 from catstream.video.demo import write
@@ -22,6 +27,11 @@ NAMES = ["t.ndjson", "t.json", "t.csv", "t.txt", "t.sqlite", "t.parquet", "t.mp4
 def track(frame):
     box = Box(10.0 + frame, 20.0, 30.0, 40.0) if frame % 4 else None
     return Track(frame + 1, frame, frame / 30, "present" if box else "absent", box, 0.5, frame // 3)
+
+
+def frame_of(number, names):
+    """The tracks of a frame of several objects."""
+    return {name: replace(track(number), object=name) for name in names}
 
 
 @pytest.fixture
@@ -40,7 +50,7 @@ def files(tmp_path):
 def fill(files, first, last, resume=False):
     with files.opened(resume=resume) as keep:
         for frame in range(first, last):
-            keep(track(frame), 0.01)
+            keep({"": track(frame)}, 0.01)
 
 
 def held(files):
@@ -62,7 +72,7 @@ def test_a_run_that_is_resumed_leaves_the_files_of_one_in_one_go(files, tmp_path
     if killed:
         with broken.opened() as keep:
             for frame in range(7):
-                keep(track(frame), 0.01)
+                keep({"": track(frame)}, 0.01)
             shutil.copytree(tmp_path / "broken", tmp_path / "left")
         shutil.rmtree(tmp_path / "broken")
         (tmp_path / "left").rename(tmp_path / "broken")
@@ -70,7 +80,7 @@ def test_a_run_that_is_resumed_leaves_the_files_of_one_in_one_go(files, tmp_path
         fill(broken, 0, 7)
     torn = tmp_path / "broken" / "t.ndjson"
     torn.write_bytes(b"".join(torn.read_bytes().splitlines(keepends=True)[:6]) + b'{"seq": 7')
-    assert broken.position() == Position(6, 5, track(5).box)
+    assert broken.position() == Position(6, 5, {"": ObjectPosition(track(5).box)})
     fill(broken, 6, 12, resume=True)
     assert held(broken) == held(whole)
     assert broken.complete
@@ -122,7 +132,7 @@ def test_results_that_cannot_be_written_are_rejected_before_the_run(files, names
 def test_a_file_of_another_program_is_not_continued(files):
     run = files("run", ["t.csv"], output=False)
     with closing(open_sink(run.files[0])) as other:
-        other.write(track(0))
+        other.write([track(0)])
     with pytest.raises(VideoError, match="exists already"):
         run.check_writable(overwrite=False, resumable=True)
     run.check_writable(overwrite=False, resumable=True, known=run.files)
@@ -133,3 +143,60 @@ def test_standard_output_has_a_line_of_json_for_each_track(files, capsys):
     run.check_writable(overwrite=False, resumable=True)
     fill(run, 0, 5)
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [track(k).to_dict() for k in range(5)]
+
+
+#: The objects of each frame: a few come, go and come again.
+NAMES_OF_A_FRAME = st.lists(st.sampled_from(["", "anna", "ben", "carl"]), min_size=1, unique=True)
+HISTORIES = st.lists(NAMES_OF_A_FRAME, min_size=1, max_size=5)
+    st.lists(st.sampled_from(["", "anna", "ben", "carl"]), min_size=1, unique=True), min_size=1, max_size=6
+)
+
+#: Formats of which a crash can leave any number of bytes, and the results files.
+CUT = ["t.ndjson", "t.json", "t.csv"]
+
+
+def in_folder(folder, names=CUT):
+    return RunFiles("walk", "", ALL_FRAMES, folder / "out", files=[folder / name for name in names])
+
+
+def add(run, history, first=0, resume=False):
+    with run.opened(resume=resume) as keep:
+        for number, names in enumerate(history):
+            if number >= first:
+                keep(frame_of(number, names), 0.01)
+
+
+def rows_of(run):
+    """The rows of all files but those of measured times."""
+    paths = [*run.files, *(path for path in run.output.iterdir() if not path.stem.endswith("_time"))]
+    return {path.name: path.read_text() for path in paths}
+
+
+@settings(max_examples=60)
+@given(HISTORIES, st.data())
+def test_wherever_a_crash_cuts_the_files_no_row_is_lost_or_doubled(history, data):
+    with tempfile.TemporaryDirectory() as place:
+        whole, broken = (in_folder(Path(place) / name) for name in ("whole", "broken"))
+        for run in (whole, broken):
+            run.output.mkdir(parents=True)
+            add(run, history)
+        for path in [*broken.files, *broken.output.iterdir()]:
+            path.write_bytes(path.read_bytes()[: data.draw(st.integers(0, path.stat().st_size), path.name)])
+        add(broken, history, broken.position().seq, resume=True)
+        assert rows_of(broken) == rows_of(whole)
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_a_frame_counts_only_if_it_is_whole_at_each_byte_at_which_a_file_can_end(tmp_path, name):
+    history = [["anna", "ben"], ["anna", "ben", "carl"], ["carl", "ben", "anna"]]
+    run = in_folder(tmp_path, [name])
+    run.output.mkdir()
+    add(run, history)
+    data = run.files[0].read_bytes()
+    lines = data.splitlines(keepends=True)
+    tracks = [line for line in lines if b"present" in line or b"absent" in line]
+    begin = data.index(tracks[2])  # frame 1
+    for end in range(begin, len(data) + 1):
+        run.files[0].write_bytes(data[:end])
+        held = sum(line in data[:end] for line in tracks)
+        assert run.position().seq == (3 if held == 8 else 2 if held >= 5 else 1 if held > 2 else 0)

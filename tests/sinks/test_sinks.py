@@ -19,6 +19,8 @@ from catstream.sinks.sqlite import SqliteSink
 from catstream.video.results import ResultsWriter
 from catstream.video.source import open_source
 
+BOX = Box(10.0, 20.0, 30.5, 40.0)
+
 TRACKS = [
     Track(1, 0, 0.0, "bootstrapping", Box(10.0, 20.0, 30.5, 40.0), 1.0, 0),
     Track(2, 1, 0.04, "absent", None, 0.125, 3),
@@ -37,7 +39,7 @@ def filled(tmp_path):
     def fill(name):
         opened.append(open_sink(tmp_path / name))
         for track in TRACKS:
-            opened[-1].write(track)
+            opened[-1].write([track])
         return tmp_path / name
 
     yield fill
@@ -54,7 +56,7 @@ def test_csv_is_that_of_the_results(filled, tmp_path):
     path = filled("tracks.csv")
     with ResultsWriter(tmp_path / "results", "run") as results:
         for track in TRACKS:
-            results.write(track, 0.0)
+            results.write([track], 0.0)
     assert path.read_text() == (tmp_path / "results" / "run.csv").read_text()
     assert [row["state"] for row in csv.DictReader(path.read_text().splitlines())] == [track.state for track in TRACKS]
 
@@ -63,6 +65,14 @@ def test_mot_counts_from_one_and_has_no_line_if_the_object_is_absent(filled):
     assert filled("tracks.txt").read_text() == (
         "1,1,11.00,21.00,30.50,40.00,1.0000,-1,-1,-1\n4,1,-1.00,22.00,30.00,40.00,0.7500,-1,-1,-1\n"
     )
+
+
+def test_a_name_keeps_its_id_in_mot_text(tmp_path):
+    with closing(open_sink(tmp_path / "tracks.txt")) as sink:
+        for frame, names in enumerate([["anna", "ben"], ["ben"], ["carl", "ben", "anna"]]):
+            sink.write([Track(frame + 1, frame, 0.0, "present", BOX, 0.5, 1, object=name) for name in names])
+    ids = [line.split(",")[:2] for line in (tmp_path / "tracks.txt").read_text().splitlines()]
+    assert ids == [["1", "1"], ["1", "2"], ["2", "2"], ["3", "3"], ["3", "2"], ["3", "1"]]
 
 
 def test_a_database_can_be_read_while_it_is_written(filled):
@@ -80,7 +90,7 @@ def test_a_database_can_be_read_while_it_is_written(filled):
 def test_json_is_one_array_once_it_is_closed(tmp_path):
     sink = open_sink(tmp_path / "tracks.json")
     for track in TRACKS:
-        sink.write(track)
+        sink.write([track])
     sink.close()
     objects = json.loads((tmp_path / "tracks.json").read_text())
     assert objects == [{**asdict(track), "box": track.box and list(track.box)} for track in TRACKS]
@@ -92,7 +102,7 @@ def test_a_parquet_file_is_written_at_close_from_buffered_rows(tmp_path):
     arrow = pytest.importorskip("pyarrow.parquet")
     sink = open_sink(tmp_path / "tracks.parquet")
     for track in TRACKS:
-        sink.write(track)
+        sink.write([track])
     assert list(SqliteSink.tracks(tmp_path / "tracks.parquet.sqlite")) == TRACKS
     sink.close()
     assert [path.name for path in tmp_path.iterdir()] == ["tracks.parquet"]
@@ -110,7 +120,7 @@ def left(tmp_path):
         (tmp_path / "open").mkdir()
         with closing(open_sink(tmp_path / "open" / name)) as sink:
             for track in TRACKS:
-                sink.write(track)
+                sink.write([track])
             if not closed:
                 shutil.copytree(tmp_path / "open", tmp_path / "left")
         return tmp_path / ("open" if closed else "left") / name
@@ -126,7 +136,7 @@ def test_a_file_continues_after_the_requested_frame(left, suffix, closed):
     kept = [replace(track, seq=track.frame + 1, pts=None) for track in TRACKS] if suffix == ".csv" else TRACKS
     assert list(read(path)) == kept
     with closing(open_sink(path, keep=2)) as again:
-        again.write(TRACKS[2])
+        again.write([TRACKS[2]])
     assert list(read(path)) == kept
     if suffix not in (".sqlite", ".parquet"):
         assert path.read_bytes().removesuffix(b"]\n") == before.removesuffix(b"]\n")
@@ -146,9 +156,9 @@ def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
     source, _ = demo_video(8)
     sink = open_sink(tmp_path / "walk.mp4", str(source), slice(1, 8, 2))  # frames 1, 3, 5, 7, counted 0 to 3
     for track in TRACKS:
-        sink.write(track)
+        sink.write([track])
     with pytest.raises(VideoError, match="has no frame 4"):
-        sink.write(Track(5, 4, 0.2, "absent", None, 0.0, 4))
+        sink.write([Track(5, 4, 0.2, "absent", None, 0.0, 4)])
     sink.close()
     with open_source(str(tmp_path / "walk.mp4")) as frames:
         assert sum(1 for _ in frames) == len(TRACKS)
@@ -158,10 +168,10 @@ def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
 def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path, full, suffix):
     path = tmp_path / f"tracks{suffix}"
     sink = open_sink(path)
-    sink.write(TRACKS[0])
+    sink.write([TRACKS[0]])
     before = path.read_text()
     full(path)
-    for last in (lambda: sink.write(TRACKS[2]), sink.close):  # which tries it once more
+    for last in (lambda: sink.write([TRACKS[2]]), sink.close):  # which tries it once more
         with pytest.raises(VideoError, match=r"cannot write to .* any more: No space left on device$"):
             last()
     assert path.read_text() == before

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import av
 import cv2
 import numpy as np
 import pytest
 
 from catstream.box import Box
+from catstream.colours import Colours, rgb
 from catstream.errors import VideoError
 from catstream.messages import State, Track
 from catstream.video.annotate import AnnotatedVideo, draw, thumbnail
@@ -24,7 +27,7 @@ def track(state: State = "present", box: Box | None = BOX, frame: int = 7) -> Tr
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (1921, 1081)])
 def test_drawing_does_not_change_the_frame(state, size):
     image = np.full((size[1], size[0], 3), 128, np.uint8)
-    drawn = draw(image, track(state, None if state == "absent" else BOX))
+    drawn = draw(image, [track(state, None if state == "absent" else BOX)], Colours())
     assert drawn.shape[1:] == image.shape[1:]
     assert (image == 128).all()
     assert (drawn[25:35, 35:45] != 128).any() == (state != "absent")
@@ -34,14 +37,38 @@ def test_drawing_does_not_change_the_frame(state, size):
 @pytest.mark.parametrize("size", [(70, 50), (352, 288)])
 def test_the_text_is_below_the_image(size):
     image = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
-    assert (draw(image, track(box=None))[: size[1]] == image).all()
+    assert (draw(image, [track(box=None)], Colours())[: size[1]] == image).all()
 
 
 @pytest.mark.parametrize(
     "box", [Box(-500, -500, 10, 10), Box(-50, 20, 900, 30), Box(630, 470, 40, 40), Box(5, 5, 0, 0)]
 )
 def test_boxes_anywhere_can_be_drawn(box):
-    assert draw(np.zeros((480, 640, 3), np.uint8), track(box=box)).shape == (506, 640, 3)
+    assert draw(np.zeros((480, 640, 3), np.uint8), [track(box=box)], Colours()).shape == (506, 640, 3)
+
+
+def test_each_object_is_drawn_in_its_own_colour_which_stays(rng):
+    image, colours = rng.integers(0, 256, (240, 320, 3), np.uint8), Colours()
+    anna, ben = replace(track(), object="anna"), replace(track(box=Box(200, 90, 50, 60)), object="ben")
+    for tracks in ([anna, ben], [ben, anna], [ben]):
+        drawn = draw(image, tracks, colours)
+        for each in tracks:
+            assert has_colour(drawn[:240], colours.of(each.object)), "its box and its name"
+            assert has_colour(drawn[240:], colours.of(each.object)), "its score"
+    assert not has_colour(drawn, colours.of("anna"))
+    assert colours.of("anna") != colours.of("ben")
+
+
+def has_colour(image, colour):
+    red, green, blue = rgb(colour)
+    return (image == (blue, green, red)).all(axis=2).sum() > 9
+
+
+@pytest.mark.parametrize("size", [(70, 50), (352, 288), (1920, 1080)])
+@pytest.mark.parametrize("box", [BOX, Box(-50, -50, 900, 3), Box(60, 45, 4, 4), None])
+def test_many_objects_with_long_names_can_be_drawn_in_any_picture(size, box):
+    tracks = [replace(track(box=box), object=f"{k}-" + 60 * "ë") for k in range(32)]
+    assert draw(np.zeros((size[1], size[0], 3), np.uint8), tracks, Colours()).shape[1] == size[0]
 
 
 @pytest.mark.parametrize("size", [(640, 480), (321, 241), (99, 77)])
@@ -50,12 +77,12 @@ def test_the_video_has_each_frame_written_at_any_size(tmp_path, size):
     image = np.full((size[1], size[0], 3), 128, np.uint8)
     with AnnotatedVideo(path, 29.97, size) as video:
         for frame in range(9):
-            video.write(image, track(frame=frame))
+            video.write(image, [track(frame=frame)])
         assert not path.exists()
     with open_source(path) as source:
         assert source.rate == pytest.approx(29.97)
         width, height = source.size
-        shape = draw(image, track()).shape
+        shape = draw(image, [track()], Colours()).shape
         assert (height - shape[0], width - shape[1]) == (shape[0] % 2, shape[1] % 2)
         assert sum(1 for _ in source) == 9
     assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
@@ -65,7 +92,7 @@ def test_frames_keep_the_time_stamps_of_the_source(tmp_path):
     times = [2.0, 2.04, 2.5, 2.52, 9.0]
     with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)) as video:
         for frame, time in enumerate(times):
-            video.write(np.zeros((64, 64, 3), np.uint8), track(frame=frame), time)
+            video.write(np.zeros((64, 64, 3), np.uint8), [track(frame=frame)], time)
     with open_source(tmp_path / "out.mp4") as source:
         assert [frame.time + 2 for frame in source] == pytest.approx(times, abs=0.001)
 
@@ -94,7 +121,7 @@ def test_the_sound_of_the_source_keeps_its_time(tmp_path, with_sound, first):
     source = open_source(with_sound, part=slice(first, None))
     with source, AnnotatedVideo(tmp_path / "out.mp4", source.rate, source.size, sound=source.sound) as video:
         for frame in source:
-            video.write(frame.image, track(frame=frame.number), frame.time)
+            video.write(frame.image, [track(frame=frame.number)], frame.time)
     with av.open(str(tmp_path / "out.mp4")) as container:
         heard = [(frame.time, np.abs(frame.to_ndarray()).max() > 0.5) for frame in container.decode(audio=0)]
     assert min(time for time, loud in heard if loud) == pytest.approx(2 - first / 25, abs=0.15)
@@ -110,7 +137,7 @@ def test_a_video_without_frames_leaves_no_file(tmp_path):
 def test_an_interrupted_run_keeps_its_video(tmp_path):
     def run():
         with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)) as video:
-            video.write(np.zeros((64, 64, 3), np.uint8), track())
+            video.write(np.zeros((64, 64, 3), np.uint8), [track()])
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -126,10 +153,10 @@ def test_a_full_disk_is_one_line_of_error_and_no_video_is_left(tmp_path, rng, fu
     def run():
         with AnnotatedVideo(tmp_path / "out.mp4", 25, (320, 240)) as video:
             for frame in range(50):  # the encoder keeps some back
-                video.write(image, track(frame=frame))
+                video.write(image, [track(frame=frame)])
             full(tmp_path / "out.mp4.part")
             for frame in range(frames):
-                video.write(image, track(frame=frame))
+                video.write(image, [track(frame=frame)])
 
     with pytest.raises(VideoError, match=r"cannot write the video .* any more: No space left on device$"):
         run()

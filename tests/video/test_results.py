@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,10 @@ def track(frame: int, box: Box | None = BOX) -> Track:
     return Track(frame + 1, frame, frame / 25, "present" if box else "absent", box, 0.5 if box else 0.125, frame // 2)
 
 
+def named(name: str, frame: int) -> Track:
+    return replace(track(frame), object=name)
+
+
 def rows(path) -> np.ndarray:
     return np.loadtxt(path, delimiter=",", ndmin=2)
 
@@ -24,7 +30,7 @@ def rows(path) -> np.ndarray:
 def test_each_frame_has_a_row_and_absence_is_nan(tmp_path):
     with ResultsWriter(tmp_path / "deep" / "out", "walk") as results:
         for frame in range(5):
-            results.write(track(frame, None if frame == 3 else Box(frame, 2, 3.5, 4.25)), 0.01)
+            results.write([track(frame, None if frame == 3 else Box(frame, 2, 3.5, 4.25))], 0.01)
     out = tmp_path / "deep" / "out"
     boxes = rows(out / "walk.txt")
     assert boxes.shape == (5, 4)
@@ -33,35 +39,55 @@ def test_each_frame_has_a_row_and_absence_is_nan(tmp_path):
     np.testing.assert_array_equal(rows(out / "walk_confidence.value")[:, 0], [0.5, 0.5, 0.5, 0.125, 0.5])
     np.testing.assert_array_equal(rows(out / "walk_time.txt")[:, 0], 5 * [0.01])
     lines = (out / "walk.csv").read_text().splitlines()
-    assert lines[0] == "frame,seconds,state,x,y,w,h,score,model_version"
-    assert lines[3] == "2,0.080000,present,2.0000,2.0000,3.5000,4.2500,0.500000,1"
-    assert lines[4] == "3,0.120000,absent,,,,,0.125000,1"
+    assert lines[0] == "frame,seconds,state,x,y,w,h,score,model_version,object"
+    assert lines[3] == "2,0.080000,present,2.0000,2.0000,3.5000,4.2500,0.500000,1,"
+    assert lines[4] == "3,0.120000,absent,,,,,0.125000,1,"
 
 
 def test_written_rows_can_be_read_before_the_end(tmp_path):
     results = ResultsWriter(tmp_path, "walk")
-    results.write(track(0), 0.01)
+    results.write([track(0)], 0.01)
     for file in ("walk.txt", "walk_confidence.value", "walk_time.txt"):
         assert len(rows(tmp_path / file)) == 1
     results.close()
 
 
 def test_frames_without_a_track_get_a_row_of_nan(tmp_path):
-    with ResultsWriter(tmp_path, "walk", start=10) as results:
-        results.write(track(10), 0.01)
-        results.write(track(13), 0.01)
-        results.write(track(13), 0.01)  # a restarted detector may say it again
-        results.write(track(12), 0.01)
+    with ResultsWriter(tmp_path, "walk") as results:
+        results.write([track(0)], 0.01)
+        results.write([track(3)], 0.01)
+        results.write([track(3)], 0.01)  # a restarted detector may say it again
+        results.write([track(2)], 0.01)
     boxes = rows(tmp_path / "walk.txt")
     assert np.isnan(boxes).all(axis=1).tolist() == [False, True, True, False]
     assert len((tmp_path / "walk.csv").read_text().splitlines()) == 3
+
+
+def test_each_object_with_a_name_has_its_own_files_with_a_row_for_every_frame(tmp_path):
+    with ResultsWriter(tmp_path, "walk") as results:
+        results.write([named("anna", 0)], 0.01)
+        results.write([named("zoë", 2), named("anna", 2)], 0.01)
+        results.write([named("zoë", 3)], 0.01)
+    assert not (tmp_path / "walk.txt").exists()
+    for name, present in (("anna", [0, 2]), ("zoë", [2, 3])):
+        assert np.flatnonzero(~np.isnan(rows(tmp_path / f"walk-{name}.txt")[:, 0])).tolist() == present
+        assert len(rows(tmp_path / f"walk-{name}_time.txt")) == len(rows(tmp_path / f"walk-{name}.txt")) == 4
+    table = [line.split(",")[::9] for line in (tmp_path / "walk.csv").read_text().splitlines()[1:]]
+    assert table == [["0", "anna"], ["2", "zoë"], ["2", "anna"], ["3", "zoë"]]
+
+
+def test_a_file_of_another_run_that_has_the_name_of_an_object_file_is_kept(tmp_path):
+    (tmp_path / "walk-2.txt").write_text("dear to somebody")
+    with ResultsWriter(tmp_path, "walk") as results, pytest.raises(VideoError, match=r"walk-2\.txt exists already"):
+        results.write([named("2", 0)], 0.01)
+    assert (tmp_path / "walk-2.txt").read_text() == "dear to somebody"
 
 
 def test_the_same_tracks_give_the_same_bytes(tmp_path):
     for folder, seconds in (("a", 0.1), ("b", 0.2)):
         with ResultsWriter(tmp_path / folder, "walk") as results:
             for frame in range(20):
-                results.write(track(frame, Box(frame / 3, frame / 7, 10 / 3, 1e-9)), seconds)
+                results.write([track(frame, Box(frame / 3, frame / 7, 10 / 3, 1e-9))], seconds)
     for file in ("walk.txt", "walk_confidence.value", "walk.csv"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
@@ -69,9 +95,9 @@ def test_the_same_tracks_give_the_same_bytes(tmp_path):
 @pytest.mark.parametrize("file", ["walk.txt", "walk_confidence.value", "walk_time.txt", "walk.csv"])
 def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path, full, file):
     results = ResultsWriter(tmp_path, "walk")
-    results.write(track(0), 0.01)
+    results.write([track(0)], 0.01)
     full(tmp_path / file)
-    for last in (lambda: results.write(track(1), 0.01), results.close):  # which tries it once more
+    for last in (lambda: results.write([track(1)], 0.01), results.close):  # which tries it once more
         with pytest.raises(VideoError, match=r"cannot write results to .* any more: No space left on device$"):
             last()
     assert len((tmp_path / file).read_text().splitlines()) == 1 + (file == "walk.csv")
