@@ -24,7 +24,6 @@ def test_a_track_is_one_detection_of_supervision():
     assert np.array_equal(found.xyxy, [[10, 20, 40, 60]])
     assert (found.confidence, found.class_id, found.tracker_id) == (1, 0, 1)
     assert {name: list(values) for name, values in found.data.items()} == {
-        "object": [""],
         "frame": [2],
         "state": ["present"],
         "model_version": [7],

@@ -24,9 +24,8 @@ _Point = tuple[float, float]
 _Colour = tuple[int, int, int]
 
 _COLOURS: dict[str, _Colour] = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
-_WHITE, _GREY, _DARK, _ORANGE = (245, 245, 245), (110, 110, 110), (32, 32, 32), (40, 140, 255)
-#: Luminance from which text on a colour is dark.
-_LIGHT = 110
+_WHITE, _GREY, _DARK, _BLACK = (245, 245, 245), (110, 110, 110), (32, 32, 32), (17, 17, 17)
+_ORANGE = (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 #: Height of the line of text below an image that is 640 pixels wide, and the smallest factor by which it is scaled.
@@ -139,7 +138,7 @@ def _draw_box(canvas: np.ndarray, start: _Point, end: _Point, colour: _Colour, u
 
 
 def _draw_name(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -> None:
-    """Write the name of an object in dark letters on its colour: above its box, or in it if there is no room above."""
+    """Write the name of an object in black letters on its colour: above its box, or in it if there is no room above."""
     if not track.object or track.box is None:
         return
     height, width = canvas.shape[:2]
@@ -152,19 +151,13 @@ def _draw_name(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -
     top = min(max(top if top >= 0 else round(track.box.y), 0), height - deep)
     cv2.rectangle(canvas, (left, top), (left + long + 2 * margin, top + deep), colour, cv2.FILLED)
     baseline = (left + margin, top + high + margin // 2 + 1)
-    cv2.putText(canvas, text, baseline, _FONT, scale, _ink(colour), thick, cv2.LINE_AA)
+    cv2.putText(canvas, text, baseline, _FONT, scale, _BLACK, thick, cv2.LINE_AA)
 
 
 def _plain(text: str) -> str:
     """Replace letters that OpenCV's fonts do not have: by those without accents, or else by question marks."""
     letters = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
     return "".join(letters).encode("ascii", "replace").decode()
-
-
-def _ink(colour: _Colour) -> _Colour:
-    """The colour of text on a colour: dark, or white on a dark one."""
-    blue, green, red = colour
-    return _DARK if 0.114 * blue + 0.587 * green + 0.299 * red > _LIGHT else _WHITE
 
 
 def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], unit: float) -> None:
@@ -250,6 +243,7 @@ class AnnotatedVideo:
 
     def write(self, image: np.ndarray, tracks: Sequence[Track], time: float | None = None) -> None:
         """Add a frame, uint8 (h, w, 3), with its tracks. `time` is as in `VideoWriter.write`."""
+        self._colours.keep(track.object for track in tracks)
         self._writer.write(draw(image, tracks, self._colours), time)
 
     def close(self) -> None:
