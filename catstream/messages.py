@@ -285,7 +285,8 @@ class Track:
     Attributes
     ----------
     seq : int
-        1, 2, 3 ... for each object, from the run's first frame on: a gap means that this subscriber missed messages.
+        1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means that this subscriber
+        missed messages, or that the object was not tracked in between.
     frame : int
         Number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted.
     time : float

@@ -5,9 +5,11 @@ one kind of message, or to the messages of one kind about one object (the bytes 
 `catstream.wire.codec.opening`). The publisher never waits for a subscriber: one that falls too far behind misses
 messages.
 
-If a channel keeps the newest message, it keeps that of each object. They are transmitted again to late joiners, and
-once to all if nothing newer followed within 0.2 s: a burst may have cost a subscriber the last one. A `Subscriber`
-drops repeats.
+If a channel keeps the newest message, it keeps that of each object. They are transmitted again to late joiners, and to
+all if nothing newer followed within 0.2 s, 0.6 s, 1.4 s ...: a burst may have cost a subscriber the last ones. A
+`Subscriber` drops repeats. Only as many are repeated at once as fit into the queue of a subscriber.
+
+The number of topics that a peer can make either side remember is limited.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ _MOST_KEPT = 256  # newest messages that are kept, one of each object
 _MOST_TOPICS = 1024  # topics that a publisher knows the subscribers of, and that a subscriber knows the last message of
 _MAX_CHANGES = 1000  # subscriptions that are processed at once
 _MAX_SUBSCRIPTION_BYTES = 4096
-_REPEAT_SECONDS = 0.2  # without a newer message, after which the last one is sent again
+_REPEAT_SECONDS = 0.2  # without a newer message, after which the last ones are sent again; doubled each time
 _READER = b"\xffreader "  # begins the topic that makes an announced subscriber known; no message begins with it
 
 Message = TypeVar("Message")
@@ -64,7 +66,8 @@ class Publisher(ChannelSocket[Message]):
         self._last: dict[bytes, bytes] = {}  # the messages for late joiners by topic, oldest first
         if first_message is not None:
             self._last[b""] = encode(first_message)
-        self._repeat_at = math.inf
+        self._due: list[bytes] = []  # topics whose last message is sent again, in this order
+        self._repeat_at, self._pause = math.inf, _REPEAT_SECONDS
         self._bind(sender)
 
     @property
@@ -95,8 +98,8 @@ class Publisher(ChannelSocket[Message]):
         self._last[topic] = data
         if len(self._last) > _MOST_KEPT:
             del self._last[next(iter(self._last))]
-        self._repeat_at = monotonic() + _REPEAT_SECONDS
         self._socket.send(data, copy=False)
+        self._repeat_after(_REPEAT_SECONDS)
         self.serve_late_joiners()
 
     def keep_only(self, objects: Iterable[str]) -> None:
@@ -105,19 +108,32 @@ class Publisher(ChannelSocket[Message]):
         self._last = {topic: data for topic, data in self._last.items() if topic in topics}
 
     def serve_late_joiners(self) -> None:
-        """Process subscriptions; send the first or the last message again if it is due. Call once per iteration."""
+        """Process subscriptions; send the first message or the last ones again if due. Call once per iteration."""
         self._read_events()
-        due = monotonic() >= self._repeat_at
+        joined = False
         for _ in range(_MAX_CHANGES):  # the rest waits for the next call: a flood does not stop the process
             try:
                 change = self._socket.recv(zmq.NOBLOCK)
             except zmq.Again:
                 break
-            due |= self._process(subscribes=change.startswith(b"\x01"), topic=change[1:])
-        if due:
-            self._repeat_at = math.inf
-            for data in self._last.values():
+            joined |= self._process(subscribes=change.startswith(b"\x01"), topic=change[1:])
+        if joined or monotonic() >= self._repeat_at:
+            self._due = list(dict.fromkeys([*self._due, *self._last]))
+            if self._newest:
+                self._repeat_after(_REPEAT_SECONDS if joined else 2 * self._pause)
+        self._repeat_some()
+
+    def _repeat_after(self, seconds: float) -> None:
+        """Send the last messages again after so many seconds."""
+        self._repeat_at, self._pause = monotonic() + seconds, seconds
+
+    def _repeat_some(self) -> None:
+        """Send some of the last messages again that are due: those that half the queue of a subscriber can hold."""
+        count = max(1, self.channel.high_water_mark // 2)
+        for topic in self._due[:count]:
+            if (data := self._last.get(topic)) is not None:
                 self._socket.send(data, copy=False)
+        del self._due[:count]
 
     def _process(self, subscribes: bool, topic: bytes) -> bool:
         """Process one subscription or its end; returns whether there is a new subscriber."""

@@ -13,12 +13,35 @@ import sys
 from pathlib import Path
 from typing import Literal, get_args, get_origin
 
+import msgpack
 import pytest
 
 from catstream.box import Box, Window
 from catstream.heads import HEADS
-from catstream.messages import DetectorState, End, Motion, Stored, Summary, Track, TrainingRows
-from catstream.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Bytes, Named, OnlyWith, Whole, fields
+from catstream.messages import (
+    DetectorState,
+    End,
+    Motion,
+    ObjectFeatures,
+    ObjectPosition,
+    Stored,
+    Summary,
+    Track,
+    TrainingRows,
+)
+from catstream.schema import (
+    LARGEST_INTEGER,
+    LONGEST_LIST,
+    LONGEST_TEXT,
+    Array,
+    ByObject,
+    Bytes,
+    Name,
+    Named,
+    OnlyWith,
+    Whole,
+    fields,
+)
 from catstream.wire import codec
 from catstream.wire.channels import CHANNELS, TRACKS
 from catstream.wire.endpoint import Endpoint
@@ -26,7 +49,7 @@ from catstream.wire.newest import Publisher
 
 PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
-MESSAGES = [*codec.KINDS.values(), DetectorState, Motion, Summary, TrainingRows]
+MESSAGES = [*codec.KINDS.values(), DetectorState, Motion, ObjectFeatures, ObjectPosition, Summary, TrainingRows]
 PLAIN = {int: "whole number", float: "number", str: "text", bool: "boolean", Box: "box", Window: "window"}
 
 
@@ -56,7 +79,10 @@ def described(field):
 
 def kind_of(field):
     if field.values is not None:
-        return f"map of {names_of(field.limit(Named))} to {kind_of(field.values)}"
+        names = "objects" if field.limit(ByObject) else names_of(field.limit(Named))
+        return f"map of {names} to {kind_of(field.values)}"
+    if field.limit(Name):
+        return "name of an object"
     if field.is_message:
         return f"`{field.type.__name__.lower()}`"
     if array := field.limit(Array):
@@ -125,13 +151,20 @@ def test_the_limits_are_those_of_the_codec():
 
 def test_the_example_in_bytes_agrees_with_the_encoded_message():
     example = re.search(r"^```\n((?:[0-9a-f]{2}[ \n])+)```", PAGE, re.MULTILINE)[1]
-    assert bytes.fromhex(example) == codec.encode(Stored(5, 7, 2))
+    assert bytes.fromhex(example) == codec.encode(Stored(5, 7, {"anna": 2}))
     assert f"`{codec.opening(End).hex(' ')}` for `end`" in PAGE
+    assert f"`{codec.opening(Track, 'anna').hex(' ')}` for" in PAGE
 
 
 @pytest.mark.parametrize("text", ["run", "tcp://127.0.0.1:5700"])
 def test_the_address_of_the_example_is_that_of_the_channel(text):
     assert Endpoint.parse(text).address(CHANNELS["tracks"]) in block("python")
+
+
+def test_the_topic_of_one_object_in_the_page_is_that_of_its_tracks():
+    (expression,) = re.findall(r"`(msgpack\.packb.*?)`", PAGE)
+    for name in ("", "anna", "a" * 40):
+        assert eval(expression, {"msgpack": msgpack, "name": name}) == codec.opening(Track, name)
 
 
 def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
@@ -143,12 +176,13 @@ def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
         hello = Track(1, 0, 0.0, "absent", None, 0.0, 0)
         until(lambda: heard(reader.stdout), lambda: tracks.send(hello))
         for seq in range(2, 20):
-            tracks.send(Track(seq, seq - 1, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 1))
+            for name in ("anna", "ben"):
+                tracks.send(Track(seq, seq - 1, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 1, object=name))
         tracks.send(End(20, "the source has ended"))
         lines = reader.communicate(timeout=60)[0].splitlines()
     assert reader.returncode == 0
     assert [line for line in lines if "present" in line] == [
-        f"{frame} present [1.0, 2.0, 3.0, 4.0] 0.5" for frame in range(1, 19)
+        f"{frame} {name} present [1.0, 2.0, 3.0, 4.0] 0.5" for frame in range(1, 19) for name in ("anna", "ben")
     ]
 
 

@@ -1,0 +1,212 @@
+"""Published messages about several objects: each subscriber gets those of its object, and each object's newest."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pytest
+import zmq
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from catstream.messages import End, Model, Sample, Summary, Track
+from catstream.wire.channels import MODELS, SAMPLES, TRACKS
+from catstream.wire.codec import encode, opening, topic_of
+from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.newest import Publisher, Subscriber
+from catstream.wire.rejects import rejects
+
+NAMES = st.just("") | st.from_regex(r"\w[\w.-]{0,63}", fullmatch=True)
+
+
+def model(version, name):
+    return Model(version, version, np.full(5, version, np.float32), 0.0, object=name)
+
+
+def track(name):
+    return Track(1, 0, 0.0, "absent", None, 0.0, 0, object=name)
+
+
+@pytest.fixture
+def endpoint(folder):
+    return Endpoint.parse(str(folder))
+
+
+def joined(publisher, count, until):
+    """Wait until subscribers have subscribed to so many topics."""
+    until(lambda: len(publisher._subscribed) == count, publisher.serve_late_joiners)
+
+
+@given(NAMES, NAMES)
+@example("ann", "anna")
+@example("", "anna")
+@example("a" * 31, "a" * 32)
+@example("é" * 20, "é" * 64)
+def test_a_message_begins_with_the_topic_of_its_object_and_of_no_other(name, other):
+    data = encode(track(name))
+    assert data.startswith(opening(Track))
+    assert data.startswith(opening(Track, name))
+    assert topic_of(data) == opening(Track, name)
+    assert data.startswith(opening(Track, other)) == (name == other)
+    assert not data.startswith(opening(Model, name))
+
+
+class Turns(RuleBasedStateMachine):
+    """A subscriber to models at which messages arrive and are sometimes read; the socket is a queue in memory."""
+
+    def __init__(self):
+        super().__init__()
+        self.folder = private_folder()
+        self.subscriber = Subscriber(MODELS, Endpoint.parse(str(self.folder.__enter__())))
+        self.socket, self.subscriber._socket = self.subscriber._socket, self
+        self.queue, self.version, self.moment = deque(), 0, 0
+        self.newest, self.received = {}, {}  # version of each object that arrived, and that was received last
+        self.since = {}  # when the first message of each object arrived that was not received yet
+
+    def poll(self, _):
+        return len(self.queue)
+
+    def recv(self, copy):
+        assert not copy
+        return zmq.Frame(self.queue.popleft())
+
+    def arrive(self, name):
+        self.queue.append(encode(model(self.newest[name], name)))
+        self.moment += 1
+        self.since.setdefault(name, self.moment)
+
+    @rule(name=st.sampled_from(["", "ann", "anna", "ben"]))
+    def a_model_arrives(self, name):
+        self.version += 1
+        self.newest[name] = self.version
+        self.arrive(name)
+
+    @precondition(lambda self: self.newest)
+    @rule(data=st.data())
+    def a_model_is_repeated(self, data):
+        self.arrive(data.draw(st.sampled_from(sorted(self.newest))))
+
+    @rule()
+    def one_is_read(self):
+        """The newest of the object that has waited longest; none twice."""
+        expected = None
+        for name in sorted(self.since, key=self.since.get):
+            del self.since[name]
+            if self.received.get(name) != self.newest[name]:
+                expected = name, self.newest[name]
+                break
+        message = self.subscriber.receive(0)
+        assert (None if message is None else (message.object, message.version)) == expected
+        if expected is not None:
+            self.received[expected[0]] = expected[1]
+
+    @invariant()
+    def one_message_of_each_object_is_kept_at_most(self):
+        assert len(self.subscriber._arrived) <= len(self.newest)
+
+    def teardown(self):
+        self.subscriber._socket = self.socket
+        self.subscriber.close()
+        self.folder.__exit__(None, None, None)
+
+
+TestTurns = Turns.TestCase
+TestTurns.settings = settings(max_examples=60, stateful_step_count=40)
+
+
+def heard_by_all(publisher, subscriber, count, until):
+    """The version of the last message of each object, once so many objects were heard."""
+    heard = {}
+
+    def turn():
+        publisher.serve_late_joiners()
+        heard.update({message.object: message.version for message in subscriber.receive_all()})
+
+    until(lambda: len(heard) == count, turn)
+    return heard
+
+
+def test_a_late_joiner_receives_the_newest_model_of_each_object(endpoint, until):
+    with Publisher(MODELS, endpoint) as models:
+        for version, name in enumerate(["anna", "ben", "anna", "", "ben"], 1):
+            models.send(model(version, name))
+        with Subscriber(MODELS, endpoint) as late:
+            assert heard_by_all(models, late, 3, until) == {"anna": 3, "": 4, "ben": 5}
+        with Subscriber(MODELS, endpoint, Model, about="anna") as late:
+            assert heard_by_all(models, late, 1, until) == {"anna": 3}
+
+
+def test_models_of_forgotten_objects_are_sent_to_no_late_joiner(endpoint, until):
+    with Publisher(MODELS, endpoint) as models:
+        for version, name in enumerate(["ann", "anna", "ben"], 1):
+            models.send(model(version, name))
+        models.keep_only(["anna", "carl"])
+        models.send(model(4, "carl"))
+        with Subscriber(MODELS, endpoint) as late:
+            assert heard_by_all(models, late, 2, until) == {"anna": 2, "carl": 4}
+
+
+def test_after_the_end_a_late_joiner_receives_only_the_end(endpoint, until):
+    with Publisher(SAMPLES, endpoint) as samples:
+        samples.send(sample(1, "anna"))
+        samples.send(End(2, "the source has ended"))
+        with Subscriber(SAMPLES, endpoint) as late:
+            heard = []
+            until(lambda: heard, lambda: (samples.serve_late_joiners(), heard.extend(late.receive_all())))
+    assert heard == [End(2, "the source has ended")]
+
+
+def sample(version, name, width=5):
+    tree = Summary(np.ones((100, width), np.float32), np.ones(width, np.float32), 200, (0,))
+    loss = Summary(np.ones((100, width + 2), np.float32), np.ones(width + 2, np.float32), 200, (0,))
+    return Sample(version, 0, {"object": tree, "background": tree, "loss": loss}, np.empty((0, 2)), name)
+
+
+def test_of_a_burst_that_no_queue_holds_the_newest_of_each_object_still_arrives(endpoint, until):
+    objects = 3 * SAMPLES.high_water_mark
+    with Publisher(SAMPLES, endpoint) as samples, Subscriber(SAMPLES, endpoint) as trainer:
+        joined(samples, 1, until)
+        for version in range(1, objects + 1):  # nothing is read meanwhile
+            samples.send(sample(version, f"o{version}", width=2000))
+        heard = heard_by_all(samples, trainer, objects, until)
+    assert heard == {f"o{version}": version for version in range(1, objects + 1)}
+
+
+def test_a_publisher_remembers_the_last_messages_of_a_limited_number_of_names(endpoint):
+    with Publisher(MODELS, endpoint) as models:
+        for version in range(1, 2000):
+            models.send(model(version, f"o{version}"))
+        assert list(models._last) == [opening(Model, f"o{version}") for version in range(1744, 2000)]
+
+
+def test_a_subscriber_remembers_a_limited_number_of_names_and_receives_all_that_arrive():
+    turns = Turns()
+    try:
+        turns.queue.extend(encode(model(version, f"o{version}")) for version in range(1, 3000))
+        turns.queue.append(b"no message" * 100)
+        versions = []
+        while (message := turns.subscriber.receive(0)) is not None:
+            versions.append(message.version)
+            assert len(turns.subscriber._arrived) <= 256
+            assert len(turns.subscriber._last) <= 1024
+    finally:
+        turns.teardown()
+    assert versions == list(range(1, 3000))
+
+
+def test_a_flood_of_subscriptions_is_counted_and_the_others_are_served(endpoint, until):
+    before = rejects().get("rejected_subscription", 0)
+    with Publisher(TRACKS, endpoint) as tracks, Subscriber(TRACKS, endpoint) as honest:
+        joined(tracks, 1, until)
+        with zmq.Context.instance().socket(zmq.SUB) as stranger:
+            stranger.linger = stranger.sndhwm = 0
+            stranger.connect(endpoint.address(TRACKS))
+            for number in range(3000):
+                stranger.subscribe(opening(Track, f"o{number}"))
+            until(lambda: rejects().get("rejected_subscription", 0) >= before + 3000 - 1023, tracks.serve_late_joiners)
+            assert len(tracks._subscribed) == 1024
+            tracks.send(track("anna"))
+            assert honest.receive(30) == track("anna")
+        joined(tracks, 1, until)
