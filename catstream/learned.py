@@ -25,6 +25,7 @@ from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.features.cells import row_length
 from catstream.heads import HEADS
 from catstream.messages import Model
+from catstream.names import check_name
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
 from catstream.storage import Arrays, Metadata
@@ -174,7 +175,7 @@ class Learned:
     def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
         trees = unpack_trees(arrays, metadata["trees"])
         return cls(
-            str(metadata["object"]),
+            check_name(metadata["object"]),
             {name: trees[name] for name in HEADS},
             arrays["centres"],
             tuple(map(str, metadata["origins"])),

@@ -7,6 +7,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from catstream import storage
 from catstream.box import Box, Window
 from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import energy
@@ -213,3 +214,16 @@ def test_a_tracker_gives_what_its_trees_have_learned(demo_video):
     assert learned.object == ""
     assert learned.box.overlap(Box(*boxes[11])) > 0.5
     assert learned.likeness()(learned.trees["object"].nodes[0].rows[0]) > 0.5
+
+
+def test_a_file_without_any_of_its_parts_is_an_error(learned):
+    arrays, metadata = storage.decode(learned.to_bytes(), "whole")
+    for name in metadata:
+        with pytest.raises(ProtocolError, match="not a saved model"):
+            Learned.from_bytes(storage.encode(arrays, {**metadata, name: None}), "one")
+    for name in arrays.keys() - {"model.motion.process", "model.motion.observation"}:
+        rest = {other: array for other, array in arrays.items() if other != name}
+        with pytest.raises(ProtocolError, match="not a saved model"):
+            Learned.from_bytes(storage.encode(rest, metadata), "one")
+        with pytest.raises(ProtocolError, match="not a saved model"):
+            Learned.from_bytes(storage.encode(rest | {name: np.float32([[np.nan]])}, metadata), "one")

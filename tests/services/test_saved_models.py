@@ -1,0 +1,82 @@
+"""The coreset trees as files, for subscribers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from catstream.box import Box, Window
+from catstream.compression.compressor import Compressor
+from catstream.features.cells import row_length
+from catstream.heads import APPEARANCE, EXTENT
+from catstream.learned import Learned
+from catstream.messages import DetectorState, ObjectFeatures, SavedModel, TrainingRows
+from catstream.services.saved_models import SavedModels
+from catstream.settings import Settings
+from catstream.wire.channels import SAVED_MODELS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import Subscriber
+
+SETTINGS = Settings(coreset={"size": 4})
+WINDOW = Window(0.0, 0.0, 40.0, 50.0)
+
+
+def compressor(name, rng, frames=6):
+    """The compressor of an object that was found in some frames."""
+    found = Compressor(SETTINGS, name)
+    for frame in range(frames):
+        labels = np.repeat(np.float32([1, 0]), 4)
+        rows = rng.normal(scale=0.2, size=(8, row_length())).astype(np.float32) + np.where(labels[:, None], 1, -1)
+        training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
+        state = DetectorState(0, "confident", WINDOW, WINDOW, WINDOW)
+        found.take(frame, ObjectFeatures(Box(1.0, 2.0, 30.0, 40.0), training, state), found.version + 1)
+    return found
+
+
+@pytest.fixture
+def place(folder):
+    return Endpoint.parse(str(folder))
+
+
+def received(publisher, compressors, reader):
+    """The first message that a subscriber receives while the publisher takes its turns."""
+    for _ in range(200):
+        publisher.turn(compressors)
+        if (message := reader.receive(0.05)) is not None:
+            return message
+    raise AssertionError("nothing was received")
+
+
+def test_a_subscriber_receives_the_whole_trees_of_its_object(place, rng):
+    compressors = {name: compressor(name, rng) for name in ("anna", "ben")}
+    with SavedModels(place, SETTINGS) as publisher, Subscriber(SAVED_MODELS, place, SavedModel, about="ben") as reader:
+        message = received(publisher, compressors, reader)
+    assert (message.object, message.version) == ("ben", compressors["ben"].version)
+    assert message.file == Learned.of(compressors["ben"], SETTINGS).to_bytes()
+
+
+def test_no_file_is_made_without_a_subscriber(place, rng, monkeypatch):
+    monkeypatch.setattr(Learned, "of", lambda *_: pytest.fail("a file was made"))
+    with SavedModels(place, SETTINGS) as publisher:
+        for _ in range(3):
+            publisher.turn({"": compressor("", rng)})
+
+
+def test_an_object_that_was_not_found_yet_has_no_file(place, rng):
+    compressors = {"anna": Compressor(SETTINGS, "anna"), "ben": compressor("ben", rng)}
+    with SavedModels(place, SETTINGS) as publisher, Subscriber(SAVED_MODELS, place) as reader:
+        assert received(publisher, compressors, reader).object == "ben"
+        assert reader.receive(0.1) is None
+
+
+def test_a_later_subscriber_receives_the_newest_trees(place, rng):
+    compressors = {"": compressor("", rng)}
+    with SavedModels(place, SETTINGS) as publisher:
+        with Subscriber(SAVED_MODELS, place) as reader:
+            first = received(publisher, compressors, reader)
+        while publisher.has_subscribers:
+            publisher.turn(compressors)
+        compressors[""] = compressor("", rng, frames=30)
+        publisher.turn(compressors)
+        with Subscriber(SAVED_MODELS, place) as reader:
+            assert received(publisher, compressors, reader).version == compressors[""].version > first.version
