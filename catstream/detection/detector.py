@@ -42,7 +42,7 @@ class Detector:
     state : after the last frame, None before there is an object; with the model, and SCM if it is in use, all there is
     model : the one in use
     newest_version : of the models that arrived, in use or not
-    likeness : to the object of a saved model, which is used until that is found; None without one
+    likeness : to the object of a saved model, used until that is found; None without a saved model
     """
 
     def __init__(self, settings: Settings, name: str = "") -> None:
@@ -83,7 +83,7 @@ class Detector:
         self.state, self.model, self._scm = DetectorState(seq - 1, "confident", window, window, window), model, scm
         return self._result(seq, time, 1.0, training, begins=True)
 
-    def seek(self, model: Model, box: Box, likeness: Likeness | None = None) -> None:
+    def seek(self, model: Model, box: Box, likeness: Likeness) -> None:
         """Start with a saved model: the object is absent until it is found, in whichever frame and size that is.
 
         It is found at a window that looks like the object and scores `sighting_lead` higher than the rest of the
@@ -92,7 +92,7 @@ class Detector:
         Parameters
         ----------
         box : in pixels, about as large as the object may be
-        likeness : to the object; None to search by the score only
+        likeness : to the object
 
         Raises
         ------

@@ -38,6 +38,7 @@ _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a 
 _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
 _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
+_LIKELY_STEPS = 8  # larger or smaller than the size at which an object was first found, that are tried
 _LEAD_OVER_ALIKE = 0.25  # difference of score to another window that looks like the object of a saved model, too
 _SAME_OVERLAP = 0.3  # above which two windows in successive frames show the same object
 
@@ -134,8 +135,13 @@ class ScoreMap:
 def searched(
     frame: Pyramid, state: DetectorState, seq: int, model: Model, likeness: Likeness | None, settings: Settings
 ) -> tuple[DetectorState, Detection]:
-    """The best window of a frame, and the state that it was searched with: `seek` changes it, `find` does not."""
-    if state.first_window is None:
+    """The best window of a frame, and the state that it was searched with: `seek` changes it, `find` does not.
+
+    Parameters
+    ----------
+    likeness : to the object of a saved model, as long as that has not been found
+    """
+    if state.first_window is None and likeness is not None:
         return seek(frame, state, seq, model, likeness, settings)
     return state, find(frame, state, seq, model, settings)
 
@@ -166,7 +172,7 @@ def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings:
 
 
 def seek(
-    frame: Pyramid, state: DetectorState, seq: int, model: Model, likeness: Likeness | None, settings: Settings
+    frame: Pyramid, state: DetectorState, seq: int, model: Model, likeness: Likeness, settings: Settings
 ) -> tuple[DetectorState, Detection]:
     """The best window of the whole frame, of any size that an object that has not been found yet may have.
 
@@ -188,8 +194,23 @@ def seek(
     )
     if state.sightings < limits.sighting_frames:
         return state, best
-    found = fitted(frame, best, best.window, model, settings.extent)
-    return replace(state, window=best.window, first_window=best.window), replace(found, redetected=True)
+    found = replace(_at_likely_size(frame, best, model, likeness), redetected=True)
+    return replace(state, window=found.window, first_window=found.window), found
+
+
+def _at_likely_size(frame: Pyramid, found: Detection, model: Model, likeness: Likeness) -> Detection:
+    """A detection moved by at most a cell, at the size with the highest sum of score and likeness.
+
+    The score alone prefers windows that are too small, because they contain less background, and it may be higher than
+    that of the object's mean, 1. The subspace of the object contains its own outline and margin.
+    """
+
+    def tried(step: int) -> tuple[float, Detection]:
+        scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
+        best = scores.best()
+        return min(best.score, 1.0) + likeness(scores.row(*scores.highest())), best
+
+    return max((tried(step) for step in range(-_LIKELY_STEPS, _LIKELY_STEPS + 1)), key=lambda each: each[0])[1]
 
 
 def local(frame: Pyramid, window: Window, model: Model, settings: SearchSettings) -> Detection:
@@ -241,11 +262,9 @@ def _sighting(frame: Pyramid, window: Window, factors: tuple[float, ...], model:
     return _Sighting(best, max(rival, 0.0), scores.row(*scores.highest()), rival_row)
 
 
-def _stands_out(sighting: _Sighting, likeness: Likeness | None, limits: BeliefSettings) -> bool:
+def _stands_out(sighting: _Sighting, likeness: Likeness, limits: BeliefSettings) -> bool:
     """Whether the best window looks like the object, and leads the rest of the frame."""
     lead = sighting.found.score - sighting.rival
-    if likeness is None:
-        return lead >= _LEAD_OVER_ALIKE
     if likeness(sighting.row) < limits.sighting_likeness or lead < limits.sighting_lead:
         return False
     alike = sighting.rival_row is not None and likeness(sighting.rival_row) >= limits.sighting_likeness

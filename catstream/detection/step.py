@@ -69,7 +69,7 @@ def taught(
     settings: Settings,
 ) -> Training:
     """The training rows of a frame, as far as the belief in its detection allows."""
-    if state.first_window is None:
+    if state.first_window is None and likeness is not None:
         return teacher.training_beside(frame, found.window, model, likeness, settings)
     if not _policy(state, settings).teach:
         return {}

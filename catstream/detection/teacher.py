@@ -120,9 +120,7 @@ def training_at(
     return {APPEARANCE: rows, **(_extents(frame, window, rows, settings) if extents else {})}
 
 
-def training_beside(
-    frame: Pyramid, window: Window, model: Model, likeness: Likeness | None, settings: Settings
-) -> Training:
+def training_beside(frame: Pyramid, window: Window, model: Model, likeness: Likeness, settings: Settings) -> Training:
     """The rows of a frame in which the object of a saved model has not been found yet: background of a new scene.
 
     Windows with a high score are taken, but neither the best one, which may be the object, nor others that look like
@@ -130,7 +128,7 @@ def training_beside(
     """
     scores = ScoreMap.whole(frame, window, model)
     rows = _strongest(scores, window, settings.teaching.hard_negatives, settings.belief.weak_score)
-    strange = [row for row in rows if likeness is None or likeness(row) < settings.belief.sighting_likeness]
+    strange = [row for row in rows if likeness(row) < settings.belief.sighting_likeness]
     return {APPEARANCE: _rows(strange, 0, 1, settings.teaching)} if strange else {}
 
 
