@@ -39,7 +39,7 @@ _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole fram
 _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
 _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
 _LIKELY_STEPS = 8  # larger or smaller than the size at which an object was first found, that are tried
-_LEAD_OVER_ALIKE = 0.25  # difference of score to another window that looks like the object of a saved model, too
+_LEAD_OVER_ALIKE = 0.25  # difference of score to another window whose likeness to the object is at least half as high
 _SAME_OVERLAP = 0.3  # above which two windows in successive frames show the same object
 
 
@@ -264,11 +264,11 @@ def _sighting(frame: Pyramid, window: Window, factors: tuple[float, ...], model:
 
 def _stands_out(sighting: _Sighting, likeness: Likeness, limits: BeliefSettings) -> bool:
     """Whether the best window looks like the object, and leads the rest of the frame."""
-    lead = sighting.found.score - sighting.rival
-    if likeness(sighting.row) < limits.sighting_likeness or lead < limits.sighting_lead:
+    lead, alike = sighting.found.score - sighting.rival, likeness(sighting.row)
+    if alike < limits.sighting_likeness or lead < limits.sighting_lead:
         return False
-    alike = sighting.rival_row is not None and likeness(sighting.rival_row) >= limits.sighting_likeness
-    return lead >= _LEAD_OVER_ALIKE or not alike
+    rival = 0.0 if sighting.rival_row is None else likeness(sighting.rival_row)
+    return lead >= _LEAD_OVER_ALIKE or rival < alike / 2
 
 
 def _near(frame: Pyramid, window: Window, state: DetectorState, model: Model, settings: Settings) -> Detection:

@@ -303,15 +303,15 @@ def likeness(scene):
     return Likeness.of(own, float((own**2).sum()), own.sum(axis=0), len(own), other.mean(axis=0))
 
 
-def sought(model, frames, likeness=None):
+def sought(model, likeness, frames):
     """The tracks of an object, as large as START when it was learned, that is searched for in these frames."""
     detector = Follower()
     detector.seek(model, START, likeness)
     return [detector.step(frame)[0] for frame in frames]
 
 
-def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned):
-    tracks = sought(learned, [scene(), *[scene((90, 60))] * 3])
+def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned, likeness):
+    tracks = sought(learned, likeness, [scene(), *[scene((90, 60))] * 3])
     assert [track.state for track in tracks] == ["absent"] * 3 + ["present"]
     assert {track.model_version for track in tracks} == {7}
     assert tracks[-1].box.overlap(Box(90, 60, 48, 40)) > 0.6
@@ -319,27 +319,27 @@ def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned):
 
 @pytest.mark.parametrize("before", [0, 1, 2], ids="frames before: {}".format)
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.5, 2.0], ids="size: {}".format)
-def test_the_first_box_of_an_object_that_is_found_has_its_size(scene, learned, factor, before):
+def test_the_first_box_of_an_object_that_is_found_has_its_size(scene, learned, likeness, factor, before):
     frame = cv2.resize(scene((90, 60)), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     empty = cv2.resize(scene(), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    tracks = sought(learned, [empty] * before + [frame] * 5)
+    tracks = sought(learned, likeness, [empty] * before + [frame] * 5)
     box = next(track.box for track in tracks if track.box is not None)
     assert np.sqrt(box.area / (48 * 40)) == pytest.approx(factor, rel=0.15)
 
 
-def test_a_window_that_does_not_lead_its_frame_is_not_the_object(scene, learned):
+def test_a_window_that_does_not_lead_its_frame_is_not_the_object(scene, learned, likeness):
     frame = scene((90, 60))
     frame[150:190, 200:248] = frame[60:100, 90:138]
-    tracks = sought(learned, [frame] * 10)
+    tracks = sought(learned, likeness, [frame] * 10)
     assert {track.state for track in tracks} == {"absent"}
     assert tracks[-1].score > Settings().belief.confident_score
 
 
 def test_a_window_that_does_not_look_like_the_object_is_not_the_object(scene, learned, likeness):
     frames = [scene((90, 60))] * 5
-    assert sought(learned, frames, likeness)[-1].state == "present"
+    assert sought(learned, likeness, frames)[-1].state == "present"
     stranger = dataclasses.replace(likeness, basis=np.roll(likeness.basis, 1, axis=1))
-    assert {track.state for track in sought(learned, frames, stranger)} == {"absent"}
+    assert {track.state for track in sought(learned, stranger, frames)} == {"absent"}
 
 
 def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(scene, learned, likeness):
@@ -354,33 +354,34 @@ def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(scene,
     assert all(likeness(row) < Settings().belief.sighting_likeness for each in rows for row in each.rows)
 
 
-def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned):
-    tracks = sought(learned, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
+def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned, likeness):
+    tracks = sought(learned, likeness, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
     assert {track.state for track in tracks} == {"absent"}
 
 
-def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned):
+def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned, likeness):
     detector = Follower()
-    detector.seek(learned, START)
+    detector.seek(learned, START, likeness)
     taught = [detector.step(scene((90, 60)))[1].training.get("appearance") for _ in range(5)]
     assert not any(rows is not None and rows.labels.any() for rows in taught[:2])
     assert any(rows is not None and rows.labels.any() for rows in taught[2:])
 
 
-def test_a_resumed_search_continues_bit_for_bit(scene, learned):
+def test_a_resumed_search_continues_bit_for_bit(scene, learned, likeness):
     frame = scene((90, 60))
-    tracks = sought(learned, [frame] * 5)
+    tracks = sought(learned, likeness, [frame] * 5)
     other, before = Follower(), Follower()
-    before.seek(learned, START)
+    before.seek(learned, START, likeness)
     detector = [before.step(frame)[1].detector for _ in range(2)][-1]
     assert detector.sightings == 2
     other.go_on(2, detector, learned)
+    other.likeness = likeness
     assert [other.step(frame)[0] for _ in range(3)] == tracks[2:]
 
 
-def test_a_model_of_other_features_is_rejected():
+def test_a_model_of_other_features_is_rejected(likeness):
     with pytest.raises(ProtocolError, match="learn it anew"):
-        Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START)
+        Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START, likeness)
 
 
 def test_tracking_continues_from_a_corrected_box_which_is_learned_from(scene):
