@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -161,7 +162,8 @@ def match_template(template: np.ndarray, image: np.ndarray) -> Found:
 class OrbMatcher:
     """Matches of ORB features that agree on a similarity transform; the score is their number."""
 
-    _SIDE = 200  # of the longer side of the object, to which it is enlarged: ORB finds little in a small image
+    _SIDE = 120  # of the longer side of the object, to which it is enlarged: ORB finds little in a small image
+    _MOST_PIXELS = 4_000_000  # of an enlarged frame
 
     def __init__(self, template: np.ndarray) -> None:
         self._orb = cv2.ORB_create(nfeatures=1000, edgeThreshold=15, patchSize=31)
@@ -172,9 +174,10 @@ class OrbMatcher:
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
 
     def __call__(self, image: np.ndarray) -> Found:
-        large = cv2.resize(image, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_CUBIC)
-        if self._features is None or len(self._features) < 3 or large.shape[0] * large.shape[1] > 20_000_000:
+        if self._features is None or len(self._features) < 3:
             return []
+        scale = min(self._scale, math.sqrt(self._MOST_PIXELS / (image.shape[0] * image.shape[1])))
+        large = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         points, features = self._orb.detectAndCompute(large, None)
         if features is None or len(features) < 2:
             return []
@@ -189,7 +192,7 @@ class OrbMatcher:
         if matrix is None:
             return []
         (w, h), corners = self._size, np.array([(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 1)])
-        placed = corners * (w, h, 1) @ matrix.T / self._scale
+        placed = corners * (w, h, 1) @ matrix.T / scale
         low, high = placed.min(axis=0), placed.max(axis=0)
         return [(float(inliers.sum()), Box(*map(float, (*low, *np.maximum(high - low, 1e-3)))))]
 
@@ -444,9 +447,9 @@ def _call(
 if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument(
-        "--own", type=int, default=20, help="frames of the rest of each sequence (default: %(default)s)"
+        "--own", type=int, default=12, help="frames of the rest of each sequence (default: %(default)s)"
     )
-    parser.add_argument("--others", type=int, default=4, help="frames of each other sequence (default: %(default)s)")
+    parser.add_argument("--others", type=int, default=2, help="frames of each other sequence (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes (default: %(default)s)")
     parser.add_argument(
         "--output", type=Path, help="folder for the answers; objects that are complete are not repeated"
