@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 
 from catstream import storage
-from catstream.box import Box, Window
+from catstream.box import Box
 from catstream.compression.compressor import Compressor, sample_of
 from catstream.compression.reduce import energy
 from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
@@ -45,14 +45,13 @@ _SAME = ("coreset.size", "coreset.reduction", "search.context", "teaching.colour
 class Learned:
     """Everything that was learned of an object. The trees are not changed: `compressor` makes copies of them.
 
-    object        name of the object, empty for the object without a name
-    trees         coreset tree of each head of `catstream.heads`
-    centres       centres of the object in the last complete block of frames, as in a `Sample`
-    origins       digest of the first training rows of each stream that the trees contain
-    box           last box of the object in pixels; only its size matters in another video
-    first_window  window of the object in its first frame: the search prefers its size and aspect ratio
-    model         trained from the trees; its frame is 0
-    settings      that the trees and the model were made with
+    object    name of the object, empty for the object without a name
+    trees     coreset tree of each head of `catstream.heads`
+    centres   centres of the object in the last complete block of frames, as in a `Sample`
+    origins   digest of the first training rows of each stream that the trees contain
+    box       last box of the object in pixels; only its size matters in another video
+    model     trained from the trees; its frame is 0
+    settings  that the trees and the model were made with
     """
 
     object: str
@@ -60,7 +59,6 @@ class Learned:
     centres: np.ndarray
     origins: tuple[str, ...]
     box: Box
-    first_window: Window
     model: Model
     settings: Settings
 
@@ -79,7 +77,7 @@ class Learned:
         trees = {head: tree.copy() for head, tree in compressor.trees.items()}
         centres, name = compressor.centres, compressor.name
         model = _trained(trees, centres, compressor.version, name, settings)
-        return cls(name, trees, centres, compressor.origins, compressor.box, state.first_window, model, settings)
+        return cls(name, trees, centres, compressor.origins, compressor.box, model, settings)
 
     def compressor(self, settings: Settings, name: str = "") -> Compressor:
         """A compressor that inserts the frames of another stream into copies of the trees; versions continue.
@@ -131,7 +129,6 @@ class Learned:
             "trees": trees,
             "origins": list(self.origins),
             "box": list(self.box),
-            "first_window": list(self.first_window),
             "model": model,
             "settings": self.settings.portable(),
         }
@@ -180,7 +177,6 @@ class Learned:
             arrays["centres"],
             tuple(map(str, metadata["origins"])),
             Box(*map(float, metadata["box"])),
-            Window(*map(float, metadata["first_window"])),
             unpack(Model, arrays, metadata["model"], "model"),
             Settings.from_values(metadata["settings"]),
         )
@@ -189,10 +185,9 @@ class Learned:
         """Raise ValueError if the parts do not belong together."""
         check_message(self.model)
         check_message(sample_of(self.trees, self.model.version, 0, self.centres, self.object))
-        for rectangle in (self.box, self.first_window):
-            x, y, w, h = rectangle
-            if not (np.isfinite((x, y)).all() and 0 < w < np.inf and 0 < h < np.inf):
-                raise ValueError(f"its box is {rectangle}")
+        x, y, w, h = self.box
+        if not (np.isfinite((x, y)).all() and 0 < w < np.inf and 0 < h < np.inf):
+            raise ValueError(f"its box is {self.box}")
         for name, head in HEADS.items():
             tree, width = self.trees[name], len(self.model.weights) + head.more_columns
             if tree.size != self.settings.coreset.size or tree.width not in (0, width):
