@@ -4,7 +4,7 @@
 /events           updates of the page as server-sent events, at most ten per second
 /pictures/N.jpg   the picture of frame N
 /live.mjpeg       the newest pictures with their tracks drawn in, as an MJPEG stream
-/control          POST {"verb": ..., "box": [x, y, w, h], "keep": ...}
+/control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ...}
 /metrics          metrics for Prometheus
 /healthz          200 while this server runs
 /readyz           200 while all processes of the pipeline send health reports
@@ -16,6 +16,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
@@ -28,6 +29,7 @@ from starlette.staticfiles import StaticFiles
 
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages import Answer
+from catstream.names import check_name
 from catstream.steering import Control
 from catstream.video.annotate import draw_preview
 from catstream.web import metrics
@@ -42,6 +44,8 @@ _UPDATE_SECONDS = 0.1
 _KEEP_ALIVE_SECONDS = 5.0  # an idle stream sends a comment after this time, which detects closed connections
 _MAX_VIEWERS = 64
 _COMMANDS, _COMMANDS_PER_SECOND = 20, 5
+_VERBS = ("set-box", "forget", "pause", "resume", "stop")
+_DEFAULTS: dict[str, object] = {"verb": "", "object": "", "box": None, "keep": False}  # of the fields of a command
 
 
 def create(feed: Feed) -> Starlette:
@@ -104,7 +108,7 @@ class _Pages:
                 newest = self._feed.dashboard.newest
                 if newest is not None and newest != shown:
                     shown = newest
-                    jpeg = await run_in_threadpool(draw_preview, *newest)
+                    jpeg = await run_in_threadpool(draw_preview, *newest, self._feed.dashboard.objects.colours)
                     # The boundary after the picture is sent with it: many clients show a picture only after it.
                     yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (
                         len(jpeg),
@@ -142,11 +146,11 @@ class _Pages:
             return too_many(wait)
         self._commands.take()
         try:
-            verb, box, keep = _command(await body_of(request))
+            command = _command(await body_of(request))
         except ValueError as error:
             return _refused(400, str(error))
         try:
-            answer = await run_in_threadpool(_execute, self._feed, verb, box, keep)
+            answer = await run_in_threadpool(_execute, self._feed, command)
         except CommandRejectedError as error:
             return _refused(409, str(error))
         except ProtocolError as error:
@@ -155,7 +159,8 @@ class _Pages:
             return _refused(504, str(error))
         except CatstreamError as error:
             return _refused(503, str(error))
-        return JSONResponse({"done": True, "reason": answer.reason, "frame": answer.frame, "version": answer.version})
+        result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
+        return JSONResponse({"done": True} | result)
 
     async def metrics(self, _: Request) -> Response:
         return Response(metrics.text(self._feed), media_type="text/plain; version=0.0.4; charset=utf-8")
@@ -172,8 +177,18 @@ class _Pages:
         )
 
 
-def _command(body: bytes | None) -> tuple[str, list[float] | None, bool]:
-    """Return verb, box and `keep` of a posted command. Raises ValueError if it is not a valid command."""
+@dataclass(frozen=True, slots=True)
+class _Command:
+    """A posted command: verb, name of the object, and the arguments of `Control.set_box`."""
+
+    verb: str
+    object: str
+    box: list[float] | None
+    keep: bool
+
+
+def _command(body: bytes | None) -> _Command:
+    """Return a posted command. Raises ValueError if it is not valid."""
     if body is None:
         raise ValueError("expected a command, got more than 4096 bytes")
     try:
@@ -182,21 +197,25 @@ def _command(body: bytes | None) -> tuple[str, list[float] | None, bool]:
         )  # an integer that is too large becomes infinite, and is rejected
     except RecursionError:
         raise ValueError("expected a command, got deeply nested JSON") from None
-    if not isinstance(command, dict) or command.get("verb") not in ("set-box", "pause", "resume", "stop"):
-        raise ValueError('expected {"verb": "set-box", "pause", "resume" or "stop"}')
-    verb, box, keep = command["verb"], command.get("box"), command.get("keep", False)
+    if not isinstance(command, dict) or command.get("verb") not in _VERBS:
+        raise ValueError(f'expected "verb": one of {", ".join(_VERBS)}')
+    verb, name, box, keep = (command.get(key, default) for key, default in _DEFAULTS.items())
     numbers = isinstance(box, list) and len(box) == 4 and all(type(side) is float for side in box)
     if (verb == "set-box") != numbers or not isinstance(keep, bool) or (box is not None and not numbers):
         raise ValueError('expected "box": [x, y, w, h] with set-box and with nothing else, and "keep": true or false')
-    return verb, box, keep
+    if not isinstance(name, str) or (name and verb not in ("set-box", "forget")):
+        raise ValueError('expected "object": the name of an object, with set-box and forget and with nothing else')
+    return _Command(verb, check_name(name), box, keep)
 
 
-def _execute(feed: Feed, verb: str, box: list[float] | None, keep: bool) -> Answer:
+def _execute(feed: Feed, command: _Command) -> Answer:
     """Send a command and wait for its answer."""
     with Control(feed.attached_endpoint, keys=feed.keys) as pipeline:
-        if box is not None:
-            return pipeline.set_box(box, keep=keep)
-        return {"pause": pipeline.pause, "resume": pipeline.resume, "stop": pipeline.stop}[verb]()
+        if command.box is not None:
+            return pipeline.set_box(command.box, object=command.object, keep=command.keep)
+        if command.verb == "forget":
+            return pipeline.forget(command.object)
+        return {"pause": pipeline.pause, "resume": pipeline.resume, "stop": pipeline.stop}[command.verb]()
 
 
 def _refused(code: int, reason: str) -> Response:

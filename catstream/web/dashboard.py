@@ -7,6 +7,7 @@ from typing import Literal
 
 from catstream.heads import HEADS
 from catstream.messages import End, Features, Health, Model, Preview, Track
+from catstream.web.objects import Objects
 from catstream.web.surprising import SurprisingFrames
 
 __all__ = ["SILENCE_SECONDS", "Dashboard", "Phase"]
@@ -20,11 +21,15 @@ SILENCE_SECONDS = 4.0
 _POINT_SECONDS = 0.25
 _POINTS = 480  # two minutes
 _RATE_SECONDS = 2.0  # interval over which frames per second are counted
-_FRAMES = 4096  # number of frames whose arrival times are kept until a model was trained on them
-_MONOTONIC_COUNTERS = ("sent", "rows")  # counters that never decrease within a run for one object
+_FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
+_MONOTONIC_COUNTERS = ("sent", "rows")  # counters that never decrease within a run, if no object is dropped
 _LATE_HEALTH_SECONDS = 3.0  # health reports of the same run may arrive this long after its end
-_TRACKS = 256  # number of tracks that are kept until the picture of their frame arrives
+_TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
 _PICTURES = 8  # number of pictures that a page may still request
+
+#: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
+#: whether it is present.
+_Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
 
 
 class Dashboard:
@@ -37,6 +42,7 @@ class Dashboard:
     endpoint, source : endpoint of the pipeline, and its source of frames
     health : last health report of each process
     last_reports : arrival time of the last health report of each process that is not silent
+    objects : the objects that are tracked
     """
 
     def __init__(self) -> None:
@@ -48,20 +54,18 @@ class Dashboard:
         """Drop all state of the previous pipeline."""
         self.phase: Phase = "waiting"
         self.reason = self.source = ""
-        self.track: Track | None = None
+        self.objects = Objects()
         self.health: dict[str, Health] = {}
         self.last_reports: dict[str, float] = {}
-        self.model_latency: float | None = None
         self.surprising = SurprisingFrames()
         self.pictures: OrderedDict[int, Preview] = OrderedDict()
         self._last: dict[str, Health] = {}  # like `health`, but kept while the pipeline is silent
-        self._model: Model | None = None
-        self._since = 0  # first frame of the current object
-        self._points: deque[tuple[float | None, ...]] = deque(maxlen=_POINTS)
+        self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = self._ended = float("-inf")  # times of the last chart point and of the end
         self._moments: deque[float] = deque()
         self._arrivals: OrderedDict[int, float] = OrderedDict()
-        self._tracks: OrderedDict[int, Track] = OrderedDict()  # the newest tracks, by frame
+        self._tracks: OrderedDict[int, dict[str, Track]] = OrderedDict()  # of the newest frames, by frame and object
+        self._frame: tuple[int, float] | None = None  # number and time of the newest frame
 
     def attach(self, endpoint: str) -> None:
         """Expect messages from this endpoint from now on; the state is kept until the first one arrives."""
@@ -74,7 +78,7 @@ class Dashboard:
         """Process a message that arrived at the time `now`, in seconds of a monotonic clock."""
         if self._is_from_another_pipeline(message, now):
             self._reset()
-            self._mark_changed("pipeline", "status", "track", "picture", "trees", "surprising")
+            self._mark_changed("pipeline", "status", "tracks", "picture", "trees", "surprising")
         match message:
             case Track():
                 self._add_track(message, now)
@@ -111,6 +115,11 @@ class Dashboard:
         """Return a counter from the last health report of a process, None if there is none."""
         return self.health[process].counters.get(name) if process in self.health else None
 
+    def object_counters(self, process: str, name: str) -> dict[str, float]:
+        """Return a counter of each object that is shown from the last health report of a process, by object."""
+        objects = self.health[process].objects if process in self.health else {}
+        return {each: objects[each][name] for each in self.objects.shown if name in objects.get(each, {})}
+
     def picture(self, frame: int) -> Preview | None:
         """Return the picture of a recent frame or of a surprising one, None if it is not kept."""
         if frame in self.pictures:
@@ -118,10 +127,13 @@ class Dashboard:
         return next((one.preview for one in self.surprising.frames if one.frame == frame), None)
 
     @property
-    def newest(self) -> tuple[Preview, Track | None] | None:
-        """The newest picture, and the track of its frame or None."""
+    def newest(self) -> tuple[Preview, list[Track]] | None:
+        """The newest picture, and the tracks of its frame as far as they have arrived."""
         preview = next(reversed(self.pictures.values()), None)
-        return None if preview is None else (preview, self._tracks.get(preview.frame))
+        if preview is None:
+            return None
+        tracks = self._tracks.get(preview.frame, {}).values()
+        return preview, [track for track in tracks if track.object in self.objects.shown]
 
     def updates(self, seen: dict[str, int]) -> dict[str, object]:
         """Return the parts that have changed since the last call for this page, as JSON values.
@@ -144,11 +156,12 @@ class Dashboard:
         if self._attached != self.endpoint:
             self.endpoint = self._attached
             return True
-        if isinstance(message, Track):  # a restarted detector continues, or starts again before the first model
-            over = self.track is not None and message.seq < self.track.seq and not message.model_version
+        if isinstance(message, Track):  # a restarted detector continues with the model of the object
+            before = self.objects.shown.get(message.object)
+            over = before is not None and message.seq < before.seq and message.model_version == 0 < before.version
             return over or self.phase == "ended"
-        before = self._last.get(message.process, message).counters
-        over = any(message.counters.get(name, 0.0) < before.get(name, 0.0) for name in _MONOTONIC_COUNTERS)
+        counters = self._last.get(message.process, message).counters
+        over = any(message.counters.get(name, 0.0) < counters.get(name, 0.0) for name in _MONOTONIC_COUNTERS)
         late = self.phase == "ended" and now - self._ended > _LATE_HEALTH_SECONDS
         return late or (over and self.phase in ("ended", "silent"))
 
@@ -160,6 +173,11 @@ class Dashboard:
         self.source = health.source or self.source
         if self.phase in ("waiting", "silent"):
             self.phase, self.reason = "running", ""
+        if health.process == "detector":
+            if dropped := self.objects.add_health(health):
+                self.surprising.drop(dropped)
+                self._mark_changed("surprising")
+            self._mark_changed("tracks")
         self._add_point(now)
         self._mark_changed("status", "trees")
 
@@ -167,35 +185,32 @@ class Dashboard:
         if self.phase != "running":
             self.phase, self.reason = "running", ""
             self._mark_changed("status")
-        if self.track is not None and track.model_version < self.track.model_version:
-            self._begin_object(track.frame)
-        self.track = self._tracks[track.frame] = track
+        if self.objects.add_track(track):
+            self.surprising.drop({track.object})
+            if (model := self.objects.shown[track.object].model) is not None:  # it arrived before the track
+                self.surprising.adopt(model)
+            self._mark_changed("surprising")
+        if self._frame is None or track.frame != self._frame[0]:
+            self._begin_frame(track, now)
+        self._tracks[track.frame][track.object] = track
+        self._add_point(now)
+        self._mark_changed("tracks")
+
+    def _begin_frame(self, track: Track, now: float) -> None:
+        """Record the arrival of the first track of a frame."""
+        self._frame = track.frame, track.time
+        self._tracks[track.frame] = {}
         if len(self._tracks) > _TRACKS:
             self._tracks.popitem(last=False)
         self._moments.append(now)
         self._arrivals[track.frame] = now
         if len(self._arrivals) > _FRAMES:
             self._arrivals.popitem(last=False)
-        self._add_point(now)
-        self._mark_changed("track")
-
-    def _begin_object(self, frame: int) -> None:
-        """Reset what belongs to the previous object: another object is tracked from this frame on."""
-        self._since, self.surprising, self.model_latency = frame, SurprisingFrames(), None
-        self._arrivals.clear()
-        if self._model is not None and self._model.frame >= frame:  # the model arrived before the track
-            self.surprising.adopt(self._model)
-        self._mark_changed("surprising")
 
     def _add_model(self, model: Model, now: float) -> None:
-        if model.frame < self._since:  # a model of the previous object
-            return
-        self._model = model
-        self.surprising.adopt(model)
-        if (arrived := self._arrivals.get(model.frame)) is not None:
-            self.model_latency = now - arrived
-        while self._arrivals and next(iter(self._arrivals)) <= model.frame:
-            self._arrivals.popitem(last=False)
+        arrived = self._arrivals.get(model.frame)
+        if self.objects.add_model(model, None if arrived is None else now - arrived):
+            self.surprising.adopt(model)
 
     def _add_preview(self, preview: Preview) -> None:
         self.pictures[preview.frame] = preview
@@ -207,12 +222,14 @@ class Dashboard:
         self._mark_changed("picture")
 
     def _add_point(self, now: float) -> None:
-        if self.track is None or now - self._last_point < _POINT_SECONDS:
+        if not self.objects.shown or now - self._last_point < _POINT_SECONDS:
             return
-        self._last_point, present = now, self.track.state != "absent"
-        self._points.append(
-            (now, self.track.score, self.rate(now), self.model_latency, self.track.model_version, present)
-        )
+        self._last_point = now
+        objects = {
+            name: (each.score, each.model_latency, each.version, each.state != "absent")
+            for name, each in self.objects.shown.items()
+        }
+        self._points.append((now, self.rate(now), objects))
         self._mark_changed("points")
 
     def _mark_changed(self, *parts: str) -> None:
@@ -231,10 +248,13 @@ class Dashboard:
             "skipped": self.counter("detector", "skipped"),
         }
 
-    def _track_part(self, _: int) -> dict[str, object] | None:
-        if (track := self.track) is None:
-            return None
-        return {"frame": track.frame, "time": track.time, "state": track.state, "version": track.model_version}
+    def _tracks_part(self, _: int) -> dict[str, object]:
+        frame, time = self._frame or (None, None)
+        objects = [
+            {"name": name, "colour": each.colour, "state": each.state, "score": each.score, "version": each.version}
+            for name, each in self.objects.shown.items()
+        ]
+        return {"frame": frame, "time": time, "objects": objects}
 
     def _pipeline_part(self, _: int) -> int:
         """Return the number of pipelines shown so far; if it changes, all parts are sent again."""
@@ -246,24 +266,36 @@ class Dashboard:
         preview = self.newest[0]
         return {"frame": preview.frame, "width": preview.width, "height": preview.height, "boxes": preview.boxes}
 
-    def _points_part(self, new: int) -> list[list[float | None]]:
-        return [[value if value is None else round(value, 3) for value in point] for point in list(self._points)[-new:]]
+    def _points_part(self, new: int) -> list[list[object]]:
+        return [
+            [round(now, 3), rate, {name: list(map(_rounded, values)) for name, values in objects.items()}]
+            for now, rate, objects in list(self._points)[-new:]
+        ]
 
     def _trees_part(self, _: int) -> dict[str, object]:
-        counted = self._last["compressor"].counters if "compressor" in self._last else {}
+        counted = self._last["compressor"].objects if "compressor" in self._last else {}
+        objects = {
+            name: {
+                "leaves": [counters.get(f"{head}_leaves", 0.0) for head in HEADS],
+                "bytes": counters.get("bytes", 0.0),
+                "rows": counters.get("rows", 0.0),
+            }
+            for name, counters in counted.items()
+        }
         return {
-            "trees": [
-                {"title": head.title, "meaning": head.meaning, "leaves": counted.get(f"{name}_leaves")}
-                for name, head in HEADS.items()
-            ],
-            "bytes": counted.get("bytes"),
-            "rows": counted.get("rows"),
+            "heads": [{"title": head.title, "meaning": head.meaning} for head in HEADS.values()],
+            "objects": objects,
         }
 
     def _surprising_part(self, _: int) -> dict[str, object]:
         frames = [
-            {"frame": one.frame, "time": one.time, "surprise": round(one.surprise, 3), "boxes": one.preview.boxes}
-            | {"width": one.preview.width, "height": one.preview.height}
+            {"frame": one.frame, "time": one.time, "object": one.object}
+            | {"surprise": round(one.surprise, 3), "colour": self.objects.colours.of(one.object)}
+            | {"box": one.preview.boxes[one.object], "width": one.preview.width, "height": one.preview.height}
             for one in self.surprising.frames
         ]
         return {"measured": self.surprising.measured, "frames": frames}
+
+
+def _rounded(value: float | None) -> float | None:
+    return round(value, 3) if isinstance(value, float) else value

@@ -20,7 +20,6 @@ _COUNTED = (
     ("frames_skipped", "detector", "skipped", "Frames of a live source that were skipped."),
     ("source_reopened", "detector", "reopened", "Times that a live source was lost and reopened."),
     ("features_stored", "detector", "stored", "Features messages stored in the coreset trees."),
-    ("rows", "compressor", "rows", "Rows inserted into the coreset trees."),
 )
 _GAUGES = (
     (
@@ -29,6 +28,15 @@ _GAUGES = (
         "lost_seconds",
         "Seconds since a live source was lost, 0 while it is available.",
     ),
+    ("objects", "detector", "objects", "Objects that are tracked."),
+)
+
+#: The same of the metrics with a value for each object.
+_COUNTED_BY_OBJECT = (
+    ("rows", "compressor", "rows", "Rows inserted into the coreset trees."),
+    ("models_trained", "trainer", "trained", "Models trained."),
+)
+_GAUGES_BY_OBJECT = (
     ("model_version", "detector", "model_version", "Version of the model that the detector uses."),
     ("tree_bytes", "compressor", "bytes", "Memory of the coreset trees."),
 )
@@ -55,32 +63,48 @@ class _Collector:
         for name, process, counter, meaning in _GAUGES:
             if (value := dashboard.counter(process, counter)) is not None:
                 yield _gauge(name, meaning, value)
-        yield from self._learning()
-        yield from self._processes()
-        if dashboard.track is not None:
-            yield _gauge("score", "Score of the newest track: about 0 on background, about 1 on the object.",
-                         dashboard.track.score)  # fmt: skip
-            yield _gauge("present", "Whether the object is present.", dashboard.track.state != "absent")
-            yield _gauge(
-                "frames_per_second", "Frames per second over the last two seconds.", dashboard.rate(monotonic())
-            )
-
-    def _learning(self) -> Iterator[Metric]:
-        dashboard = self._feed.dashboard
+        if dashboard.objects.shown:
+            frames = "Frames per second over the last two seconds."
+            yield _gauge("frames_per_second", frames, dashboard.rate(monotonic()))
         sent, taken = dashboard.counter("detector", "sent"), dashboard.counter("detector", "taken")
         if sent is not None and taken is not None:
             yield _gauge("features_waiting", "Features messages that the compressor has not received yet.",
                          sent - taken)  # fmt: skip
-        if dashboard.model_latency is not None:
-            yield _gauge("learning_latency_seconds", "Seconds from the track of a frame to the model trained on it.",
-                         dashboard.model_latency)  # fmt: skip
+        yield from self._objects()
+        yield from self._processes()
+
+    def _objects(self) -> Iterator[Metric]:
+        """The metrics with a value for each object; the label of an object without a name is empty."""
+        dashboard = self._feed.dashboard
+        for name, process, counter, meaning in _COUNTED_BY_OBJECT:
+            counted = CounterMetricFamily(f"catstream_{name}", meaning, labels=["object"])
+            yield _with_objects(counted, dashboard.object_counters(process, counter))
+        for name, process, counter, meaning in _GAUGES_BY_OBJECT:
+            gauge = GaugeMetricFamily(f"catstream_{name}", meaning, labels=["object"])
+            yield _with_objects(gauge, dashboard.object_counters(process, counter))
+        score = GaugeMetricFamily(
+            "catstream_score",
+            "Score of the newest track: about 0 on background, about 1 on the object.",
+            labels=["object"],
+        )
+        present = GaugeMetricFamily("catstream_present", "Whether the object is present.", labels=["object"])
+        latency = GaugeMetricFamily(
+            "catstream_learning_latency_seconds",
+            "Seconds from the track of a frame to the model trained on it.",
+            labels=["object"],
+        )
+        for name, each in dashboard.objects.shown.items():
+            score.add_metric([name], each.score)
+            present.add_metric([name], float(each.state != "absent"))
+            if each.model_latency is not None:
+                latency.add_metric([name], each.model_latency)
         leaves = GaugeMetricFamily(
-            "catstream_tree_leaves", "Leaves ever inserted into a coreset tree.", labels=["tree"]
+            "catstream_tree_leaves", "Leaves ever inserted into a coreset tree.", labels=["object", "tree"]
         )
         for tree in HEADS:
-            if (value := dashboard.counter("compressor", f"{tree}_leaves")) is not None:
-                leaves.add_metric([tree], value)
-        yield leaves
+            for name, value in dashboard.object_counters("compressor", f"{tree}_leaves").items():
+                leaves.add_metric([name, tree], value)
+        yield from (score, present, latency, leaves)
 
     def _processes(self) -> Iterator[Metric]:
         ages = GaugeMetricFamily(
@@ -94,6 +118,15 @@ class _Collector:
                 ages.add_metric([process], max(0.0, time() - self._feed.dashboard.health[process].time))
                 rejected.add_metric([process], self._feed.dashboard.counter(process, "rejected") or 0)
         yield from (ages, rejected)
+
+
+def _with_objects(
+    family: CounterMetricFamily | GaugeMetricFamily, values: dict[str, float]
+) -> CounterMetricFamily | GaugeMetricFamily:
+    """Add a value for each object, by name."""
+    for name, value in values.items():
+        family.add_metric([name], value)
+    return family
 
 
 def _gauge(name: str, meaning: str, value: float) -> Metric:

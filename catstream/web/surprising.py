@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -25,12 +26,14 @@ class SurprisingFrame:
     """One of the selected frames.
 
     frame, time  number and time stamp in the video
-    surprise     its `surprise`
-    preview      its picture
+    object       name of the object
+    surprise     `surprise` of the object's model
+    preview      picture of the frame, with a box of the object
     """
 
     frame: int
     time: float
+    object: str
     surprise: float
     preview: Preview
 
@@ -42,35 +45,50 @@ def surprise(training: TrainingRows, model: Model) -> float:
 
 
 class SurprisingFrames:
-    """Keeps the few frames with the largest surprise, at least a second apart, in constant memory.
+    """Keeps the few frames with the largest surprise, those of one object at least a second apart, in constant memory.
 
-    A frame is measured once its features and its picture were received, with the newest model at that time. Frames
-    before the first model are not measured.
+    A frame is measured once its features and its picture were received, with the newest model of each object at that
+    time. Frames before the first model of an object are not measured for it.
     """
 
     def __init__(self) -> None:
         self.frames: list[SurprisingFrame] = []  #: in the order of the video
-        self.measured = 0  #: number of measured frames
-        self._models: dict[str, Model] = {}  # the newest of each object
-        self._surprises: OrderedDict[int, tuple[float, float]] = OrderedDict()  # frame -> time, surprise
+        self._measured: Counter[str] = Counter()
+        self._models: dict[str, Model] = {}
+        self._surprises: OrderedDict[int, tuple[float, dict[str, float]]] = OrderedDict()  # frame -> time, by object
         self._pictures: OrderedDict[int, Preview] = OrderedDict()
 
+    @property
+    def measured(self) -> int:
+        """Number of measured frames, summed over the objects."""
+        return self._measured.total()
+
     def adopt(self, model: Model) -> None:
-        """Measure with this model from now on."""
+        """Measure the frames of its object with this model from now on."""
         self._models[model.object] = model
+
+    def drop(self, names: Iterable[str]) -> None:
+        """Drop everything of these objects."""
+        dropped = set(names)
+        self.frames = [one for one in self.frames if one.object not in dropped]
+        for name in dropped:
+            self._models.pop(name, None)
+            del self._measured[name]
+            for _, surprises in self._surprises.values():
+                surprises.pop(name, None)
 
     def add_features(self, features: Features) -> bool:
         """Add the features of a frame; return whether the selection has changed."""
-        surprises = [
-            surprise(training, model)
+        surprises = {
+            name: surprise(training, model)
             for name, part in features.objects.items()
             if (model := self._models.get(name)) is not None
             and (training := part.training.get(APPEARANCE)) is not None
             and training.rows.shape[1] == len(model.weights)
-        ]
+        }
         if not surprises:
             return False
-        self._keep(self._surprises, features.frame, (features.time, max(surprises)))
+        self._keep(self._surprises, features.frame, (features.time, surprises))
         return self._match(features.frame)
 
     def add_preview(self, preview: Preview) -> bool:
@@ -87,16 +105,21 @@ class SurprisingFrames:
             pending.popitem(last=False)
 
     def _match(self, frame: int) -> bool:
+        """Measure a frame if its features and its picture are here; return whether the selection has changed."""
         if frame not in self._surprises or frame not in self._pictures:
             return False
-        self.measured += 1
-        time, value = self._surprises.pop(frame)
-        new = SurprisingFrame(frame, time, value, self._pictures.pop(frame))
-        near = [other for other in self.frames if abs(other.time - time) < _APART_SECONDS]
-        if any(other.surprise >= value for other in near):
-            return False
-        frames = sorted({*self.frames, new} - set(near), key=lambda one: one.surprise, reverse=True)[:_FRAMES]
-        frames.sort(key=lambda one: one.frame)
-        changed = frames != self.frames
-        self.frames = frames
-        return changed
+        time, surprises = self._surprises.pop(frame)
+        preview, before = self._pictures.pop(frame), self.frames
+        for name in surprises.keys() & preview.boxes.keys():
+            self._measured[name] += 1
+            self._insert(SurprisingFrame(frame, time, name, surprises[name], preview))
+        return self.frames != before
+
+    def _insert(self, new: SurprisingFrame) -> None:
+        """Add a frame to the selection, unless others are more surprising."""
+        near = [one for one in self.frames if one.object == new.object and abs(one.time - new.time) < _APART_SECONDS]
+        if any(one.surprise >= new.surprise for one in near):
+            return
+        rest = [one for one in self.frames if one not in near]
+        frames = sorted([*rest, new], key=lambda one: one.surprise, reverse=True)[:_FRAMES]
+        self.frames = sorted(frames, key=lambda one: (one.frame, one.object))

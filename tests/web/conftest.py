@@ -9,33 +9,41 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.messages import Features, Model, Preview, Track, TrainingRows
+from catstream.messages import Features, Health, Model, ObjectFeatures, Preview, Track, TrainingRows
 from catstream.web.server import Server
 
 JPEG = b"\xff\xd8\xff\xe0 a picture"
 
 
 class Facts:
-    """Messages about frame after frame."""
+    """Messages about frame after frame, of one object or of several."""
 
     @staticmethod
-    def track(frame, version=1, state="present", score=0.75):
+    def track(frame, version=1, state="present", score=0.75, name=""):
         box = None if state == "absent" else Box(4.0, 3.0, 20.0, 10.0)
-        return Track(frame + 1, frame, frame / 10, state, box, score, version)
+        return Track(frame + 1, frame, frame / 10, state, box, score, version, None, name)
 
     @staticmethod
-    def model(version, frame):
-        return Model(version, frame, np.ones(2, np.float32), 0.0)
+    def model(version, frame, name=""):
+        return Model(version, frame, np.ones(2, np.float32), 0.0, object=name)
 
     @staticmethod
-    def features(frame, wrong):
-        """Of one row, about which the model of above is so wrong."""
+    def features(frame, wrong, *names):
+        """One row of each object, for which the loss of the model above is `wrong` squared."""
         rows = np.full((1, 2), 0.5 + wrong / 2, np.float32)
-        return Features(frame + 1, frame, frame / 10, None, {"appearance": TrainingRows.labelled(rows, 1)})
+        part = ObjectFeatures(None, {"appearance": TrainingRows.labelled(rows, 1)})
+        return Features(frame + 1, frame, frame / 10, dict.fromkeys(names or ("",), part))
 
     @staticmethod
-    def preview(frame):
-        return Preview(frame, 64, 48, Box(4.0, 3.0, 20.0, 10.0), JPEG + str(frame).encode())
+    def preview(frame, *names):
+        box = Box(4.0, 3.0, 20.0, 10.0)
+        return Preview(frame, 64, 48, dict.fromkeys(names or ("",), box), JPEG + str(frame).encode())
+
+    @staticmethod
+    def tracking(sent, *names):
+        """The health report of a detector after `sent` frames, which tracks these objects."""
+        counters = {"model_version": 1.0, "score": 0.75, "present": 1.0}
+        return Health("detector", 1.0, {"sent": sent, "objects": len(names)}, objects=dict.fromkeys(names, counters))
 
 
 @pytest.fixture

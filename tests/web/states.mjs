@@ -17,22 +17,33 @@ const status = {
   phase: "running", reason: "", endpoint: "/tmp/catstream-a1", source: "/videos/walk.mp4", processes: [], paused: false,
   waiting: false, lost_seconds: 0, skipped: null,
 };
-const track = (state) => ({ frame: 210, time: 8.4, state, version: 12 });
+const anna = { name: "anna", colour: "#ff922b", state: "present", score: 0.93, version: 12 };
+const ben = { name: "ben", colour: "#3586ff", state: "present", score: 0.61, version: 9 };
+const carl = { name: "a-name-that-is-as-long-as-a-name-may-be-which-is-64-characters.64", colour: "#fedd38", state: "absent", score: 0.08, version: 4 };
+const tracks = (...objects) => ({ frame: objects.length ? 210 : null, time: 8.4, objects });
+const unnamed = (state) => tracks({ ...anna, name: "", state });
 const box = [120, 90, 60, 50];
-const points = [...Array(40).keys()].map((n) => [n / 4, Math.sin(n / 6) / 2 + 0.5, 60 + n, 0.2, Math.floor(n / 4), n < 30]);
-const trees = (...leaves) => leaves.map((leaves, place) => ({ title: `Tree ${place}`, meaning: "what it summarises", leaves }));
+const names = ["", anna.name, ben.name, carl.name];
+const byName = (value) => Object.fromEntries(names.map((name) => [name, value]));
+const points = [...Array(40).keys()].map((n) => [n / 4, 60 + n, byName([Math.sin(n / 6) / 2 + 0.5, 0.2, Math.floor(n / 4), n < 30])]);
+const heads = [0, 1, 2, 3].map((place) => ({ title: `Tree ${place}`, meaning: "what it summarises" }));
+const trees = (...leaves) => ({ heads, objects: leaves.length ? byName({ leaves, bytes: 4e6, rows: 5120 }) : {} });
+const frames = (...objects) => objects.map(({ name, colour }, place) => ({ frame: 20 + 70 * place, time: 1 + 3 * place, object: name, colour,
+  surprise: 1 + place / 2, box, width: 320, height: 240 }));
+const nothing = { tracks: tracks(), picture: null, trees: trees(), surprising: { measured: 0, frames: [] } };
 const all = {
-  pipeline: 1, status, track: track("present"), picture: { frame: 210, width: 320, height: 240, box }, points,
-  trees: { trees: trees(13, 22, 9, 0), bytes: 4e6, rows: 5120 },
-  surprising: { measured: 90, frames: [20, 90, 160].map((frame) => ({ frame, time: frame / 25, surprise: 1 + frame / 40, box, width: 320, height: 240 })) },
+  pipeline: 1, status, tracks: unnamed("present"), picture: { frame: 210, width: 320, height: 240, boxes: { "": box } }, points,
+  trees: trees(13, 22, 9, 0), surprising: { measured: 90, frames: frames({ ...anna, name: "" }, { ...anna, name: "" }, { ...anna, name: "" }) },
 };
-const changed = (more, state = "present") => ({ status: { ...status, ...more }, track: track(state) });
+const several = { tracks: tracks(anna, ben, carl), picture: { frame: 210, width: 320, height: 240, boxes: { anna: box, ben: [30, 4, 50, 90] } },
+  surprising: { measured: 90, frames: frames(anna, ben, carl) } };
+const changed = (more, state = "present") => ({ status: { ...status, ...more }, tracks: unnamed(state) });
 
 //: What the page is told in each state, after it was told all; what is done there; in that order.
 const STATES = {
   "no pipeline": { pipeline: 0, status: { ...status, phase: "waiting", source: "", endpoint: "", reason: "no pipeline of yours is running" },
-    track: null, picture: null, trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, surprising: { measured: 0, frames: [] } },
-  "waiting for a box": { ...all, ...changed({ waiting: true }), track: null },
+    ...nothing },
+  "waiting for a box": { ...all, ...changed({ waiting: true }), tracks: tracks() },
   bootstrapping: { ...all, ...changed({}, "bootstrapping") },
   present: { ...all },
   absent: changed({}, "absent"),
@@ -40,31 +51,43 @@ const STATES = {
   "paused, absent": changed({ paused: true }, "absent"),
   lost: changed({ lost_seconds: 12, skipped: 40 }, "absent"),
   silent: changed({ phase: "silent" }),
-  "another pipeline": { pipeline: 2, status: { ...status, source: "rtsp://10.0.0.7/stream1", endpoint: "run" }, track: null, picture: null,
-    trees: { trees: trees(null, null, null, null), bytes: null, rows: null }, surprising: { measured: 0, frames: [] } },
+  "another pipeline": { pipeline: 2, status: { ...status, source: "rtsp://10.0.0.7/stream1", endpoint: "run" }, ...nothing },
+  "three objects": { ...all, ...several },
+  "another one chosen": {},
+  "drawing one more": {},
+  forgetting: {},
+  "two objects": { tracks: tracks(anna, carl), surprising: { measured: 60, frames: frames(anna, carl) } },
   drawing: { ...all },
   stopping: {},
   "the end": changed({ phase: "ended", reason: "the source has ended" }),
   "the end, and of the server": { closed: true },
 };
-const doing = {
-  drawing: async (page, viewport) => {
-    await page.waitForFunction(() => document.querySelector("#overlay").textContent === "");
-    const view = await page.locator("#picture").boundingBox();
-    const at = (part) => ({ x: view.x + view.width * part, y: view.y + view.height * part });
-    if (viewport === PHONE) { // with a finger
-      const touch = await page.context().newCDPSession(page);
-      for (const [type, ...points] of [["touchStart", at(0.3)], ["touchMove", at(0.4)], ["touchMove", at(0.6)], ["touchEnd"]]) {
-        await touch.send("Input.dispatchTouchEvent", { type, touchPoints: points });
-      }
-    } else {
-      await page.mouse.move(at(0.3).x, at(0.3).y);
-      await page.mouse.down();
-      await page.mouse.move(at(0.6).x, at(0.6).y);
-      await page.mouse.up();
+const draw = async (page, viewport) => {
+  await page.waitForFunction(() => document.querySelector("#overlay").textContent === "");
+  const view = await page.locator("#picture").boundingBox();
+  const at = (part) => ({ x: view.x + view.width * part, y: view.y + view.height * part });
+  if (viewport === PHONE) { // with a finger
+    const touch = await page.context().newCDPSession(page);
+    for (const [type, ...points] of [["touchStart", at(0.3)], ["touchMove", at(0.4)], ["touchMove", at(0.6)], ["touchEnd"]]) {
+      await touch.send("Input.dispatchTouchEvent", { type, touchPoints: points });
     }
-    await page.waitForSelector("#follow:not([disabled])");
+  } else {
+    await page.mouse.move(at(0.3).x, at(0.3).y);
+    await page.mouse.down();
+    await page.mouse.move(at(0.6).x, at(0.6).y);
+    await page.mouse.up();
+  }
+  await page.waitForSelector("#follow:not([disabled])");
+};
+const doing = {
+  drawing: draw,
+  "another one chosen": (page) => page.click('.choose:has-text("ben")'),
+  "drawing one more": draw,
+  forgetting: async (page) => {
+    await page.press("#name", "Escape");
+    await page.click('[aria-label="Forget ben"]');
   },
+  "two objects": (page) => page.click("#forget-dialog .danger"),
   stopping: async (page) => {
     await page.click("#cancel");
     await page.click("#stop");
@@ -84,7 +107,11 @@ try {
       window.EventSource = class { constructor() { window.events = this; } close() {} };
     });
     await page.route("**/pictures/*", (route) => route.fulfill({ path: picture, contentType: "image/jpeg" }));
-    await page.route("**/control", (route) => route.fulfill({ json: { done: true, reason: "paused after frame 210", frame: 210, version: 12 } }));
+    const sent = []; // commands
+    await page.route("**/control", (route) => {
+      sent.push(route.request().postDataJSON());
+      return route.fulfill({ json: { done: true, reason: "paused after frame 210", frame: 210, version: 12, object: "" } });
+    });
     await page.goto(url);
     await page.evaluate(axe);
     for (const [name, parts] of Object.entries(STATES)) {
@@ -93,10 +120,12 @@ try {
       const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));
       seen.push({ state: name, scheme, pill: await page.locator("#state").innerText(), overlay: await page.locator("#overlay").textContent(),
         source: await page.locator("#source").textContent(), frame: await page.locator("#frame").textContent(),
+        objects: await page.locator(".objects b").allTextContents(), chosen: await page.locator('.choose[aria-pressed="true"] b').allTextContents(),
+        charts: await page.locator("#charts-title").innerText(), name: await page.locator("#name").inputValue(), sent: sent.at(-1) ?? null,
         frames: await page.locator(".surprising li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
         wide: await page.evaluate(() => document.documentElement.scrollWidth - innerWidth),
         violations: violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html, any }) => `${html} ${any[0]?.message ?? ""}`).join("; ")}`) });
-      if (screenshots) await page.screenshot({ path: `${screenshots}/${name}-${scheme}-${viewport.width}.png`, fullPage: name === "present" });
+      if (screenshots) await page.screenshot({ path: `${screenshots}/${name}-${scheme}-${viewport.width}.png`, fullPage: ["present", "three objects"].includes(name) });
     }
     await page.close();
   }

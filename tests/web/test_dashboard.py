@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from catstream.colours import PALETTE
 from catstream.messages import End, Health
 from catstream.web.dashboard import Dashboard
 
@@ -16,10 +17,11 @@ def dashboard():
 def test_a_page_gets_each_update_once(dashboard, facts):
     seen = {}
     dashboard.take(facts.track(3), 1.0)
-    assert dashboard.updates(seen)["track"] == {"frame": 3, "time": 0.3, "state": "present", "version": 1}
+    shown = {"name": "", "colour": PALETTE[0], "state": "present", "score": 0.75, "version": 1}
+    assert dashboard.updates(seen)["tracks"] == {"frame": 3, "time": 0.3, "objects": [shown]}
     assert dashboard.updates(seen) == {}
     dashboard.take(facts.track(4), 1.01)
-    assert set(dashboard.updates(seen)) == {"track"}
+    assert set(dashboard.updates(seen)) == {"tracks"}
 
 
 def test_a_page_that_connects_late_gets_all_parts(dashboard, facts):
@@ -52,7 +54,7 @@ def test_latency_is_measured_from_a_track_to_the_model_trained_on_its_frame(dash
     for frame in range(10):
         dashboard.take(facts.track(frame), float(frame))
     dashboard.take(facts.model(1, frame=6), 9.5)
-    assert dashboard.model_latency == pytest.approx(3.5)
+    assert dashboard.objects.shown[""].model_latency == pytest.approx(3.5)
 
 
 def test_silence_and_the_end_are_different_phases(dashboard, facts):
@@ -95,10 +97,15 @@ def test_the_last_health_report_of_a_pipeline_does_not_belong_to_the_next_one(da
 
 def test_the_trees_of_the_last_health_report_are_shown_after_the_end(dashboard):
     dashboard.take(End(2, "the source has ended"), 10.0)
-    dashboard.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 200.0}), 10.1)
+    dashboard.take(learning({"object_leaves": 3.0, "rows": 200.0}), 10.1)
     dashboard.mark_silent("no pipeline is running")
-    trees = dashboard.updates({})["trees"]
-    assert (trees["trees"][0]["leaves"], trees["rows"]) == (3.0, 200.0)
+    trees = dashboard.updates({})["trees"]["objects"][""]
+    assert (trees["leaves"], trees["rows"]) == ([3.0, 0.0, 0.0, 0.0], 200.0)
+
+
+def learning(counters):
+    """The health report of a compressor that has trees of one object."""
+    return Health("compressor", 1.0, counters, objects={"": counters})
 
 
 def followed(dashboard, facts, endpoint):
@@ -106,7 +113,7 @@ def followed(dashboard, facts, endpoint):
     told = {}
     dashboard.attach(endpoint)
     dashboard.take(Health("detector", 1.0, {"sent": 9.0}, source="first.mp4"), 0.0)
-    dashboard.take(Health("compressor", 1.0, {"object_leaves": 3.0, "rows": 90.0}), 0.0)
+    dashboard.take(learning({"object_leaves": 3.0, "rows": 90.0}), 0.0)
     for frame in (50, 51):
         dashboard.take(facts.track(frame, version=5), frame / 10)
         dashboard.take(facts.model(5, frame=50), frame / 10)
@@ -145,7 +152,7 @@ def test_all_state_is_dropped_when_another_pipeline_appears(dashboard, facts, en
     assert parts["status"]["source"] != "first.mp4"
     assert parts["surprising"]["frames"] == []
     assert parts["picture"] is None
-    assert not any(tree["leaves"] for tree in parts["trees"]["trees"])
+    assert not any(leaves for trees in parts["trees"]["objects"].values() for leaves in trees["leaves"])
     assert len(parts.get("points", [])) <= 1
     assert dashboard.picture(51) is None
 
@@ -185,6 +192,11 @@ def test_another_run_begins_with_no_surprising_frames(dashboard, facts):
 def test_recent_pictures_are_kept_and_older_ones_are_not(dashboard, facts):
     for frame in range(30):
         dashboard.take(facts.preview(frame), 0.1 * frame)
-    assert dashboard.updates({})["picture"] == {"frame": 29, "width": 64, "height": 48, "box": (4.0, 3.0, 20.0, 10.0)}
+    assert dashboard.updates({})["picture"] == {
+        "frame": 29,
+        "width": 64,
+        "height": 48,
+        "boxes": {"": (4.0, 3.0, 20.0, 10.0)},
+    }
     assert dashboard.picture(25).jpeg.endswith(b"25")
     assert dashboard.picture(5) is None

@@ -86,7 +86,7 @@ def test_the_page_loads_nothing_from_other_hosts_and_has_no_inline_script(page):
 
 
 @pytest.mark.parametrize(
-    "name", ["style.css", "page.js", "stage.js", "charts.js", "trees.js", "surprising.js", "svg.js"]
+    "name", ["style.css", "page.js", "stage.js", "objects.js", "charts.js", "trees.js", "surprising.js", "svg.js"]
 )
 def test_each_file_of_the_page_has_its_content_type(page, name):
     answer = page.get(f"/page/{name}")
@@ -133,7 +133,8 @@ def test_tracks_reach_the_page_when_they_are_sent(page, pipeline, facts):
         pipeline["detector"].send(Health("detector", time.monotonic(), {}))
         pipeline["tracks"].send(facts.track(5))
 
-    assert updates(page, "track", turn) == {"frame": 5, "time": 0.5, "state": "present", "version": 1}
+    tracks = updates(page, "tracks", turn)
+    assert (tracks["frame"], tracks["time"], [one["name"] for one in tracks["objects"]]) == (5, 0.5, [""])
 
 
 def test_an_error_on_a_message_does_not_end_the_feed(page, pipeline, facts, monkeypatch, caplog):
@@ -146,7 +147,7 @@ def test_an_error_on_a_message_does_not_end_the_feed(page, pipeline, facts, monk
         pipeline["tracks"].send(facts.track(5))
 
     monkeypatch.setattr(Dashboard, "take", fails)
-    assert updates(page, "track", turn)["frame"] == 5
+    assert updates(page, "tracks", turn)["frame"] == 5
     assert "ArithmeticError: it cannot be" in caplog.text
 
 
@@ -216,6 +217,11 @@ def test_a_form_of_another_page_cannot_steer_without_an_origin_header(page):
         {"verb": "set-box", "box": [1, 2, 3, float("nan")]},
         {"verb": "pause", "box": [1, 2, 3, 4]},
         {"verb": "pause", "keep": "yes"},
+        {"verb": "pause", "object": "anna"},
+        {"verb": "forget", "object": 1},
+        {"verb": "forget", "object": "no name"},
+        {"verb": "forget", "object": "a" * 65},
+        {"verb": "set-box", "object": "../anna", "box": [1, 2, 3, 4]},
         ["pause"],
         "x" * 5000,
     ],

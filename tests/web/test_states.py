@@ -14,6 +14,7 @@ import pytest
 from catstream.web.server import Server
 
 HERE = Path(__file__).parent
+SEVERAL = ("three objects", "another one chosen", "drawing one more", "forgetting", "two objects")
 
 
 @pytest.fixture
@@ -32,14 +33,27 @@ def seen(tmp_path):
 
 
 def test_each_state_of_the_page_is_accessible_and_correct(seen):
-    assert len(seen) == 28
+    assert len(seen) == 38
     assert {key: state["violations"] for key, state in seen.items() if state["violations"]} == {}, "found by axe"
     assert {key for key, state in seen.items() if state["wide"] > 0} == set(), "wider than its window"
     for scheme in ("light", "dark"):
         assert seen[scheme, "present"]["source"] == "walk.mp4"
         assert seen[scheme, "lost"]["source"] == "walk.mp4, 40 frames skipped"
+        check_several(*(seen[scheme, name] for name in SEVERAL))
         check_another_pipeline(seen[scheme, "another pipeline"])
         check_end(seen[scheme, "the end"], seen[scheme, "the end, and of the server"])
+
+
+def check_several(three, chosen, drawing, forgetting, two):
+    """One of several objects is chosen, for the charts; a new one gets the next name; one is dropped once confirmed."""
+    assert (three["pill"], three["objects"][:2], three["chosen"]) == ("2 of 3 present", ["anna", "ben"], ["anna"])
+    assert [state["charts"] for state in (three, chosen)] == [
+        f"The last two minutes of {name}" for name in ("anna", "ben")
+    ]
+    assert (drawing["name"], drawing["sent"]) == ("object-4", {"verb": "pause"})
+    assert forgetting["sent"] == {"verb": "resume"}, "nothing is dropped before it is confirmed"
+    assert two["sent"] == {"verb": "forget", "object": "ben"}
+    assert (len(two["objects"]), two["chosen"], two["frames"]) == (2, ["anna"], 2)
 
 
 def check_another_pipeline(state):

@@ -1,4 +1,4 @@
-// Four charts of the last two minutes: score, frames a second, latency, model.
+// Four charts of the last two minutes of one object: score, frames a second, latency, model.
 
 import { figure, make } from "./svg.js";
 
@@ -14,7 +14,8 @@ const CHARTS = [
 
 export class Charts {
   constructor(element) {
-    this.points = [];
+    this.rows = [];
+    this.name = null;
     this.charts = CHARTS.map((chart) => {
       const drawing = make("svg", { role: "img" });
       const parts = figure("chart", chart.title, chart.tone, drawing);
@@ -24,7 +25,31 @@ export class Charts {
   }
 
   clear() {
-    this.points = [];
+    this.rows = [];
+    this.draw();
+  }
+
+  /** Show another object. */
+  choose(name) {
+    this.name = name;
+    this.draw();
+  }
+
+  /** Take rows of [second, frames a second, {object: [score, latency, model, present]}]. */
+  add(rows) {
+    if (!rows.length) return;
+    this.rows.push(...rows);
+    while (this.rows[0][0] < this.rows.at(-1)[0] - SECONDS) this.rows.shift();
+    this.draw();
+  }
+
+  draw() {
+    const points = this.rows.filter((row) => this.name in row[2]).map(([second, rate, { [this.name]: [score, ...more] }]) => [second, score, rate, ...more]);
+    if (points.length) for (const chart of this.charts) this.plot(chart, points, this.rows.at(-1)[0]);
+    else this.blank();
+  }
+
+  blank() {
     for (const chart of this.charts) {
       chart.drawing.replaceChildren();
       chart.drawing.setAttribute("aria-label", `${chart.title}: nothing yet`);
@@ -32,21 +57,13 @@ export class Charts {
     }
   }
 
-  /** Take points of [second, score, frames a second, latency, model, present]. */
-  add(points) {
-    if (!points.length) return;
-    this.points.push(...points);
-    const now = this.points.at(-1)[0];
-    while (this.points[0][0] < now - SECONDS) this.points.shift();
-    for (const chart of this.charts) this.draw(chart, now);
-  }
-
-  draw({ drawing, right, column, least, show, unit, title }, now) {
-    const points = this.points.filter((point) => point[column] !== null);
+  /** Plot one column of points of [second, score, frames a second, latency, model, present]. */
+  plot({ drawing, right, column, least, show, unit, title }, all, now) {
+    const points = all.filter((point) => point[column] !== null);
     const last = points.at(-1)?.[column];
     right.textContent = last === undefined ? "–" : `${show(last)}${unit && ` ${unit}`}`;
     const [wide, tall] = [drawing.clientWidth, drawing.clientHeight];
-    const seconds = Math.min(SECONDS, Math.max(FEWEST, now - this.points[0][0]));
+    const seconds = Math.min(SECONDS, Math.max(FEWEST, now - all[0][0]));
     const low = Math.min(0, ...points.map((point) => point[column]));
     const high = round(Math.max(least, ...points.map((point) => point[column])));
     const x = (second) => LEFT + (wide - LEFT) * (1 - (now - second) / seconds);
@@ -57,7 +74,7 @@ export class Charts {
     ]);
     grid.push(make("text", { x: LEFT, y: tall - 3 }, `${Math.round(seconds)} s ago`));
     grid.push(make("text", { x: wide, y: tall - 3, "text-anchor": "end" }, "now"));
-    const away = spans(this.points).map(([from, to]) =>
+    const away = spans(all).map(([from, to]) =>
       make("rect", { class: "away", x: x(from), y: TOP, width: Math.max(1, x(to) - x(from)), height: tall - TOP - BOTTOM }));
     const line = pieces(points).map((piece) =>
       make("polyline", { points: piece.map((point) => `${x(point[0]).toFixed(1)},${y(point[column]).toFixed(1)}`).join(" ") }));

@@ -1,6 +1,7 @@
 // Passes updates of the server to the parts of the page, and commands of the user to the pipeline.
 
 import { Charts } from "./charts.js";
+import { Objects } from "./objects.js";
 import { Stage } from "./stage.js";
 import { SurprisingFrames } from "./surprising.js";
 import { Trees } from "./trees.js";
@@ -9,9 +10,10 @@ const $ = (selector) => document.querySelector(selector);
 const charts = new Charts($(".charts"));
 const trees = new Trees($(".trees"), $("#tree-summary"));
 const surprising = new SurprisingFrames($(".surprising"), $("#surprising-summary"));
-const stage = new Stage($("#stage"), $("#picture"), { pause, follow, changed: showDrawing });
+const objects = new Objects($(".objects"), { choose: showChosen, forget: askToForget });
+const stage = new Stage($("#stage"), $("#picture"), objects, { pause, follow, changed: showDrawing });
 let status = { phase: "waiting" };
-let track = null;
+let frame = null; // number and time of the newest frame
 let paused = false;
 let closed = false; // whether the server has announced its shutdown
 let silent = false; // whether the server does not answer
@@ -52,21 +54,76 @@ async function pause() {
   return { frame: answer.frame + 1, leave: before ? null : () => sendCommand("resume") };
 }
 
+/** Send the box, as that of a new object or of the chosen one. */
 async function follow(box, leave) {
-  const keep = $("#keep").checked && !status.waiting;
-  const answer = await sendCommand("set-box", { box: box.map((side) => Math.round(side * 10) / 10), keep });
-  if (answer && leave) {
+  const role = $("#role").value;
+  const name = role === "new" ? $("#name").value.trim() : objects.chosen ?? "";
+  if (role === "new" && objects.list.length && (!name || objects.get(name))) {
+    showMessage(name ? `There is an object ${name} already: give another name.` : "Give the new object a name.", true);
+    $("#name").focus();
+    return false;
+  }
+  const answer = await sendCommand("set-box", { object: name, box: box.map((side) => Math.round(side * 10) / 10), keep: role === "keep" });
+  if (!answer) return false;
+  objects.choose(answer.object);
+  if (leave) {
     await leave();
     showMessage(answer.reason);
   }
-  return answer !== null;
+  return true;
 }
 
 function showDrawing(drawing, box) {
+  if (drawing && $("#drawing").hidden) offerRoles();
   $("#watching").hidden = drawing;
   $("#drawing").hidden = !drawing;
-  $("#keep").parentElement.hidden = Boolean(status.waiting); // there is nothing to keep yet
   $("#follow").disabled = !box;
+}
+
+/** Offer what the drawn box may be: a new object, or the chosen one. */
+function offerRoles() {
+  const name = objects.chosen;
+  const option = (value, text) => Object.assign(document.createElement("option"), { value, textContent: text });
+  const another = option("another", name ? `another object as ${name}` : "another object in its place");
+  const roles = [option("new", objects.single ? "one more object" : "a new object"),
+    option("keep", name ? `the same ${name}: keep what was learned` : "the same object: keep what was learned"), another];
+  $("#role").replaceChildren(...(objects.list.length ? roles : roles.slice(0, 1)));
+  $("#role").value = objects.single && objects.list.length ? "another" : "new";
+  $("#role").parentElement.hidden = !objects.list.length; // the first object is a new one
+  $("#name").value = objects.list.length ? objects.suggestion : "";
+  $("#name").placeholder = objects.list.length ? "" : "optional";
+  showRole();
+}
+
+function showRole() {
+  $("#name").parentElement.hidden = $("#role").value !== "new";
+}
+
+function askToForget(name) {
+  $("#forget-title").textContent = `Forget ${name || "the object without a name"}?`;
+  $("#forget-dialog").dataset.object = name;
+  $("#forget-dialog").showModal();
+}
+
+/** Show the charts and the trees of another object. */
+function showChosen(name) {
+  charts.choose(name);
+  trees.choose(name);
+  showFrame();
+  showObjects();
+}
+
+/** Show the list, unless the only object has no name. */
+function showObjects() {
+  $("#objects").hidden = objects.single;
+  $("main").classList.toggle("several", !objects.single);
+  for (const target of document.querySelectorAll(".of")) target.textContent = objects.single ? "" : ` of ${objects.chosen || "the object without a name"}`;
+  stage.draw();
+}
+
+function showFrame() {
+  const model = objects.get(objects.chosen)?.version;
+  $("#frame").textContent = frame ? `frame ${frame.number}, ${frame.time.toFixed(1)} s${model === undefined ? "" : `, model ${model}`}` : "";
 }
 
 function showPaused(now) {
@@ -80,12 +137,13 @@ function showState() {
   const running = status.phase === "running" && !silent;
   const lost = running && status.lost_seconds > 0;
   const waiting = running && status.waiting;
-  let state = running ? (track && !waiting ? track.state : "waiting") : status.phase;
+  let state = running && !waiting ? stateOfAll() : running ? "waiting" : status.phase;
   let words = { waiting: "waiting", silent: "pipeline silent", ended: "ended" }[state] || state;
   if (silent && status.phase !== "ended") [state, words] = ["silent", "page stopped"];
   else if (lost) [state, words] = ["silent", `source lost for ${Math.round(status.lost_seconds)} s`];
   else if (waiting) words = "waiting for a box";
-  else if (running && paused) words = `paused, ${words}`;
+  else if (running && objects.list.length > 1) words = `${objects.list.filter((one) => one.state !== "absent").length} of ${objects.list.length} present`;
+  if (running && !lost && !waiting && paused) words = `paused, ${words}`;
   const pill = $("#state");
   pill.dataset.state = state;
   if (pill.lastElementChild.textContent !== words) pill.lastElementChild.textContent = words;
@@ -93,6 +151,11 @@ function showState() {
   $("#overlay").textContent = overlay(running);
   $("#stage").classList.toggle("over", status.phase === "ended" && stage.hasPicture);
   for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
+}
+
+/** The state of the objects together: present if one of them is. */
+function stateOfAll() {
+  return ["present", "bootstrapping", "absent"].find((state) => objects.list.some((one) => one.state === state)) ?? "waiting";
 }
 
 /** The name of the source; its whole address and the endpoint of the pipeline as the tooltip. */
@@ -124,9 +187,10 @@ const show = {
     stage.clear();
     charts.clear();
     surprising.clear();
-    track = null;
+    objects.clear();
+    frame = null;
     showMessage("");
-    $("#frame").textContent = "";
+    showFrame();
   },
   closed() {
     closed = true;
@@ -137,10 +201,12 @@ const show = {
     status = part;
     showPaused(Boolean(part.paused));
   },
-  track(part) {
-    track = part;
-    if (!part) return showState();
-    $("#frame").textContent = `frame ${part.frame}, ${part.time.toFixed(1)} s, model ${part.version}`;
+  tracks(part) {
+    frame = part.frame === null ? null : { number: part.frame, time: part.time };
+    const before = objects.list.map((one) => one.name).join();
+    objects.show(part.objects);
+    if (objects.list.map((one) => one.name).join() !== before) showObjects();
+    showFrame();
     showState();
   },
   picture(part) {
@@ -177,6 +243,15 @@ function listen() {
 $("#draw").onclick = () => { $("#stage").focus(); stage.begin(); };
 $("#follow").onclick = () => stage.accept();
 $("#cancel").onclick = () => stage.cancel();
+$("#role").onchange = () => showRole();
+$("#name").onkeydown = (event) => {
+  if (event.key === "Enter") stage.accept();
+  if (event.key === "Escape") stage.cancel();
+};
+$("#forget-dialog").onclose = ({ target }) => {
+  if (target.returnValue === "forget") sendCommand("forget", { object: target.dataset.object });
+  target.returnValue = "";
+};
 $("#pause").onclick = () => sendCommand(paused ? "resume" : "pause");
 $("#stop").onclick = () => $("#stop-dialog").showModal();
 $("#stop-dialog").onclose = (event) => {

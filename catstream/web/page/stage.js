@@ -1,22 +1,23 @@
-// The live picture with the box of its track, and the box that the user draws with mouse, touch or keyboard.
+// The live picture with the boxes of its objects, and the box that the user draws with mouse, touch or keyboard.
 
 const STEP = 0.02; // distance of an arrow key, as a share of the picture's shorter side
 const SMALLEST = 6; // minimum side of a box in pixels of the frame
+const STILL = 4; // pixels of the screen that a pointer may move in a click
 
 export class Stage {
   /**
-   * actions: pause() pauses the pipeline and returns {frame, leave}; follow(box, leave) sends the box; changed(drawing,
-   * box) is called whenever the drawing changes.
+   * objects: the list of the objects. actions: pause() pauses the pipeline and returns {frame, leave}; follow(box, leave)
+   * sends the box; changed(drawing, box) is called whenever the drawing changes.
    */
-  constructor(element, canvas, actions) {
-    Object.assign(this, { element, canvas, actions });
+  constructor(element, canvas, objects, actions) {
+    Object.assign(this, { element, canvas, objects, actions });
     this.picture = this.bitmap = this.box = this.start = this.still = null;
     this.drawing = this.loading = false;
     this.turn = 0; // number of pipelines shown before
     element.addEventListener("pointerdown", (event) => this.press(event));
     element.addEventListener("pointermove", (event) => this.drag(event));
     element.addEventListener("pointerup", () => this.release());
-    element.addEventListener("pointercancel", () => this.release());
+    element.addEventListener("pointercancel", () => this.release(false));
     element.addEventListener("keydown", (event) => this.key(event));
   }
 
@@ -92,24 +93,42 @@ export class Stage {
 
   press(event) {
     if (event.button !== 0 || !this.picture) return;
-    this.begin();
     this.element.setPointerCapture(event.pointerId);
-    this.start = this.place(event);
+    this.start = { ...this.place(event), screen: [event.clientX, event.clientY] };
   }
 
   drag(event) {
     if (!this.start) return;
+    const [across, down] = this.start.screen;
+    if (!this.box && Math.hypot(event.clientX - across, event.clientY - down) < STILL) return;
+    this.begin();
     const { x, y } = this.place(event);
     this.set(Math.min(x, this.start.x), Math.min(y, this.start.y), Math.abs(x - this.start.x), Math.abs(y - this.start.y));
   }
 
-  release() {
+  release(clicked = true) {
     if (!this.start) return;
+    const place = this.start;
     this.start = null;
-    if (!this.box || this.box.w < SMALLEST || this.box.h < SMALLEST) {
+    if (!this.drawing) {
+      if (clicked) this.choose(place);
+    } else if (!this.box || this.box.w < SMALLEST || this.box.h < SMALLEST) {
       this.box = null;
       this.tell();
     }
+  }
+
+  /** Choose the object whose box contains a place; the smallest one, if there are several. */
+  choose({ x, y }) {
+    const inside = ([, [left, top, w, h]]) => x >= left && x <= left + w && y >= top && y <= top + h;
+    const found = this.boxes.filter(inside).sort(([, one], [, other]) => one[2] * one[3] - other[2] * other[3]);
+    if (found.length) this.objects.choose(found[0][0]);
+  }
+
+  /** The boxes of the picture, by name; those of objects that were dropped are left out, and the chosen one is last. */
+  get boxes() {
+    const boxes = Object.entries(this.picture?.boxes ?? {}).filter(([name]) => this.objects.get(name));
+    return boxes.sort(([name], [other]) => (name === this.objects.chosen) - (other === this.objects.chosen));
   }
 
   key(event) {
@@ -163,24 +182,48 @@ export class Stage {
     const context = canvas.getContext("2d");
     const scale = wide / picture.width;
     context.drawImage(bitmap, 0, 0, wide, tall);
-    if (picture.box && !this.drawing) outline(context, picture.box.map((side) => side * scale), "#ff922b", wide);
-    if (!this.drawing) return;
     context.fillStyle = "#0007";
-    context.fillRect(0, 0, wide, tall);
-    if (!this.box) return;
+    if (this.drawing) context.fillRect(0, 0, wide, tall);
+    if (!this.drawing || !this.objects.single) this.outlines(context, scale, wide);
+    if (!this.drawing || !this.box) return;
     const { x, y, w, h } = this.box;
     const own = bitmap.width / picture.width;
     context.drawImage(bitmap, x * own, y * own, w * own, h * own, x * scale, y * scale, w * scale, h * scale);
-    outline(context, [x, y, w, h].map((side) => side * scale), "#ffffff", wide);
+    outline(context, [x, y, w, h].map((side) => side * scale), "#ffffff", wide / 260);
+  }
+
+  /** Draw the box of each object with its name; the chosen one is thicker. */
+  outlines(context, scale, wide) {
+    const { single, chosen } = this.objects;
+    for (const [name, box] of this.boxes) {
+      const { colour } = this.objects.get(name);
+      const scaled = box.map((side) => side * scale);
+      outline(context, scaled, colour, wide / (single || name !== chosen ? 260 : 170));
+      if (!single) label(context, scaled, name || "no name", colour, wide);
+    }
   }
 }
 
-function outline(context, box, colour, wide) {
-  const thin = Math.max(2, wide / 260);
+function outline(context, box, colour, width) {
+  const thin = Math.max(2, width);
   context.lineWidth = thin * 2.2;
   context.strokeStyle = "#000b";
   context.strokeRect(...box);
   context.lineWidth = thin;
   context.strokeStyle = colour;
   context.strokeRect(...box);
+}
+
+/** Write a name above a box, or below its upper side if there is no room. */
+function label(context, [x, y], name, colour, wide) {
+  const size = Math.max(13, wide / 48);
+  context.font = `600 ${size}px system-ui, "DejaVu Sans", sans-serif`;
+  const [across, down] = [Math.min(context.measureText(name).width + 0.8 * size, wide), 1.45 * size];
+  const left = Math.max(0, Math.min(x - 1, wide - across));
+  const top = y >= down ? y - down : y;
+  context.fillStyle = colour;
+  context.fillRect(left, top, across, down);
+  context.fillStyle = "#111";
+  context.textBaseline = "middle";
+  context.fillText(name, left + 0.4 * size, top + 0.53 * down, across);
 }

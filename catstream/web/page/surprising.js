@@ -1,4 +1,4 @@
-// The frames with the largest surprise, each cropped around its box.
+// The frames with the largest surprise, each cropped around the box of its object.
 
 const AROUND = 2.6; // width of a picture in box widths
 const [WIDTH, HEIGHT] = [304, 205];
@@ -15,12 +15,12 @@ export class SurprisingFrames {
 
   show({ measured, frames }) {
     this.measured.textContent = measured
-      ? `The ${frames.length} largest of ${measured.toLocaleString("en")} measured frames, at least a second apart.`
+      ? `The ${frames.length} largest of ${measured.toLocaleString("en")} measured frames; those of one object are at least a second apart.`
       : "None yet: the first model is needed to measure.";
     const most = Math.max(...frames.map((frame) => frame.surprise));
     const now = new Map();
     for (const frame of frames) {
-      const id = `${frame.frame} ${frame.surprise}`;
+      const id = `${frame.frame} ${frame.object} ${frame.surprise}`;
       const item = this.items.get(id) ?? this.make(frame);
       item.share.style.width = `${(100 * frame.surprise) / most}%`;
       now.set(id, item);
@@ -35,7 +35,7 @@ export class SurprisingFrames {
     const element = document.createElement("li");
     const canvas = Object.assign(document.createElement("canvas"), { width: WIDTH, height: HEIGHT });
     canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", `the object in frame ${frame.frame}`);
+    canvas.setAttribute("aria-label", `${frame.object || "the object"} in frame ${frame.frame}`);
     const caption = document.createElement("p");
     const [when, surprise] = [document.createElement("span"), document.createElement("b")];
     when.textContent = `frame ${frame.frame}`;
@@ -43,6 +43,12 @@ export class SurprisingFrames {
     caption.append(when, surprise);
     const share = document.createElement("i");
     element.append(canvas, share, caption);
+    if (frame.object) {
+      element.style.setProperty("--colour", frame.colour);
+      const name = Object.assign(document.createElement("p"), { className: "name" });
+      name.append(Object.assign(document.createElement("i"), { className: "swatch" }), frame.object);
+      element.append(name);
+    }
     const item = { element, canvas, share, frame };
     this.load(item);
     return item;
@@ -71,7 +77,7 @@ export class SurprisingFrames {
     context.setTransform(zoom, 0, 0, zoom, WIDTH / 2 - zoom * across, HEIGHT / 2 - zoom * down);
     context.drawImage(bitmap, 0, 0);
     context.lineWidth = 4 / zoom;
-    context.strokeStyle = "#ff922b";
+    context.strokeStyle = frame.colour;
     context.strokeRect(x, y, w, h);
     context.setTransform(1, 0, 0, 1, 0, 0);
   }

@@ -12,14 +12,25 @@ export class Trees {
     this.element = element;
     this.kept = kept;
     this.trees = [];
+    this.part = { heads: [], objects: {} };
+    this.name = null;
   }
 
-  /** Show the trees that the pipeline has, by the table of heads: a figure for each, made when it is first received. */
-  show({ trees, rows, bytes }) {
+  /** Show another object. */
+  choose(name) {
+    this.name = name;
+    for (const tree of this.trees) tree.leaves = -1;
+    this.show(this.part);
+  }
+
+  /** Show the trees of the chosen object, by the table of heads: a figure for each, made when it is first received. */
+  show(part) {
+    this.part = part;
+    const { leaves = [], rows = 0, bytes = 0 } = part.objects[this.name] ?? {};
     this.kept.textContent = rows ? `${rows.toLocaleString("en")} rows in ${(bytes / 1e6).toFixed(1)} MB.` : "";
-    for (const [place, { title, meaning, leaves }] of trees.entries()) {
+    for (const [place, { title, meaning }] of part.heads.entries()) {
       const tree = this.trees[place] ??= this.add(title, meaning, TONES[place % TONES.length]);
-      const count = leaves ?? 0;
+      const count = leaves[place] ?? 0;
       if (count !== tree.leaves) this.draw(tree, count);
     }
   }

@@ -1,0 +1,102 @@
+"""The objects that a pipeline tracks, as the page shows them. It uses no socket and no clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from catstream.colours import Colours
+from catstream.messages import Health, Model, State, Track
+
+__all__ = ["Objects", "ShownObject"]
+
+
+@dataclass(slots=True)
+class ShownObject:
+    """One of the objects.
+
+    colour         colour of its box, #rrggbb
+    state, score   those of its newest track
+    version        version of the model that scored it
+    seq            number of its newest track, 0 before the first
+    model          its newest model, None before the first
+    model_latency  seconds from the track of a frame to the model that was trained on it, None before the first model
+    """
+
+    colour: str
+    state: State
+    score: float
+    version: int
+    seq: int = 0
+    model: Model | None = None
+    model_latency: float | None = None
+
+
+class Objects:
+    """The objects by name, in the order in which they began.
+
+    Attributes
+    ----------
+    shown : the objects
+    colours : the colour of each of them
+    """
+
+    def __init__(self) -> None:
+        self.shown: dict[str, ShownObject] = {}
+        self.colours = Colours()
+        self._models: dict[str, Model] = {}  # newest models, also of objects without a track yet
+        self._since: dict[str, int] = {}  # first frame of an object that took the name of another one
+
+    def add_track(self, track: Track) -> bool:
+        """Add a track; return whether another object of this name begins with it."""
+        name, before = track.object, self.shown.get(track.object)
+        begins = before is not None and track.model_version < before.version
+        if begins:
+            self._since[name] = track.frame
+            if (model := self._models.get(name)) is not None and model.frame < track.frame:
+                del self._models[name]
+        if before is None or begins:
+            self.shown[name] = ShownObject(self.colours.of(name), track.state, track.score, track.model_version)
+        each = self.shown[name]
+        each.state, each.score, each.version, each.seq = track.state, track.score, track.model_version, track.seq
+        each.model = self._models.get(name)
+        return begins
+
+    def add_model(self, model: Model, latency: float | None) -> bool:
+        """Add a model that arrived `latency` seconds after the track of its frame, None if that is not known.
+
+        Returns
+        -------
+        False if the model is of another object that had the name before: it is ignored
+        """
+        name = model.object
+        if model.frame < self._since.get(name, 0):
+            return False
+        before, self._models[name] = self._models.get(name), model
+        if (each := self.shown.get(name)) is not None:
+            each.model = model
+            if latency is not None and (before is None or before.version != model.version):
+                each.model_latency = latency
+        return True
+
+    def add_health(self, health: Health) -> set[str]:
+        """Add the objects of the detector's health report that have no track yet; drop those that it does not track.
+
+        Returns
+        -------
+        the names of the dropped objects
+        """
+        if len(health.objects) != health.counters.get("objects"):  # it has no track of some objects yet
+            return set()
+        for name, counters in health.objects.items():
+            if name not in self.shown:
+                version = int(counters.get("model_version", 0))
+                state: State = "absent" if not counters.get("present") else "present" if version else "bootstrapping"
+                self.shown[name] = ShownObject(self.colours.of(name), state, counters.get("score", 0.0), version)
+        sent = health.counters.get("sent", 0)  # a track after this one may be of an object that began later
+        dropped = {name for name, each in self.shown.items() if name not in health.objects and each.seq <= sent}
+        for name in dropped:
+            del self.shown[name]
+            self._models.pop(name, None)
+            self._since.pop(name, None)
+        self.colours.keep(self.shown)
+        return dropped

@@ -1,0 +1,76 @@
+// The list of the objects: colour, name, state, score and model of each, one of them chosen, and a button that drops it.
+
+export class Objects {
+  /** actions: choose(name) is called if another object is chosen; forget(name) if the button of an object is pressed. */
+  constructor(element, actions) {
+    Object.assign(this, { element, actions, list: [], chosen: null, items: new Map() });
+  }
+
+  /** Whether there is nothing to choose: no object, or one without a name. */
+  get single() {
+    return this.list.length < 2 && !this.list[0]?.name;
+  }
+
+  get(name) {
+    return this.list.find((one) => one.name === name);
+  }
+
+  /** The first of object-2, object-3 ... that is no object's name. */
+  get suggestion() {
+    for (let number = this.list.length + 1; ; number++) if (!this.get(`object-${number}`)) return `object-${number}`;
+  }
+
+  clear() {
+    this.show([]);
+  }
+
+  /** Show these objects. If the chosen one is not among them, the first one is chosen, or the one to choose next. */
+  show(list) {
+    this.list = list;
+    if (this.next !== undefined && this.get(this.next)) {
+      this.choose(this.next);
+    } else if (!this.get(this.chosen)) this.choose(list[0]?.name ?? null);
+    const items = new Map(list.map((one) => [one.name, this.items.get(one.name) ?? this.make(one.name)]));
+    this.items = items;
+    for (const one of list) this.fill(items.get(one.name), one);
+    const elements = [...items.values()].map((item) => item.element);
+    const shown = this.element.children;
+    if (elements.length !== shown.length || elements.some((element, place) => element !== shown[place])) this.element.replaceChildren(...elements);
+  }
+
+  /** Choose an object, now or as soon as it is shown. */
+  choose(name) {
+    this.next = name === null || this.get(name) ? undefined : name;
+    if (this.next !== undefined || name === this.chosen) return;
+    this.chosen = name;
+    for (const [other, { choose }] of this.items) choose.setAttribute("aria-pressed", String(other === name));
+    this.actions.choose(name);
+  }
+
+  make(name) {
+    const element = document.createElement("li");
+    const add = (parent, tag, more) => {
+      const child = Object.assign(document.createElement(tag), more);
+      parent.append(child);
+      return child;
+    };
+    const choose = add(element, "button", { type: "button", className: "choose", onclick: () => this.choose(name) });
+    choose.setAttribute("aria-pressed", String(name === this.chosen));
+    add(choose, "i", { className: "swatch" });
+    add(choose, "b", { textContent: name || "object without a name" });
+    const [state, score] = [add(choose, "span", { className: "state" }), add(choose, "span", { className: "score number" })];
+    const share = add(add(choose, "span", { className: "share" }), "i");
+    const forget = add(element, "button", { type: "button", className: "forget", textContent: "Forget", onclick: () => this.actions.forget(name) });
+    forget.setAttribute("aria-label", `Forget ${name || "the object without a name"}`);
+    return { element, choose, state, score, share };
+  }
+
+  fill({ element, state, score, share }, one) {
+    element.style.setProperty("--colour", one.colour);
+    element.dataset.state = one.state;
+    share.style.width = `${100 * Math.max(0, Math.min(1, one.score))}%`;
+    const write = (target, text) => target.textContent !== text && (target.textContent = text);
+    write(state, `${one.state}, model ${one.version}`);
+    write(score, one.score.toFixed(2));
+  }
+}
