@@ -174,12 +174,18 @@ class Dashboard:
         if self.phase in ("waiting", "silent"):
             self.phase, self.reason = "running", ""
         if health.process == "detector":
-            if dropped := self.objects.add_health(health):
-                self.surprising.drop(dropped)
-                self._mark_changed("surprising")
-            self._mark_changed("tracks")
+            self._add_objects(health)
         self._add_point(now)
         self._mark_changed("status", "trees")
+
+    def _add_objects(self, health: Health) -> None:
+        """Add and drop objects by a health report of the detector."""
+        before = set(self.objects.shown)
+        if dropped := self.objects.add_health(health):
+            self.surprising.drop(dropped)
+            self._mark_changed("surprising")
+        if before != self.objects.shown.keys():
+            self._mark_changed("tracks")
 
     def _add_track(self, track: Track, now: float) -> None:
         if self.phase != "running":
