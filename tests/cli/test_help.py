@@ -40,7 +40,18 @@ def test_every_command_has_a_help_text(help_of, verb):
 
 def test_the_help_of_track_lists_its_files_and_how_to_stop_it(help_of):
     text = help_of("track")
-    for word in ("NAME.txt", "NAME_confidence.value", "NAME_time.txt", "NAME.csv", "NAME.mp4", "Ctrl-C", "EXAMPLES"):
+    for word in (
+        "NAME=X,Y,W,H",
+        "NAME-anna.txt",
+        "forget",
+        "NAME.txt",
+        "NAME_confidence.value",
+        "NAME_time.txt",
+        "NAME.csv",
+        "NAME.mp4",
+        "Ctrl-C",
+        "EXAMPLES",
+    ):
         assert word in text
 
 

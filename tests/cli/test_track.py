@@ -43,7 +43,7 @@ def test_it_writes_five_files_with_a_row_a_frame(whole_run):
     assert np.loadtxt(out / "demo_confidence.value").shape == (60,)
     assert (np.loadtxt(out / "demo_time.txt") >= 0).sum() == 60
     rows = table(out / "demo.csv")
-    assert list(rows[0]) == ["frame", "seconds", "state", "x", "y", "w", "h", "score", "model_version"]
+    assert list(rows[0]) == ["frame", "seconds", "state", "x", "y", "w", "h", "score", "model_version", "object"]
     assert [int(row["frame"]) for row in rows] == list(range(60))
     assert {row["state"] for row in rows} <= {"bootstrapping", "present", "absent"}
     assert [row["x"] == "" for row in rows] == list(np.isnan(boxes[:, 0]))
@@ -161,6 +161,19 @@ REJECTED = {
     "a box without size": (["--box", "10,10,0,20"], "10,10,0,20|width|area"),
     "a box of NaN": (["--box", "10,nan,20,20"], "nan|number"),
     "a box of three numbers": (["--box", "10,10,20"], "x,y,w,h"),
+    "two objects with one name": (["--box", "anna=1,2,30,40", "--box", "anna=5,6,30,40"], "its own name"),
+    "two objects without a name": (["--box", "1,2,30,40", "--box", "5,6,30,40"], "NAME=5,6,30,40"),
+    "a name of no letters": (["--box", "=1,2,30,40"], "has no name before"),
+    "a name with a blank": (["--box", "a b=1,2,30,40"], "'a b' is not a name"),
+    "a box of an object outside": (["--box", "anna=400,10,20,20"], "anna: the box 400,10,20,20"),
+    "a box of an object of three numbers": (["--box", "anna=10,10,20"], "anna: a box is four numbers"),
+    "1,000 objects": (
+        [word for k in range(1000) for word in ("--box", f"n{k}=1,2,30,40")],
+        "1000 objects are more than 32",
+    ),
+    "a box and a model of one object": (["--box", "anna=1,2,30,40", "--model", "anna=notes.txt"], "give one of them"),
+    "models of two objects in one file": (["--save-model", "a=m", "--save-model", "b=m"], "named twice"),
+    "two models of an object": (["--save-model", "a=m", "--save-model", "a=n"], "its own name"),
     "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset.size'"),
     "a value that does not fit": (["--set", "coreset.size=x"], "coreset.size cannot be 'x'"),
     "a preset that does not exist": (["--preset", "cat11"], "cat11"),

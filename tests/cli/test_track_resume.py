@@ -143,7 +143,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
 
 
 def test_settings_that_are_given_again_change_and_all_others_stay(video, said, monkeypatch, tmp_path):
-    monkeypatch.setattr(Pipeline, "__iter__", lambda _: iter(()))  # kept when it starts: no frame has to be followed
+    monkeypatch.setattr(Pipeline, "by_frame", lambda _: iter(()))  # kept when it starts: no frame has to be followed
     (source, box), kept = video, tmp_path / "kept"
     assert said("track", source, "--box", box, "--state", kept, *OFTEN)[0] == 0
     (tmp_path / "mine.toml").write_text("[run]\nunstored_frames = 99\nlag_frames = 7\n")
@@ -184,6 +184,28 @@ def test_a_program_that_resumes_a_run_gives_only_the_changed_settings(video, tmp
         )
     resumed = Pipeline(resume=tmp_path / "kept", settings={"run.unstored_frames": 256})
     assert resumed.settings == Settings(run={"lockstep": True})
+
+
+def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_whose_last_frame_was_torn(
+    video, said, tmp_path
+):
+    (source, box), out = video, tmp_path / "out"
+    objects = ["--box", f"flower={box}", "--box", "lake=10,20,60,40"]
+    files = ["--output", out, "--write", tmp_path / "t.txt", "--save-model", f"lake={tmp_path / 'lake'}"]
+    code, _, errors = said("track", source, *objects, *files, "--end", 16, "--state", tmp_path / "kept", *OFTEN)
+    assert code == 0, errors
+    assert "1 flower: present in" in errors
+    assert Learned.load(tmp_path / "lake").object == "lake"
+    table = out / "demo.csv"
+    table.write_bytes(table.read_bytes()[:-9])  # the last row, that of the lake, is torn
+    code, _, errors = said("track", "--resume", tmp_path / "kept")
+    assert code == 0, errors
+    rows = [(int(row["frame"]), row["object"]) for row in csv.DictReader(table.read_text().splitlines())]
+    assert rows == [(frame, name) for frame in range(16) for name in ("flower", "lake")]
+    for name in ("flower", "lake"):
+        assert len((out / f"demo-{name}.txt").read_text().splitlines()) == 16
+    ids = {tuple(line.split(",")[:2]) for line in (tmp_path / "t.txt").read_text().splitlines()}
+    assert ids == {(str(frame + 1), number) for frame in range(16) for number in ("1", "2")}
 
 
 def test_a_terminal_that_is_lost_ends_a_run_like_ctrl_c(video, catstream, until, tmp_path):
