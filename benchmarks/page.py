@@ -264,7 +264,7 @@ _REDUCTION = """
 _SUMMARIES = """
     The energy ||A P||^2 / ||A||^2 that k selected images keep of a collection, computed with all rows. `catstream`
     reads the images once, and keeps 128 rows as a sketch and at most 256 candidates. The greedy choice has all rows at
-    once; no k images can keep more than the best subspace of dimension k. The mixed collection has every fifth frame of
+    once; no k images can keep more than the best subspace of dimension k. The mixed collection has every tenth frame of
     all 44 sequences. See [Summarise images and runs](how-to/summaries.md)."""
 _INGREDIENTS = """
     The loss of AUC without one component; the largest losses of each run. A loss of less than two standard errors
