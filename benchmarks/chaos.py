@@ -15,7 +15,7 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -23,19 +23,18 @@ from time import monotonic
 import cv2
 import numpy as np
 from arena import LINKS, Arena, small_disk
-from sequences import named, scratch
+from sequences import FIRST, named, objects, scratch
 from table import Table, command, publish
 
 from catstream.box import Box
 from catstream.compression.forest import Forest
-from catstream.errors import BoxError, ServiceError
+from catstream.errors import ServiceError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.metrics import score
 from catstream.messages import Track
 from catstream.multi import MultiTracker
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
-from catstream.tracker import Tracker
 from catstream.video.source import open_source
 
 CALM = (1, 6)  # frames between a recovery and the next fault
@@ -44,8 +43,6 @@ SECONDS = (0.1, 1.0)  # duration of a freeze, a cut, a slow link or a full disk
 DELAY = (0.005, 0.05)  # delay of each 64 KiB on a slow link
 HOUR = 3600.0
 FULL = "disk full"
-FIRST = "first"  # name of the object whose true boxes are known; with one object, it has a name too
-PATCH = 40  # width and height of the other objects, pixels
 FORGET = 0.6  # probability that an object that is tracked is forgotten, and not replaced
 RUNS = {"lockstep": Settings(run={"lockstep": True}), "default": Settings()}
 
@@ -146,7 +143,7 @@ class Ordeal:
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     cycles, modes = (1, ["lockstep"]) if options.quick else (options.cycles, list(RUNS))
     source, truth = long(named(options, "TLD_01_david"), 30 if options.quick else 25 * cycles + 100)
-    boxes = patches(source, Box(*map(float, truth[0])), options.objects)
+    boxes = objects(source, Box(*map(float, truth[0])), options.objects)
     faults, times, ends = schedule(cycles, options.seed), [], []
     for label in [options.run] if options.run else modes:
         run = endure(source, boxes, RUNS[label], faults, options.seed)
@@ -157,8 +154,22 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         success = [score(found(tracks, FIRST), truth).success for tracks in (run.tracks, calm[0])]
         met, rows = sum(map(len, run.recovery.values())), int(run.learned.counters()["rows"])
         wrong = sum(ours.keys() != theirs.keys() for ours, theirs in zip(run.tracks, calm[0], strict=True))
-        objects = len(boxes), len(run.changes), wrong
-        ends.append((label, *objects, met, run.deaths, sent, stored, len(run.tracks), rows, *success, same))
+        ends.append(
+            (
+                label,
+                len(boxes),
+                len(run.changes),
+                wrong,
+                met,
+                run.deaths,
+                sent,
+                stored,
+                len(run.tracks),
+                rows,
+                *success,
+                same,
+            )
+        )
     columns = ("run", "fault", "times", "p50 s", "p99 s", "slowest s")
     yield Table("Recovery", columns, times, "from the end of a fault to the track two frames further, or a new model")
     columns = ("run", "objects", "changes", "wrong", "faults", "restarts", "sent", "stored", "frames")
@@ -297,23 +308,6 @@ def fingerprint(forest: Forest) -> dict[str, list[tuple[object, object]]]:
         ]
         for name, compressor in forest.compressors.items()
     }
-
-
-def patches(source: str, box: Box, count: int) -> dict[str, Box]:
-    """Return the boxes of several objects in the first frame: the object, and patches beside it that can be tracked."""
-    with open_source(source) as frames:
-        image = next(iter(frames)).image
-    places = ((x, y) for y in range(8, image.shape[0] - PATCH, PATCH) for x in range(8, image.shape[1] - PATCH, PATCH))
-    chosen = {FIRST: box}
-    for x, y in places:
-        patch = Box(float(x), float(y), float(PATCH), float(PATCH))
-        if len(chosen) < count and not patch.overlap(box):
-            with suppress(BoxError):  # it looks like its surroundings
-                Tracker().init(image, patch)
-                chosen[f"patch-{len(chosen)}"] = patch
-    if len(chosen) < count:
-        raise ServiceError(f"the first frame has room for {len(chosen)} objects: give --objects {len(chosen)}")
-    return chosen
 
 
 def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, float, float, float]]:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-from sequences import scratch
+from sequences import objects, scratch
 from table import Table, command, publish
 
 from catstream.compression.checkpoint_store import CheckpointStore
@@ -34,18 +34,21 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     moments, most, rest = (1, 5, 100) if options.quick else (options.moments, options.rows, _REST)
     frames = moments * most + rest
     place, chance = scratch(), random.Random(options.seed)
-    video, boxes = write(place, frames, (320, 240))
+    video, truth = write(place, frames, (320, 240))
+    boxes = objects(str(video), truth[0], options.objects)
     kept, out = place / "kept", place / "out"
-    begin = [str(video), "--box", ",".join(map(str, boxes[0])), "--output", str(out), "--state", str(kept)]
+    given = [word for name, box in boxes.items() for word in ("--box", f"{name}={box}")]
+    begin = [str(video), *given, "--output", str(out), "--state", str(kept)]
     resumed = ["--resume", str(kept)]
     watched(begin, out, chance.randrange(most))
     seconds = [watched(resumed, out, chance.randrange(most)) for _ in range(moments - 1)]
     seconds.append(watched(resumed, out, None))
 
-    rows = [track.frame for track in read_tracks(out, video.stem)]
+    rows = [(track.frame, track.object) for track in read_tracks(out, video.stem)]
+    lost, twice = frames * len(boxes) - len(set(rows)), len(rows) - len(set(rows))
     stored = CheckpointStore(kept / TREES).load(Settings()).seq
-    columns = ("killed", "frames", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")
-    row = (moments, frames, frames - len(set(rows)), len(rows) - len(set(rows)), stored)
+    columns = ("killed", "frames", "objects", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")
+    row = (moments, frames, len(boxes), lost, twice, stored)
     yield Table("Resume", columns, [(*row, float(np.median(seconds)), max(seconds))], f"seed {options.seed}")
 
 
@@ -83,6 +86,7 @@ if __name__ == "__main__":
     parser.add_argument(
         "--rows", type=int, default=40, help="maximum number of new rows before a kill (default: %(default)s)"
     )
+    parser.add_argument("--objects", type=int, default=1, help="number of objects (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the random moments (default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)

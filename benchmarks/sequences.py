@@ -8,11 +8,16 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.loadtest.objects import several
 from catstream.video import demo
+from catstream.video.source import open_source
 
-__all__ = ["named", "rendered", "scratch", "sequences", "video"]
+__all__ = ["FIRST", "named", "objects", "rendered", "scratch", "sequences", "video"]
+
+FIRST = "first"  #: name of the object of a sequence, if it is one of several
 
 _QUICK_FRAMES = 8
 
@@ -63,3 +68,9 @@ def named(options: argparse.Namespace, name: str) -> Sequence:
 def video(sequence: Sequence) -> str:
     """Return the source argument of `catstream track` for a sequence."""
     return str(sequence.path)
+
+
+def objects(source: str, box: Box, count: int) -> dict[str, Box]:
+    """Return the boxes of several objects in the first frame of a source, by name: that of its object, and patches."""
+    with open_source(source) as frames:
+        return several(next(iter(frames)).image, box, count, FIRST)

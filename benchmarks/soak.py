@@ -23,13 +23,15 @@ from sequences import named, scratch
 from table import Table, command, publish
 
 from catstream.box import Box
-from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
 from catstream.compression.tree import CoresetTree
-from catstream.detection.detector import Detector
+from catstream.detection.objects import Detectors
 from catstream.errors import ServiceError
 from catstream.evaluation.datasets import Sequence
+from catstream.features.pyramid import Pyramid
 from catstream.heads import APPEARANCE, EXTENT
-from catstream.messages import End, Features, TrainingRows
+from catstream.messages import End, Features, ObjectFeatures, TrainingRows
+from catstream.names import UNNAMED
 from catstream.services.start import service_command
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
@@ -84,10 +86,10 @@ class Stream:
         rows = np.stack([part[random.integers(len(part))] for part in (self._object, self._background)]) * gains[:2]
         extents = TrainingRows.labelled(self._extents.rows[pair] * gains[2:], self._extents.labels[pair])
         training = {APPEARANCE: TrainingRows.labelled(rows, [1, 0]), EXTENT: extents}
-        return Features(seq, seq - 1, (seq - 1) / 25, self._box, training)
+        return Features(seq, seq - 1, (seq - 1) / 25, {UNNAMED: ObjectFeatures(self._box, training)})
 
 
-def _all(features: list[Features], group: str) -> TrainingRows:
+def _all(features: list[ObjectFeatures], group: str) -> TrainingRows:
     """The training rows of a group of all frames."""
     found = [each.training[group] for each in features if group in each.training]
     return sum(found[1:], start=found[0])
@@ -107,33 +109,35 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield Table("Through the process", ("messages", "us a message", "resident MB", "handles", "disk MB"), there, note)
 
 
-def cut(sequence: Sequence, frames: int, settings: Settings) -> Iterator[Features]:
-    """Return the features messages of the first frames of a sequence."""
-    detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
+def cut(sequence: Sequence, frames: int, settings: Settings) -> Iterator[ObjectFeatures]:
+    """Return the features of the object in the first frames of a sequence."""
+    detectors, forest, trainer = Detectors(settings), Forest(settings), Trainer(settings)
     for number, image in zip(range(frames), sequence.frames(), strict=False):
-        _, features = detector.step(image) if number else detector.init(image, Box(*sequence.boxes[0]))
-        yield features
-        if (sample := compressor.take(features)) is not None:
-            detector.adopt(trainer.train(sample))
+        frame = Pyramid.of(image)
+        given = {} if number else {UNNAMED: detectors.begin(UNNAMED, frame, Box(*sequence.boxes[0]))}
+        _, features = detectors.step(frame, given=given)
+        yield features.objects[UNNAMED]
+        for sample in forest.take(features):
+            detectors.adopt(trainer.train(sample))
 
 
 def alone(stream: Stream, messages: int, settings: Settings) -> list[Measurement]:
-    """Run a compressor in this process; measure and save it after each block."""
-    compressor, me, file, measurements = Compressor(settings), psutil.Process(), scratch() / "soak.safetensors", []
+    """Run a forest in this process; measure and save it after each block."""
+    forest, me, file, measurements = Forest(settings), psutil.Process(), scratch() / "soak.safetensors", []
     block, busy = max(messages // BLOCKS, 1), 0.0
     for seq in range(1, messages + 1):
         message = stream.message(seq)
         begin = process_time()
-        compressor.take(message)
+        forest.take(message)
         busy += process_time() - begin
         if seq % block == 0:
-            compressor.save(file)
-            seen = compressor.counters()
+            forest.save(file)
+            seen = forest.counters()
             measurements.append(
                 Measurement(
                     seq, int(seen["rows"]), busy / block * 1e6, int(seen["nodes"]), seen["bytes"] / 1e6,
-                    sum(map(law, compressor.trees.values())) / 1e6, me.memory_info().rss / 1e6, me.num_fds(),
-                    file.stat().st_size / 1e6,
+                    sum(map(law, forest.compressors[UNNAMED].trees.values())) / 1e6,
+                    me.memory_info().rss / 1e6, me.num_fds(), file.stat().st_size / 1e6,
                 )
             )  # fmt: skip
             busy = 0.0

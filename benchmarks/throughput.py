@@ -17,10 +17,12 @@ from sequences import named, rendered, video
 from table import Table, command, publish
 
 from catstream.box import Box
-from catstream.compression.compressor import Compressor
-from catstream.detection.detector import Detector
+from catstream.compression.forest import Forest
+from catstream.detection.objects import Detectors
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.metrics import score
+from catstream.features.pyramid import Pyramid
+from catstream.names import UNNAMED
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
@@ -60,7 +62,7 @@ def steps(videos: list[Sequence]) -> Table:
 
 def costs(sequence: Sequence, settings: Settings) -> list[float]:
     """Total milliseconds of decoding, detection, compression and training."""
-    detector, compressor, trainer = Detector(settings), Compressor(settings), Trainer(settings)
+    detectors, forest, trainer = Detectors(settings), Forest(settings), Trainer(settings)
     spent = [0.0] * 4
 
     def timed(step: int, work: Callable[..., Any], *arguments: Any) -> Any:
@@ -72,13 +74,11 @@ def costs(sequence: Sequence, settings: Settings) -> list[float]:
     frames = sequence.frames()
     for row in range(len(sequence)):
         image = timed(0, next, frames)
-        if row == 0:
-            _, features = timed(1, detector.init, image, Box(*sequence.boxes[0]))
-        else:
-            _, features = timed(1, detector.step, image)
-        sample = timed(2, compressor.take, features)
-        if sample is not None:
-            detector.adopt(timed(3, trainer.train, sample))
+        frame = timed(1, Pyramid.of, image)
+        given = {} if row else {UNNAMED: timed(1, detectors.begin, UNNAMED, frame, Box(*sequence.boxes[0]))}
+        _, features = timed(1, detectors.step, frame, 0.0, given)
+        for sample in timed(2, forest.take, features):
+            detectors.adopt(timed(3, trainer.train, sample))
     return spent
 
 

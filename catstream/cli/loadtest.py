@@ -41,6 +41,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 
 @click.command()
 @click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Number of pipelines.")
+@click.option("--objects", type=click.IntRange(1), default=1, show_default=True, help="Objects of each pipeline.")
 @click.option(
     "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
 )
@@ -69,6 +70,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 def loadtest(
     settings: Settings,
     streams: int,
+    objects: int,
     subscribers: int,
     slow: int,
     rate: float,
@@ -86,6 +88,8 @@ def loadtest(
     loopback interface; a pipeline of its own tracks each stream. The camera
     does not wait: frame i is due at start + i / RATE, and latency counts from
     then. The latency of a skipped frame ends with the track of a newer one.
+    With several objects, the others are patches of the picture; success and
+    latencies are those of the rendered object.
 
     Slow subscribers read two tracks per second; half of them are frozen
     instead. Chaos kills processes by SIGKILL; --set run.seed=N repeats it.
@@ -113,6 +117,7 @@ def loadtest(
     \b
     EXAMPLES
       catstream loadtest --rate 30 --limit p99=0.1
+      catstream loadtest --objects 8 --limit skipped=0.01
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
       catstream loadtest --duration 60 --chaos --limit recovery=5
       catstream loadtest --find-limit --size 320x240
@@ -126,7 +131,7 @@ def loadtest(
     from catstream.loadtest.run import Status
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
-    plan = Plan(streams, subscribers, slow, rate, duration, size, chaos, settings)
+    plan = Plan(streams, objects, subscribers, slow, rate, duration, size, chaos, settings)
     _writable(json_file, output)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console(width=None if sys.stdout.isatty() else 140)

@@ -16,6 +16,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.loadtest.children import SPAWN, start
+from catstream.loadtest.objects import several
 from catstream.services.loop import die_with
 from catstream.video import demo
 from catstream.video.broadcast import Broadcast, Schedule, jpeg
@@ -31,34 +32,33 @@ class Camera:
     streams : number of streams
     size : (width, height) of a frame in pixels
     pictures : number of different images to render; a longer video repeats them backwards, then forwards again
+    objects : number of objects
 
     Attributes
     ----------
     urls : URL of each stream; set by `render`
-    truth : ground truth box in each image, float64 (pictures, 4), NaN if the object is absent; set by `render`
+    truth : ground truth box of the object without a name in each image, float64 (pictures, 4), NaN if it is absent; set
+        by `render`
+    boxes : boxes of all objects in the still image that is shown before the start, by name; set by `render`
     pid : id of the process
     """
 
-    def __init__(self, streams: int, size: tuple[int, int], pictures: int) -> None:
+    def __init__(self, streams: int, size: tuple[int, int], pictures: int, objects: int = 1) -> None:
         self._pipe, other = SPAWN.Pipe()
-        self._process = SPAWN.Process(target=_run_camera, args=(other, streams, size, pictures, os.getpid()))
+        arguments = other, streams, size, pictures, objects, os.getpid()
+        self._process = SPAWN.Process(target=_run_camera, args=arguments)
         self._other = other
 
     def render(self, done: Callable[[int], None] = lambda _: None) -> None:
         """Wait until all images are rendered; `done` is called with their number so far."""
         while isinstance(message := self._receive(), int):
             done(message)
-        self.urls, boxes = message
-        self.truth = np.array([box or (np.nan,) * 4 for box in boxes])
+        self.urls, truth, self.boxes = message
+        self.truth = np.array([box or (np.nan,) * 4 for box in truth])
 
     @property
     def pid(self) -> int:
         return self._process.pid or 0
-
-    @property
-    def box(self) -> Box:
-        """Box of the object in the still image that is shown before the start."""
-        return Box(*self.truth[0].tolist())
 
     @property
     def late(self) -> float:
@@ -94,15 +94,21 @@ class Camera:
             raise ServiceError("the camera of the load test has exited: its error is printed above") from None
 
 
-def _run_camera(pipe: Connection, streams: int, size: tuple[int, int], pictures: int, parent: int) -> None:
+def _run_camera(
+    pipe: Connection, streams: int, size: tuple[int, int], pictures: int, objects: int, parent: int
+) -> None:
     die_with(parent)
-    files, boxes = [], []
+    files: list[bytes] = []
+    truth: list[Box | None] = []
+    boxes: dict[str, Box] = {}
     for image, box in demo.render(pictures, size):
+        if box is not None and not truth:
+            boxes = several(image, box, objects)
         files.append(jpeg(image))
-        boxes.append(box)
+        truth.append(box)
         pipe.send(len(files))
     with Broadcast(files, size, streams) as broadcast:
-        pipe.send((broadcast.urls, boxes))
+        pipe.send((broadcast.urls, truth, boxes))
         while True:
             asked = pipe.recv()
             pipe.send(broadcast.late if asked is None else broadcast.play(asked))

@@ -21,6 +21,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
         **provenance(plan.settings),
         "plan": {
             "streams": plan.streams,
+            "objects": plan.objects,
             "subscribers": plan.subscribers,
             "slow_subscribers": plan.slow,
             "rate": plan.rate,

@@ -94,7 +94,7 @@ def run_load_test(
         return not load_test.steps[-1].violations
 
     try:
-        with Camera(plan.streams, plan.size, pictures) as camera:
+        with Camera(plan.streams, plan.size, pictures, plan.objects) as camera:
             camera.render(
                 lambda count: report_status(Status("rendering", count / pictures, f"{count} of {pictures} frames"))
             )

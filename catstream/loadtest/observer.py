@@ -21,6 +21,8 @@ _CHANNELS: tuple[Channel[object], ...] = (TRACKS, MODELS, HEALTH)
 class Observations:
     """The messages of one pipeline with their arrival times by `time.monotonic`, oldest first.
 
+    Of several objects, the one without a name is observed: its true boxes are known.
+
     tracks  tracks in order of arrival; a restarted detector may repeat a `seq` with another frame
     models  newest training frame of each model, numbered as the tracks were at its arrival
     health  health reports of all processes
@@ -65,9 +67,9 @@ class Observer(threading.Thread):
             }
             for (number, _), moment, message in arrivals(readers, self._ended.is_set):
                 match message:
-                    case Track():
+                    case Track(object=""):
                         self.observations[number].tracks.append((moment, message))
-                    case Model():
+                    case Model(object=""):
                         observations = self.observations[number]
                         observations.models.append((moment, message.frame))
                         if message.motion is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from catstream.errors import SettingsError
+from catstream.names import check_count
 from catstream.settings import Settings
 from catstream.video import demo
 
@@ -16,6 +17,7 @@ class Plan:
     """The parameters of one run.
 
     streams      number of pipelines, each of three processes
+    objects      number of objects that each pipeline tracks
     subscribers  number of subscribers to the tracks of each stream
     slow         number of those that are slow; half of these are frozen instead
     rate         frames per second of each stream, whether or not the pipeline keeps up
@@ -28,9 +30,12 @@ class Plan:
     ------
     SettingsError
         If the parameters contradict one another, or a setting is not possible in a load test.
+    ObjectError
+        If there are too many objects.
     """
 
     streams: int = 1
+    objects: int = 1
     subscribers: int = 0
     slow: int = 0
     rate: float = 25.0
@@ -48,6 +53,7 @@ class Plan:
             raise SettingsError(
                 f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: give a higher rate or more seconds"
             )
+        check_count(self.objects, self.settings.run.objects_most)
         if self.settings.run.lockstep:
             raise SettingsError("the frames of a load test do not wait for models: leave out lockstep")
         if self.settings.run.endpoint:
@@ -55,7 +61,8 @@ class Plan:
 
     def __str__(self) -> str:
         streams = f"{self.streams} streams" if self.streams > 1 else "1 stream"
-        return f"{streams} of {self.size[0]}x{self.size[1]} pixels, {self.rate:g} frames/s due in each"
+        objects = f", {self.objects} objects" if self.objects > 1 else ""
+        return f"{streams} of {self.size[0]}x{self.size[1]} pixels{objects}, {self.rate:g} frames/s due in each"
 
     @property
     def frozen(self) -> int:

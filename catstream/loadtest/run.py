@@ -118,7 +118,7 @@ def run(plan: Plan, camera: Camera, report_status: Callable[[Status], None] = la
         If a pipeline cannot start.
     """
     camera.show_still()
-    streams = [Stream(number, url, camera.box, plan.settings) for number, url in enumerate(camera.urls)]
+    streams = [Stream(number, url, camera.boxes, plan.settings) for number, url in enumerate(camera.urls)]
     with ExitStack() as stack:
         observer, groups = _started(plan, streams, stack, report_status)
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS, plan.rate, plan.frames))

@@ -30,20 +30,20 @@ class Stream(threading.Thread):
     totals, restarts : as in `Pipeline`, set at the end
     """
 
-    def __init__(self, number: int, url: str, box: Box, settings: Settings) -> None:
+    def __init__(self, number: int, url: str, boxes: dict[str, Box], settings: Settings) -> None:
         super().__init__(name=f"stream {number}", daemon=True)
         self.ready = threading.Event()
         self.endpoint = ""
         self.error: CatstreamError | None = None
         self.totals: dict[str, int] = {}
         self.restarts = 0
-        self._url, self._box, self._settings = url, box, settings
+        self._url, self._boxes, self._settings = url, boxes, settings
         self._pipeline: Pipeline | None = None
         self._signalled: set[int] = set()
 
     def run(self) -> None:
         try:
-            with Pipeline(self._url, self._box, self._settings) as pipeline:
+            with Pipeline(self._url, self._boxes, self._settings) as pipeline:
                 self._pipeline, self.endpoint = pipeline, pipeline.endpoint
                 self.ready.set()
                 for _ in pipeline:

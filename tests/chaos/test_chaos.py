@@ -44,7 +44,7 @@ def assert_same(video, calm, faults):
 
 def test_three_objects_that_begin_and_are_forgotten_between_faults_are_as_without_faults_bit_for_bit(video):
     path, truth = video
-    boxes = chaos.patches(path, truth[0], 3)
+    boxes = sequences.objects(path, truth[0], 3)
     faults = ["kill -9 all three", "link cut", "kill -9 compressor", "kill -9 detector", "kill -9 trainer"]
     run = chaos.endure(path, boxes, Settings(run={"lockstep": True}), faults)
     assert run.totals == {"sent": len(truth), "stored": len(truth)}

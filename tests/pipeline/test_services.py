@@ -135,7 +135,7 @@ def test_a_process_whose_parent_has_already_ended_ends_at_once(folder, service):
 
 
 def test_an_error_that_a_restart_cannot_resolve_is_reported_and_not_retried(folder):
-    supervisor = Supervisor(Job(str(folder / "gone.mp4"), Box(1, 1, 9, 9), endpoint=str(folder)), folder)
+    supervisor = Supervisor(Job(str(folder / "gone.mp4"), {"": Box(1, 1, 9, 9)}, endpoint=str(folder)), folder)
     try:
         with pytest.raises(ServiceError, match=r"no video or folder .*gone\.mp4"):
             check_for_a_minute(supervisor)
@@ -146,7 +146,7 @@ def test_an_error_that_a_restart_cannot_resolve_is_reported_and_not_retried(fold
 
 def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder):
     path, boxes = video
-    supervisor = Supervisor(Job(path, boxes[0], endpoint=str(folder), owned=True), folder)
+    supervisor = Supervisor(Job(path, {"": boxes[0]}, endpoint=str(folder), owned=True), folder)
 
     def kill_trainer():
         if "trainer" in supervisor.pids:

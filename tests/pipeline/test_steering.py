@@ -168,7 +168,7 @@ def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
     assert [track.frame for track in tracks] == list(range(len(boxes)))
 
 
-@pytest.mark.parametrize("torn", ["", "{", "null", '{"box": [1, 2]}'], ids=repr)
+@pytest.mark.parametrize("torn", ["", "{", "null", '{"objects": {"": [1, 2]}}'], ids=repr)
 def test_commands_that_a_power_cut_tore_are_an_error(tmp_path, torn):
     (tmp_path / "desired_state.json").write_text(torn)
     with pytest.raises(ProtocolError, match="the desired state cannot be read"):
