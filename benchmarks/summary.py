@@ -35,6 +35,7 @@ COLUMNS = (
 _LONG = 900  # frames of a sequence that is a collection by itself
 _STRIDE = 10  # of the frames of the mixed collection
 _DRAWS = 10
+_EQUAL = 1e-9  # share of the energy of images below which a direction is rounding, if two images are equal
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
@@ -66,7 +67,7 @@ def kept_by_each(rows: np.ndarray, sizes: Iterable[int]) -> Iterator[tuple[int, 
 
     def kept(numbers: Iterable[int]) -> float:
         chosen = sorted(set(numbers))
-        shares = np.linalg.solve(gram[np.ix_(chosen, chosen)], gram[chosen])
+        shares = np.linalg.pinv(gram[np.ix_(chosen, chosen)], rcond=_EQUAL, hermitian=True) @ gram[chosen]
         return float(np.sum(gram[chosen] * shares) / strongest.sum())
 
     for k in sizes:
