@@ -1,4 +1,4 @@
-"""Shows a running pipeline in the Rerun viewer: pictures, box, score, state and model version of each frame.
+"""Shows a running pipeline in the Rerun viewer: pictures, box, score, state and model version of each object.
 
     pip install "catstream[rerun]"
     catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=run
@@ -22,22 +22,24 @@ import catstream
 
 async def show_tracks(endpoint: str) -> None:
     """Log each track."""
-    count, state = 0, None
+    count, states = 0, {}
     with catstream.subscribe(endpoint, "tracks") as tracks:
         async for track in tracks:
             count += 1
+            below = f"/{track.object}" if track.object else ""  # an object with a name has entities of its own
             rr.set_time("frame", sequence=track.frame)
             rr.set_time("video", duration=track.time)
             if track.box is None:
-                rr.log("camera/object", rr.Clear(recursive=False))
+                rr.log(f"camera/object{below}", rr.Clear(recursive=False))
             else:
-                box = rr.Boxes2D(array=[track.box], array_format=rr.Box2DFormat.XYWH, labels=[track.state])
-                rr.log("camera/object", box)
-            rr.log("score", rr.Scalars(track.score))
-            rr.log("model", rr.Scalars(track.model_version))
-            if track.state != state:
-                rr.log("state", rr.TextLog(track.state))
-                state = track.state
+                labels = [track.object or track.state]
+                box = rr.Boxes2D(array=[track.box], array_format=rr.Box2DFormat.XYWH, labels=labels)
+                rr.log(f"camera/object{below}", box)
+            rr.log(f"score{below}", rr.Scalars(track.score))
+            rr.log(f"model{below}", rr.Scalars(track.model_version))
+            if track.state != states.get(track.object):
+                rr.log(f"state{below}", rr.TextLog(track.state))
+                states[track.object] = track.state
         print(f"{count} tracks, {tracks.losses()}: {tracks.end.reason}")
 
 

@@ -1,19 +1,22 @@
 // A subscriber in Node.js, with zeromq and @msgpack/msgpack.
 //
 //     npm ci --prefix examples
-//     catstream track walk.mp4 --box 120,80,64,48 --set endpoint=run
+//     catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=run
 //     node examples/subscriber.mjs run
 //
-// Where the pipeline asks for keys, their folder is a second argument. Prints every track and each new model, until the pipeline ends. docs/protocol.md says what travels.
+// If the pipeline requires keys, give their folder as the second argument.
+//
+// Prints every track and each new model, with the name of its object, until the pipeline ends. docs/protocol.md
+// describes the messages.
 
 import { readFileSync } from "node:fs";
 
 import { decode } from "@msgpack/msgpack";
 import { Subscriber } from "zeromq";
 
-const PORTS = { models: 2, tracks: 3 }; // counted from that of the endpoint
+const PORTS = { models: 2, tracks: 3 }; // offset from the port of the endpoint
 
-// Of a channel; the endpoint is a folder of sockets, or tcp://127.0.0.1:PORT.
+// The address of a channel; the endpoint is a folder of sockets, or tcp://127.0.0.1:PORT.
 function address(endpoint, channel) {
   const [, host, port] = endpoint.match(/^(tcp:\/\/.*):(\d+)$/) ?? [];
   return host ? `${host}:${Number(port) + PORTS[channel]}` : `ipc://${endpoint}/${channel}`;
@@ -24,7 +27,7 @@ function key(folder, file, name) {
   return readFileSync(`${folder}/${file}`, "utf8").match(new RegExp(`^${name} = "(.{40})"$`, "m"))[1];
 }
 
-// The options of a socket that holds these keys.
+// The options of a socket that uses these keys.
 function secured(folder) {
   if (!folder) return {};
   return {
@@ -34,35 +37,36 @@ function secured(folder) {
   };
 }
 
-// A socket that hears the channel from now on.
+// A socket that subscribes to a channel.
 function attach(endpoint, channel, options) {
   const socket = new Subscriber(options);
   socket.subscribe("");
-  socket.connect(address(endpoint, channel)); // the pipeline may come later
+  socket.connect(address(endpoint, channel)); // the pipeline may start later
   return socket;
 }
 
 // The kind and the fields of each message.
 async function* messages(socket) {
   for await (const [data] of socket) {
-    const [version, kind, fields] = decode(data);
-    if (version !== 2) throw new Error("this catstream speaks another protocol");
+    const [version, kind, , fields] = decode(data);
+    if (version !== 3) throw new Error("this catstream speaks another protocol");
     yield { kind, fields };
   }
 }
 
-// Length of a vector as it travels: dtype "<f4", shape, and the bytes of its numbers.
+// The Euclidean norm of an encoded vector: dtype "<f4", shape, and bytes.
 function norm({ data }) {
   const numbers = new Float32Array(new Uint8Array(data).buffer); // copied, so that it begins on a multiple of four
   return Math.hypot(...numbers);
 }
 
 async function followModels(models) {
-  let version = 0;
+  const versions = new Map(); // of the last model of each object
   for await (const { fields: model } of messages(models)) {
-    if (model.version === version) continue; // the last one may come twice
-    version = model.version;
-    console.log(`model ${version} of frame ${model.frame}, norm ${norm(model.weights).toFixed(4)}`);
+    if (versions.get(model.object) === model.version) continue; // the last model may arrive twice
+    versions.set(model.object, model.version);
+    const length = `norm ${norm(model.weights).toFixed(4)}`;
+    console.log(`model ${model.version} of frame ${model.frame}, ${length} ${model.object}`.trimEnd());
   }
 }
 
@@ -70,14 +74,14 @@ async function followTracks(tracks) {
   let seq = 0;
   let missed = 0;
   for await (const { kind, fields: track } of messages(tracks)) {
-    if (seq) missed += Math.max(0, track.seq - seq - 1); // who comes late has missed nothing
+    if (seq) missed += Math.max(0, track.seq - seq - 1); // all tracks of a frame have the same seq
     seq = track.seq;
     if (kind === "end") {
       console.log(`end: ${track.reason}, ${missed} tracks missed`);
       return;
     }
     const box = track.box?.map((side) => side.toFixed(1)).join(",") ?? "-";
-    console.log(`track ${track.frame} ${track.state} ${box} ${track.score.toFixed(3)}`);
+    console.log(`track ${track.frame} ${track.state} ${box} ${track.score.toFixed(3)} ${track.object}`.trimEnd());
   }
 }
 
@@ -87,7 +91,7 @@ if (!endpoint) {
   process.exit(1);
 }
 const tracks = attach(endpoint, "tracks", secured(keys));
-const models = attach(endpoint, "models", { conflate: true, ...secured(keys) });
+const models = attach(endpoint, "models", secured(keys));
 const following = followModels(models);
 await followTracks(tracks);
 models.close(); // ends the other loop

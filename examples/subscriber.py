@@ -5,7 +5,8 @@
 
 If the pipeline requires keys, give their folder as the second argument.
 
-Prints every track and each new model, until the pipeline ends. `docs/protocol.md` describes the messages.
+Prints every track and each new model, with the name of its object, until the pipeline ends. `docs/protocol.md`
+describes the messages.
 """
 
 from __future__ import annotations
@@ -30,11 +31,9 @@ def address(endpoint: str, channel: str) -> str:
     return f"ipc://{endpoint}/{channel}"
 
 
-def attach(endpoint: str, channel: str, keys: str, *, newest: bool) -> zmq.Socket:
-    """Return a socket that subscribes to a channel; with `newest` it keeps only the newest message."""
+def attach(endpoint: str, channel: str, keys: str) -> zmq.Socket:
+    """Return a socket that subscribes to a channel."""
     socket = zmq.Context.instance().socket(zmq.SUB)
-    if newest:
-        socket.setsockopt(zmq.CONFLATE, 1)
     socket.subscribe(b"")
     if keys:
         own = tomllib.loads((Path(keys) / "client.key").read_text())
@@ -46,8 +45,8 @@ def attach(endpoint: str, channel: str, keys: str, *, newest: bool) -> zmq.Socke
 
 def receive(socket: zmq.Socket) -> tuple[str, dict]:
     """Receive the next message: its kind and its fields."""
-    version, kind, fields = msgpack.unpackb(socket.recv())
-    if version != 2:
+    version, kind, _, fields = msgpack.unpackb(socket.recv())
+    if version != 3:
         sys.exit("this catstream speaks another protocol")
     return kind, fields
 
@@ -61,28 +60,32 @@ def norm(weights: dict) -> float:
 
 
 def main(endpoint: str, keys: str = "") -> None:
-    tracks, models = attach(endpoint, "tracks", keys, newest=False), attach(endpoint, "models", keys, newest=True)
+    tracks, models = attach(endpoint, "tracks", keys), attach(endpoint, "models", keys)
     poller = zmq.Poller()
     poller.register(tracks)
     poller.register(models)
-    version = seq = missed = 0
+    seq = missed = 0
+    versions = {}  # of the last model of each object
     while True:
         ready = dict(poller.poll())
         if models in ready:
             _, model = receive(models)
-            if model["version"] != version:  # the last model may arrive twice
-                version = model["version"]
-                print(f"model {version} of frame {model['frame']}, norm {norm(model['weights']):.4f}", flush=True)
+            name, version = model["object"], model["version"]
+            if versions.get(name) != version:  # the last model may arrive twice
+                versions[name] = version
+                length = f"norm {norm(model['weights']):.4f}"
+                print(f"model {version} of frame {model['frame']}, {length} {name}".rstrip(), flush=True)
         if tracks in ready:
             kind, track = receive(tracks)
-            if seq:  # tracks before the first received one are not counted
+            if seq:  # tracks before the first received one are not counted; all tracks of a frame have the same seq
                 missed += max(0, track["seq"] - seq - 1)
             seq = track["seq"]
             if kind == "end":
                 print(f"end: {track['reason']}, {missed} tracks missed")
                 return
             box = "-" if track["box"] is None else ",".join(f"{side:.1f}" for side in track["box"])
-            print(f"track {track['frame']} {track['state']} {box} {track['score']:.3f}", flush=True)
+            line = f"track {track['frame']} {track['state']} {box} {track['score']:.3f} {track['object']}"
+            print(line.rstrip(), flush=True)
 
 
 if __name__ == "__main__":

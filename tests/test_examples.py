@@ -137,3 +137,17 @@ def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(beside, exa
     seen = {int(version): float(norm) for version, norm in learned if int(version) in norms}
     assert seen
     assert seen == pytest.approx({version: norms[version] for version in seen}, abs=0.0001)
+
+
+def test_the_example_of_several_objects_prints_when_two_meet_and_part(demo_video):
+    source, boxes = demo_video(60)
+    sky = catstream.Box(boxes[0].x, boxes[0].y - 30, boxes[0].w, 40)  # the lower part of it is on the flower
+    arguments = [str(source), f"flower={boxes[0]}", f"sky={sky}"]
+    run = subprocess.run([*command("several_objects.py"), *arguments], capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    *events, flower, sky = run.stdout.splitlines()
+    turns = [re.fullmatch(r"frame \d+: flower and sky (meet|part)", line)[1] for line in events]
+    assert events[0] == "frame 0: flower and sky meet"
+    assert turns == ["meet", "part"] * (len(turns) // 2) + ["meet"] * (len(turns) % 2)
+    assert flower == "flower: present in 60 of 60 frames"
+    assert re.fullmatch(r"sky: present in \d+ of 60 frames", sky)
