@@ -13,8 +13,10 @@ from sequences import rendered
 from table import Table, command, publish
 
 from catstream.box import Box
-from catstream.detection.detector import Detector
+from catstream.detection.objects import Detectors
+from catstream.features.pyramid import Pyramid
 from catstream.messages import End, Features, Position
+from catstream.names import UNNAMED
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.wire.acknowledged import Receiver, Sender
@@ -26,8 +28,8 @@ WINDOW = Settings().run.unstored_frames
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     features, messages = features_of_a_frame(), 50 if options.quick else options.messages
-    count = sum(map(len, features.training.values()))
-    megabytes = sum(training.rows.nbytes for training in features.training.values()) / 1e6
+    training = features.objects[UNNAMED].training.values()
+    count, megabytes = sum(map(len, training)), sum(rows.rows.nbytes for rows in training) / 1e6
     rows = []
     for kind, place in (("ipc", folder), ("tcp", loopback)):
         with place() as endpoint:
@@ -40,10 +42,10 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 def features_of_a_frame() -> Features:
     """Return the features message of a typical frame."""
-    sequence, detector = rendered(2, (320, 240)), Detector(Settings())
-    first, second = sequence.frames()
-    detector.init(first, Box(*sequence.boxes[0]))
-    _, features = detector.step(second)
+    sequence, detectors = rendered(2, (320, 240)), Detectors(Settings())
+    first, second = map(Pyramid.of, sequence.frames())
+    detectors.step(first, given={UNNAMED: detectors.begin(UNNAMED, first, Box(*sequence.boxes[0]))})
+    _, features = detectors.step(second)
     return features
 
 
