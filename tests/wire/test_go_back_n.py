@@ -6,6 +6,7 @@ No process, no socket, no clock: the two state machines, a network that loses an
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import pytest
 from hypothesis import settings
@@ -22,6 +23,16 @@ STRANGER = b"stranger"
 def payload(seq):
     """What message `seq` holds."""
     return b"message %d" % seq
+
+
+def made_by(seq):
+    """The version of the newest sample of each object after message `seq`; ben is forgotten now and then."""
+    versions = {}
+    for number in range(1, seq + 1):
+        versions |= {1: {"anna": number}, 2: {"ben": number}}.get(number % 3, {})
+        if number % 7 == 0:
+            versions.pop("ben", None)
+    return versions
 
 
 class Histories(RuleBasedStateMachine):
@@ -41,6 +52,7 @@ class Histories(RuleBasedStateMachine):
         self.senders += 1
         self.peer = b"sender %d" % self.senders
         self.sender, self.resumed = SendWindow("features", self.size, self.now), self.senders == 1
+        self.known = self.asked = 0  # newest seq of an earlier sender; newest seq whose samples were asked for
 
     # What the shells do.
 
@@ -60,7 +72,11 @@ class Histories(RuleBasedStateMachine):
         if not self.full:
             self.disk = self.receiver.taken
         self.in_memory |= self.receiver.taken > self.disk
-        self.position = Position(self.receiver.taken, unsaved=self.receiver.taken - self.disk)
+        self.position = Position(
+            self.receiver.taken,
+            objects=made(**made_by(self.receiver.taken)),
+            unsaved=self.receiver.taken - self.disk,
+        )
         return self.position
 
     def arrives(self, peer, frame):
@@ -71,6 +87,7 @@ class Histories(RuleBasedStateMachine):
         actions = self.receiver.receive(peer, seq, self.now)
         if Deliver() in actions:
             assert (seq, self.receiver.taken) == (before + 1, before + 1)
+            self.position = replace(self.position, objects=made(**made_by(seq)))
             self.reply(self.receiver.acknowledge(self.position))
         else:
             assert self.receiver.taken == before
@@ -81,7 +98,7 @@ class Histories(RuleBasedStateMachine):
         if not self.resumed:
             if isinstance(message, Position):
                 self.sender.resume(message.seq, message.seq)
-                self.resumed = True
+                self.resumed, self.known = True, message.seq
             return
         try:
             assert self.sender.receive(message, self.now) is None or isinstance(message, Stored)
@@ -151,7 +168,7 @@ class Histories(RuleBasedStateMachine):
     def receiver_dies(self):
         self.to_receiver.clear()
         self.to_sender.clear()
-        self.position = Position(self.disk)
+        self.position = Position(self.disk, objects=made(**made_by(self.disk)))
         self.receiver = ReceiveWindow(self.position, self.size)
 
     @rule()
@@ -159,6 +176,20 @@ class Histories(RuleBasedStateMachine):
         """What it has transmitted may still arrive."""
         self.to_sender.clear()
         self.start_sender()
+
+    @rule()
+    def sender_asks_for_the_samples_of_what_was_taken(self):
+        """A sample counts from the message that led to it, or an earlier one; none counts that was not made."""
+        seq = self.sender.taken
+        if seq <= max(self.known, self.asked):
+            return
+        self.asked = seq
+        samples, led_to = self.sender.samples_of(seq), made_by(seq)
+        for name in samples.keys() & led_to.keys():
+            assert samples[name] >= led_to[name]
+        for version in samples.values():
+            assert version % 3
+            assert version <= self.sender.sent
 
     @rule(seq=st.integers(0, 50))
     def stranger_repeats_a_frame(self, seq):
@@ -214,6 +245,8 @@ class Histories(RuleBasedStateMachine):
         assert self.resumed
         assert self.receiver.taken >= self.sender.sent
         assert self.sender.acknowledged == self.sender.taken == self.sender.sent
+        if self.sender.sent > self.known:
+            assert self.sender.versions == made_by(self.sender.sent)
         assert not self.sender._unacknowledged
 
 
