@@ -105,6 +105,17 @@ def every(record: Record) -> Iterator[Table]:
         yield from select(number)(record)
 
 
+def merged(record: Record) -> Iterator[Table]:
+    """Select the means of the models of parts of a sequence, and the differences between them."""
+    yield from select(columns=(), without="(?!mean)")(record)
+    yield from select(1)(record)
+
+
+def means_only(record: Record) -> Iterator[Table]:
+    """Select the means over all saved models."""
+    yield from select(without="(?!mean|±)")(record)
+
+
 def strongest(count: int) -> Callable[[Record], Iterator[Table]]:
     """Select the ingredients that matter most, with the complete tracker and the paper's tracker."""
 
@@ -266,6 +277,13 @@ _SUMMARIES = """
     reads the images once, and keeps 128 rows as a sketch and at most 256 candidates. The greedy choice has all rows at
     once; no k images can keep more than the best subspace of dimension k. The mixed collection has every tenth frame of
     all 44 sequences. See [Summarise images and runs](how-to/summaries.md)."""
+_SAVED = """
+    Each model of `merge.py` is learned from a third of a sequence, and tried in the last third; `one tree` has seen
+    both. `best` is the share of frames in which the best window of the whole frame overlaps the object by half, and
+    `found` the share in which a run that starts with the model has a box that does. The models of `saved_models.py`
+    are learned from the first third of a sequence; `stranger` is the share of frames of other sequences in which a box
+    is reported. The tables have the sequences that are not on the check list. See [Saved
+    models](how-to/saved-models.md)."""
 _INGREDIENTS = """
     The loss of AUC without one component; the largest losses of each run. A loss of less than two standard errors
     may be chance. The first run is on all 44 sequences, the second on the first 20, before decision 49."""
@@ -339,6 +357,7 @@ SECTIONS = (
 MORE = (
     Section("Frequent directions", _REDUCTION, (Shown("reduction", every),)),
     Section("Summaries", _SUMMARIES, (Shown("summary", every),)),
+    Section("Saved models", _SAVED, (Shown("merge", merged), Shown("saved_models", means_only))),
 )
 
 PAGES = (
