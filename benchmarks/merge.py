@@ -59,13 +59,14 @@ def best(learned: Learned, sequence: Sequence, start: int, count: int) -> float:
 
 
 def differences(merged: Learned, one: Learned) -> tuple[float, float]:
-    """Difference of the energy along the weights, as a share of c; and c as a share of the energy of all rows."""
+    """Difference of the energy along the weights, in percent of c; and c, in percent of the energy of all rows."""
     trees = merged.trees["object"], one.trees["object"]
     ours, theirs = ([*(node.rows for node in tree.nodes), tree.pending] for tree in trees)
     weights = one.model.weights / np.linalg.norm(one.model.weights)
     along = [energy((np.vstack(rows) @ weights)[:, None]) for rows in (ours, theirs)]
     lost = max(tree.dropped_energy for tree in trees)
-    return abs(along[0] - along[1]) / max(lost, 1e-12), lost / (energy(np.vstack(theirs)) + trees[1].dropped_energy)
+    whole = energy(np.vstack(theirs)) + trees[1].dropped_energy
+    return 100 * abs(along[0] - along[1]) / max(lost, 1e-12), 100 * lost / whole
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
@@ -73,12 +74,12 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     found = [row for row in each(options, measured, tasks) if row is not None]
     names = list(found[0][1])
     columns = [[row[name][k] for _, row, *_ in found] for name in names for k in (0, 1)]
-    heads = ("sequence", *(f"{name}: {measure}" for name in names for measure in ("best", "found")), "share of c", "c")
+    heads = ("sequence", *(f"{name}: {measure}" for name in names for measure in ("best", "found")), "% of c", "c, %")
     rows = [
         (name, *(value for model in row.values() for value in model), share, lost) for name, row, share, lost in found
     ]
     means = ("mean", *map(fmean, columns), fmean(row[2] for row in found), fmean(row[3] for row in found))
-    note = f"{len(found)} sequences; `share of c`: | ||C w||^2 - ||C' w||^2 | / c of the object's trees, merged and one"
+    note = f"{len(found)} sequences; `% of c`: | ||C w||^2 - ||C' w||^2 | / c of the object's trees, merged and one"
     yield Table("Models of the parts of a sequence", heads, [*rows, means], note)
     yield Table("Merged against the others", ("difference", "best", "± s.e.", "found", "± s.e."), list(_paired(found)))
 
