@@ -17,8 +17,9 @@ from catstream.features.cells import Cells
 from catstream.features.colours import shades
 from catstream.features.hog import grid
 from catstream.messages import Sample
+from catstream.multi import MultiTracker
+from catstream.names import UNNAMED
 from catstream.settings import Settings
-from catstream.tracker import Tracker
 from catstream.training.motion_em import learn_motion
 from catstream.training.trainer import Trainer
 
@@ -68,15 +69,13 @@ def learning(sequence: Sequence, sizes: Iterable[int]) -> Iterator[tuple[str, Ca
 
 def sample_of(sequence: Sequence, n: int) -> Sample:
     """Return the sample of the trees after tracking the whole sequence."""
-    tracker = Tracker(Settings(coreset={"size": n}))
+    tracker = MultiTracker(Settings(coreset={"size": n}))
     for row, image in enumerate(sequence.frames()):
         if row == 0:
-            tracker.init(image, sequence.boxes[0])
+            tracker.init(image, {UNNAMED: sequence.boxes[0]})
         else:
             tracker.update(image)
-    sample = tracker.compressor.last_sample
-    assert sample is not None, "the first frame teaches a leaf of each tree"
-    return sample
+    return tracker.forest.last_samples[0]  # the first frame teaches a leaf of each tree
 
 
 def motion() -> Iterator[tuple[str, Callable[[], object]]]:

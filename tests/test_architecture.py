@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 #: From the lowest. A module imports only from lower levels than its own, and from its own folder.
 LEVELS = [
     {"arrays", "errors", "threads"},
-    {"box", "heads", "colours", "image", "schema", "storage", "extras"},
+    {"box", "heads", "colours", "image", "parallel", "schema", "storage", "extras"},
     {"messages", "names", "packing", "settings", "ridge", "kalman", "html"},
     {"features"},
     {"paper"},

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catstream import storage
+from catstream import parallel, storage
 from catstream.box import Box
 from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError
 from catstream.multi import MultiTracker
@@ -65,6 +65,15 @@ def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames):
         assert [without_version(tracks[name]) for tracks in together] == [
             without_version(tracks[name]) for tracks in alone
         ]
+
+
+def test_the_tracks_do_not_depend_on_the_number_of_cores(frames, monkeypatch):
+    found = followed(frames, STEPS)
+    for cores in (1, 4):
+        monkeypatch.setattr(parallel, "_cores", lambda cores=cores: cores)
+        parallel._pool.cache_clear()
+        assert followed(frames, STEPS) == found
+    parallel._pool.cache_clear()
 
 
 def test_one_unnamed_object_is_that_of_a_tracker(frames):

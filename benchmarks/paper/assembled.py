@@ -14,10 +14,12 @@ import numpy as np
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
-from catstream.detection.detector import Detector
+from catstream.detection.objects import Detectors
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import start_frames
 from catstream.evaluation.runs import EvaluationRun
+from catstream.features.pyramid import Pyramid
+from catstream.names import UNNAMED
 from catstream.paper.scm import SparseCollaborativeModel
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
@@ -92,14 +94,18 @@ def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> Evaluat
     """Run the loop of `catstream.tracker.Tracker` with other trees, and stop learning after a share of the frames."""
     frames = len(sequence) - start
     settings = recipe.settings.for_length(frames)
-    detector, compressor, trainer = Detector(settings), Compressor(settings, recipe.tree), Trainer(settings)
+    detectors, compressor, trainer = Detectors(settings), Compressor(settings, tree=recipe.tree), Trainer(settings)
     boxes, scores, moments = [], [], [perf_counter()]
     with one_thread(opencv=True):
         for row, image in enumerate(sequence.frames(start)):
-            track, features = detector.step(image) if row else detector.init(image, Box(*sequence.boxes[start]))
-            sample = compressor.take(features) if row < recipe.learned * frames else None
+            frame = Pyramid.of(image)
+            given = {} if row else {UNNAMED: detectors.begin(UNNAMED, frame, Box(*sequence.boxes[start]))}
+            tracks, features = detectors.step(frame, given=given)
+            track = tracks.tracks[UNNAMED]
+            part, version = features.objects[UNNAMED], compressor.version + 1
+            sample = compressor.take(row, part, version) if row < recipe.learned * frames else None
             if sample is not None:
-                detector.adopt(trainer.train(sample))
+                detectors.adopt(trainer.train(sample))
             boxes.append(track.box or (np.nan,) * 4)
             scores.append(track.score)
             moments.append(perf_counter())

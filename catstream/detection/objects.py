@@ -11,6 +11,7 @@ from catstream.errors import ObjectError
 from catstream.features.pyramid import Pyramid
 from catstream.messages import Features, Model, Track, Tracks
 from catstream.names import check_count, check_name, listed
+from catstream.parallel import in_parallel
 from catstream.settings import Settings
 
 __all__ = ["Detectors", "prepare"]
@@ -96,9 +97,11 @@ class Detectors:
         self.seq += 1
         results = dict(given or {})
         searched = {name: detector for name, detector in self.detectors.items() if name not in results}
-        found = {name: detector.look(frame, self.seq) for name, detector in searched.items()}
-        for name, detector in searched.items():
-            results[name] = detector.settle(found[name], frame, self.seq, time)
+        found = in_parallel(lambda detector: detector.look(frame, self.seq), searched.values())
+        settled = in_parallel(
+            lambda pair: pair[0].settle(pair[1], frame, self.seq, time), zip(searched.values(), found, strict=True)
+        )
+        results |= zip(searched, settled, strict=True)
         names = [*self.detectors, *(name for name in results if name not in self.detectors)]
         tracks: dict[str, Track] = {name: results[name][0] for name in names}
         parts = {name: results[name][1] for name in names}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from threading import Lock
-
 import cv2
 import numpy as np
 
@@ -29,7 +27,7 @@ class Pyramid:
 
     def __init__(self, image: np.ndarray) -> None:
         self.image = np.ascontiguousarray(image)
-        self._halves, self._lock = [self.image], Lock()
+        self._halves = {0: self.image}
 
     @classmethod
     def of(cls, image: np.ndarray) -> Pyramid:
@@ -52,12 +50,11 @@ class Pyramid:
         ((22, 30, 3), 4)
         """
         level = 0
-        with self._lock:
-            while 2 << level <= scale and min(self._halves[level].shape[:2]) > 1:
-                level += 1
-                if level == len(self._halves):
-                    self._halves.append(_half(self._halves[-1]))
-            return self._halves[level], 1 << level
+        while 2 << level <= scale and min(self._halves[level].shape[:2]) > 1:
+            level += 1
+            if level not in self._halves:  # two threads may make the same one: it has the same pixels
+                self._halves[level] = _half(self._halves[level - 1])
+        return self._halves[level], 1 << level
 
     def around(self, window: Window, side: int) -> np.ndarray:
         """A patch of `side` x `side` cells around a window and a margin, in which the window is 64 x 64 pixels."""
