@@ -71,7 +71,7 @@ protocol: $(TOOLS)  ## update the tables of docs/protocol.md
 bench: $(TOOLS)  ## measure speed, memory and growth on an idle machine, into benchmarks/results: 20 minutes
 	PYTHON=$${PYTHON_OF_PEERS:-$(BIN)/python} benchmarks/measure.sh
 
-results: $(TOOLS)  ## write docs/results.md, and the figures of README, from benchmarks/results
+results: $(TOOLS)  ## write the pages of results, and the figures of README, from benchmarks/results
 	$(BIN)/python benchmarks/page.py
 
 audit: $(TOOLS)  ## known vulnerabilities of the packages in the lock files, from PyPI

@@ -276,7 +276,8 @@ _SUMMARIES = """
     The energy ||A P||^2 / ||A||^2 that k selected images keep of a collection, computed with all rows. `catstream`
     reads the images once, and keeps 128 rows as a sketch and at most 256 candidates. The greedy choice has all rows at
     once; no k images can keep more than the best subspace of dimension k. The mixed collection has every tenth frame of
-    all 44 sequences. See [Summarise images and runs](how-to/summaries.md)."""
+    all 44 sequences. The most memory depends on the number of rows since the last reduction, at most 127, and not on
+    that of all images. See [Summarise images and runs](how-to/summaries.md)."""
 _SAVED = """
     Each model of `merge.py` is learned from a third of a sequence, and tried in the last third; `one tree` has seen
     both. `best` is the share of frames in which the best window of the whole frame overlaps the object by half, and
