@@ -114,8 +114,10 @@ class CompressorLoop:
     def _store(self, urgent: bool) -> None:
         """Write a checkpoint, or count all messages as stored if there are none (started by hand without --state)."""
         self._process.allow(_STORE_SECONDS)
+        began = time.monotonic()
         saved = self._checkpoints is None or self._checkpoints.save(self._forest)
-        self._progress = self._progress.after(self._forest.position, time.monotonic(), saved=saved, urgent=urgent)
+        now = time.monotonic()
+        self._progress = self._progress.after(self._forest.position, began, now, saved=saved, urgent=urgent)
 
     def publish_health(self, *, last: bool = False) -> None:
         """Serve late joiners, send the trees to subscribers, and publish the health."""

@@ -8,6 +8,8 @@ from catstream.messages import End, Position
 
 __all__ = ["Progress"]
 
+_REST = 9.0  # from one checkpoint to the next, times the duration of the last one
+
 
 @dataclass(frozen=True, slots=True)
 class Progress:
@@ -15,22 +17,27 @@ class Progress:
 
     position  the answer to a sender: messages up to it need not be retransmitted
     stored    seq of the newest message that is in a checkpoint
-    tried     moment of the last attempt to write a checkpoint
+    tried     moment at which the last attempt to write a checkpoint ended
+    took      seconds that it took
     """
 
     position: Position
     stored: int
     tried: float
+    took: float = 0.0
 
     def is_urgent(self, seq: int, window: int) -> bool:
         """Whether half of the sender's window is not stored yet: a full window would block the sender."""
         return 2 * (seq - self.position.seq) >= window
 
     def is_due(self, seq: int, now: float, interval: float) -> bool:
-        """Whether some messages are not stored, and the interval between checkpoints is over."""
-        return seq > self.stored and now - self.tried >= interval
+        """Whether some messages are not stored, and the interval between checkpoints is over.
 
-    def after(self, position: Position, now: float, *, saved: bool, urgent: bool) -> Progress:
+        The interval grows with the trees: at most a tenth of the time is spent writing.
+        """
+        return seq > self.stored and now - self.tried >= max(interval, _REST * self.took)
+
+    def after(self, position: Position, began: float, now: float, *, saved: bool, urgent: bool) -> Progress:
         """The progress after an attempt to write a checkpoint.
 
         If the disk is full, an urgent checkpoint is acknowledged although it is only in memory: training continues.
@@ -38,13 +45,14 @@ class Progress:
         Parameters
         ----------
         position : position of the newest received message
+        began, now : moments at which the attempt began and ended
         saved : whether the checkpoint was written
         urgent : whether the sender waits for it
         """
         stored = position.seq if saved else self.stored
         if not saved and not urgent:
-            return replace(self, tried=now)
-        return Progress(replace(position, unsaved=position.seq - stored), stored, now)
+            return replace(self, tried=now, took=now - began)
+        return Progress(replace(position, unsaved=position.seq - stored), stored, now, now - began)
 
     def acknowledgement(self, now: Position, end: End | None) -> Position:
         """The position to acknowledge.

@@ -1,4 +1,4 @@
-"""`catstream set-box`, `pause`, `resume`, `save` and `stop`, as a person uses them."""
+"""`catstream set-box`, `forget`, `pause`, `resume`, `save` and `stop`, as a person uses them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from catstream.cli import VERBS
 from catstream.video.source import open_source
 
-STEER = ["set-box", "pause", "resume", "save", "stop"]
+STEER = ["set-box", "forget", "pause", "resume", "save", "stop"]
 PATIENT = ("--timeout", 60)
 
 
@@ -28,13 +28,13 @@ def steer(said, tmp_path):
 
 
 @pytest.fixture
-def state(said, tmp_path):
-    """What `catstream status` says that the pipeline of this test does."""
+def status(said, tmp_path):
+    """The figures of `catstream status` about the pipeline of this test."""
 
     def ask():
         code, output, _ = said("status", "--json", "--endpoint", tmp_path / "run", "--wait", 60)
         assert code == 0
-        return json.loads(output)["state"]
+        return json.loads(output)
 
     return ask
 
@@ -43,15 +43,15 @@ def rows(folder):
     return list(csv.DictReader((folder / "demo.csv").read_text().splitlines()))
 
 
-def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, steer, state, tmp_path):
+def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, steer, status, tmp_path):
     source, box = video
     run = catstream("track", source, "--output", tmp_path / "out", "--set", f"run.endpoint={tmp_path / 'run'}")
     assert steer("pause") == (0, "paused before the first frame")
-    assert state() == "waiting for a box"
+    assert status()["state"] == "waiting for a box"
     assert steer("set-box", "400,10,20,20")[0] == 1
     code, answer = steer("set-box", box)
     assert (code, answer) == (0, f"the object begins at {box} in frame 0")
-    assert state() == "paused"
+    assert status()["state"] == "paused"
     code, answer = steer("save", tmp_path / "one")
     assert (code, "nothing was learned of the object yet" in answer) == (1, True), answer
     assert steer("resume") == (0, "resumed after frame 0")
@@ -62,6 +62,29 @@ def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, stee
     assert f"catstream set-box X,Y,W,H --endpoint {tmp_path / 'run'}" in hint
     assert "60 messages sent, 60 stored" in errors
     assert len(rows(tmp_path / "out")) == 60
+
+
+def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(
+    video, catstream, said, steer, status, until, tmp_path
+):
+    source, box = video
+    run = catstream("track", source, "--box", f"anna={box}", "--set", f"run.endpoint={tmp_path / 'run'}")
+    assert steer("pause")[0] == 0
+    code, answer = steer("set-box", "ben=20,150,70,60")
+    assert (code, answer.startswith("the object ben begins at 20,150,70,60 in frame")) == (0, True)
+    assert until(status)["objects"].keys() == {"anna", "ben"}
+    table = said("status", "--endpoint", tmp_path / "run", "--wait", 60)[1].splitlines()
+    assert table[-3].split() == ["object", "state", "score", "model", "leaves"]
+    assert {line.split()[0] for line in table[-2:]} == {"anna", "ben"}
+    code, answer = steer("forget")
+    assert (code, answer.endswith("which object? This run has anna, ben: give a name")) == (1, True)
+    assert steer("forget", "carl")[1].endswith("there is no object 'carl': the objects are anna, ben")
+    assert steer("set-box", "an na=1,2,30,40")[0] == 1
+    assert steer("forget", "anna")[1].startswith("anna is no longer tracked after frame")
+    assert steer("forget")[1].endswith("no object is left, so the run waits for a box")
+    assert status()["state"] == "waiting for a box"
+    assert steer("stop")[0] == 0
+    assert run.wait(120) == 0
 
 
 def test_a_saved_model_finds_the_object_in_another_run(video, catstream, said, steer, camera, until, tmp_path):

@@ -37,17 +37,17 @@ def looks(folder, previews, until):
 def test_a_preview_is_small_and_contains_the_size_of_the_frame(previews, looks):
     image = np.zeros((720, 1280, 3), np.uint8)
     with looks() as reader:
-        previews.show(7, image, Box(5.0, 6.0, 70.0, 80.0))
+        previews.show(7, image, {"anna": Box(5.0, 6.0, 70.0, 80.0)})
         preview = next(reader)
     assert (preview.frame, preview.width, preview.height) == (7, 1280, 720)
-    assert preview.box == Box(5.0, 6.0, 70.0, 80.0)
+    assert preview.boxes == {"anna": Box(5.0, 6.0, 70.0, 80.0)}
     assert cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (360, 640, 3)
 
 
 def test_a_picture_shows_the_frame(previews, looks):
     ((image, _),) = render(1, (320, 240))
     with looks() as reader:
-        previews.show(0, image, None)
+        previews.show(0, image, {})
         shown = cv2.imdecode(np.frombuffer(next(reader).jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert cv2.PSNR(shown, image) > 28
 
@@ -55,12 +55,12 @@ def test_a_picture_shows_the_frame(previews, looks):
 def test_none_is_made_while_nobody_looks(previews, monkeypatch):
     monkeypatch.setattr("catstream.services.previews.jpeg", None)  # to call it is an error
     for frame in range(5):
-        previews.show(frame, np.zeros((48, 64, 3), np.uint8), None)
+        previews.show(frame, np.zeros((48, 64, 3), np.uint8), {})
 
 
 def test_a_new_viewer_receives_the_newest_frame_if_none_arrives(previews, looks):
     for frame in range(5):
-        previews.show(frame, np.zeros((48, 64, 3), np.uint8), None)
+        previews.show(frame, np.zeros((48, 64, 3), np.uint8), {})
     with looks() as reader:
         previews.turn()
         assert next(reader).frame == 4
@@ -71,7 +71,7 @@ def test_frames_that_pass_by_while_none_is_followed_are_seen_though_they_have_on
     with looks() as reader:
         reader.timeout = 0
         for grey in (0, 255):
-            previews.show(3, np.full((48, 64, 3), grey, np.uint8), None)
+            previews.show(3, np.full((48, 64, 3), grey, np.uint8), {})
             until(lambda: seen.extend(_here(reader)) or any(_grey(preview) == grey for preview in seen), previews.turn)  # noqa: B023
     assert [_grey(preview) for preview in seen] == [0, 255]
 
@@ -81,7 +81,7 @@ def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
     with looks() as reader:
         reader.timeout = 0
         for frame in range(200):
-            previews.show(frame, np.zeros((48, 64, 3), np.uint8), None)
+            previews.show(frame, np.zeros((48, 64, 3), np.uint8), {})
 
         def look():
             previews.turn()

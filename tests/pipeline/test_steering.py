@@ -12,7 +12,7 @@ import cv2
 import pytest
 import zmq
 
-from catstream.errors import CommandRejectedError, ProtocolError, ServiceError, SettingsError
+from catstream.errors import CommandRejectedError, ObjectError, ProtocolError, ServiceError, SettingsError
 from catstream.learned import Learned
 from catstream.pipeline import Pipeline
 from catstream.services.desired import DesiredState
@@ -95,8 +95,11 @@ def refuses_what_cannot_be_done(pipeline, steering):
     for box, why in (((400, 10, 20, 20), "outside the frame"), ((10, 10, 1, 9), "at least 2 pixels")):
         with pytest.raises(CommandRejectedError, match=why):
             steering.set_box(box)
-    with pytest.raises(CommandRejectedError, match="nothing was learned"):
-        steering.save("never.safetensors")
+    for command in (steering.forget, lambda: steering.save("never.safetensors")):
+        with pytest.raises(CommandRejectedError, match="no object is tracked yet"):
+            command()
+    with pytest.raises(ObjectError, match="is not a name"):
+        steering.set_box((10, 10, 20, 20), "an na")
     with zmq.Context.instance().socket(zmq.DEALER) as stranger:
         stranger.connect(Endpoint.parse(pipeline.endpoint).address(CHANNELS["control"]))
         for data in (b"", b"\xc1", b"\x93\x01\xa4", bytes(9000)):

@@ -26,11 +26,12 @@ class Storing(RuleBasedStateMachine):
         self.seq = self.on_disk = 5
         self.now = 0.0
 
-    def store(self, works, urgent):
+    def store(self, works, urgent, seconds=0.0):
         if works:
             self.on_disk = self.seq
         position = Position(self.seq, objects=objects(self.seq))
-        self.progress = self.progress.after(position, self.now, saved=works, urgent=urgent)
+        began, self.now = self.now, self.now + seconds
+        self.progress = self.progress.after(position, began, self.now, saved=works, urgent=urgent)
 
     @rule(works=st.booleans())
     def receive(self, works):
@@ -39,11 +40,13 @@ class Storing(RuleBasedStateMachine):
         if urgent or self.progress.is_due(self.seq, self.now, INTERVAL):
             self.store(works, urgent)
 
-    @rule(works=st.booleans(), seconds=st.floats(0, 2 * INTERVAL))
-    def time_passes(self, works, seconds):
+    @rule(works=st.booleans(), seconds=st.floats(0, 2 * INTERVAL), duration=st.floats(0, INTERVAL))
+    def time_passes(self, works, seconds, duration):
         self.now += seconds
         if self.progress.is_due(self.seq, self.now, INTERVAL):
-            self.store(works, urgent=False)
+            assert self.now - self.progress.tried >= INTERVAL
+            assert self.progress.took <= (self.now - self.progress.tried + self.progress.took) / 10 + 1e-9
+            self.store(works, False, duration)
             assert not self.progress.is_due(self.seq, self.now, INTERVAL)
 
     @rule(works=st.booleans())

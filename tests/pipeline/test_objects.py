@@ -1,0 +1,117 @@
+"""Several objects through the three processes: they are tracked as in one process, come and go, and are resumed."""
+
+from __future__ import annotations
+
+import os
+import signal
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from catstream.errors import CommandRejectedError
+from catstream.learned import Learned
+from catstream.multi import MultiTracker
+from catstream.pipeline import Pipeline
+from catstream.settings import Settings
+from catstream.steering import control
+from catstream.video.source import open_source
+from catstream.wire.keys import create
+
+FRAMES = 30
+PATCHES = {"ben": (20, 150, 70, 60), "carl": (20, 20, 60, 60)}  # of the picture's lake
+SETTINGS = Settings(run={"unstored_frames": 16})
+
+
+@pytest.fixture(scope="module")
+def objects(video):
+    """The boxes of three objects in the first frame, by name."""
+    return {"anna": video[1][0], **PATCHES}
+
+
+@pytest.fixture(scope="module")
+def expected(video, objects):
+    """The tracks of each frame in one process."""
+    tracker, tracks = MultiTracker(), []
+    with open_source(video[0]) as source:
+        for frame, _ in zip(source, range(FRAMES), strict=False):
+            if tracks:
+                tracker.update(frame.image, frame.time)
+            else:
+                tracker.init(frame.image, objects, frame.time)
+            tracks.append(tracker.tracks)
+    return tracks
+
+
+def test_with_keys_and_in_lockstep_three_objects_are_as_in_one_process_whoever_dies(
+    video, objects, expected, folder, tcp
+):
+    create(folder / "keys")
+    settings = Settings(run={"lockstep": True, "keys": str(folder / "keys"), "endpoint": tcp})
+    tracks, victims = [], {5: "detector", 12: "compressor", 20: "trainer"}
+    with Pipeline(video[0], objects, settings, part=slice(0, FRAMES)) as pipeline:
+        for each in pipeline.by_frame():
+            tracks.append(each)
+            if victim := victims.get(len(tracks)):
+                os.kill(pipeline.pids[victim], signal.SIGKILL)
+        assert pipeline.restarts == len(victims)
+    assert tracks == expected
+    assert pipeline.totals == {"sent": FRAMES, "stored": FRAMES}
+
+
+def test_a_run_that_is_resumed_has_the_objects_that_it_had_and_each_frame_once(video, objects, tmp_path):
+    tracks = []
+    with (
+        Pipeline(video[0], objects, SETTINGS, part=slice(0, FRAMES), state=tmp_path / "kept") as pipeline,
+        control(pipeline.endpoint, timeout=60) as steering,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        forgotten = pool.submit(steering.forget, "ben")
+        for each in pipeline.by_frame():
+            tracks.append(each)
+            if forgotten.done() and "ben" not in each:
+                break
+        position = pipeline._incoming.position
+    with Pipeline(resume=tmp_path / "kept", settings=SETTINGS, after=position) as pipeline:
+        tracks += pipeline.by_frame()
+    last = forgotten.result().frame
+    assert [each["anna"].frame for each in tracks] == list(range(FRAMES))
+    assert [frame for frame, each in enumerate(tracks) if "ben" in each] == list(range(last + 1))
+    assert all(each.keys() >= {"anna", "carl"} for each in tracks)
+
+
+def test_objects_are_saved_forgotten_and_begun_by_name_while_paused(video, objects, tmp_path):
+    with (
+        Pipeline(video[0], objects, SETTINGS) as pipeline,
+        control(pipeline.endpoint, timeout=60) as steering,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        saved = pool.submit(lambda: until_saved(steering, tmp_path / "ben"))
+        tracks = []
+        for each in pipeline.by_frame():
+            tracks.append(each)
+            if saved.done():
+                break
+        assert saved.result().object == Learned.load(tmp_path / "ben").object == "ben"
+        steering.pause()
+        begin = steering.set_box(objects["anna"], "dora")
+        assert begin.reason.startswith("the object dora begins at")
+        with pytest.raises(CommandRejectedError, match="which object"):
+            steering.forget()
+        for name in ("anna", "ben", "carl"):
+            steering.forget(name)
+        assert steering.forget().reason.endswith("no object is left, so the run waits for a box")
+        again = steering.set_box(objects["carl"], "carl")
+        steering.stop()
+        tracks += pipeline.by_frame()
+    assert (tracks[-2].keys(), tracks[-1].keys()) == ({*objects, "dora"}, {"carl"})
+    assert (len(tracks) - 2, len(tracks) - 1) == (begin.frame, again.frame)
+    assert pipeline.totals == {"sent": len(tracks), "stored": len(tracks)}
+
+
+def until_saved(steering, path):
+    """Save what was learned of ben as soon as there is a model."""
+    while True:
+        try:
+            return steering.save(path, "ben")
+        except CommandRejectedError:
+            continue
