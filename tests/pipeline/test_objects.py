@@ -10,6 +10,7 @@ import pytest
 
 from catstream.errors import CommandRejectedError
 from catstream.learned import Learned
+from catstream.messages import ObjectPosition, Position
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
@@ -70,8 +71,9 @@ def test_a_run_that_is_resumed_has_the_objects_that_it_had_and_each_frame_once(v
             tracks.append(each)
             if forgotten.done() and "ben" not in each:
                 break
-        position = pipeline._incoming.position
-    with Pipeline(resume=tmp_path / "kept", settings=SETTINGS, after=position) as pipeline:
+    found = {name: ObjectPosition(track.box) for name, track in tracks[-1].items()}
+    after = Position(len(tracks), len(tracks) - 1, found)
+    with Pipeline(resume=tmp_path / "kept", settings=SETTINGS, after=after) as pipeline:
         tracks += pipeline.by_frame()
     last = forgotten.result().frame
     assert [each["anna"].frame for each in tracks] == list(range(FRAMES))
