@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,21 +92,16 @@ def summary(
     _check_output(output, json_beside(output), overwrite)
     interrupts, console = Interrupts(), Console(stderr=True, soft_wrap=True, highlight=False)
     interrupts.install()
-    with ExitStack() as stack:
-        if _is_recording(path):
-            sheet = _of_recording(Recording(path), count, name, source, console)
-        elif box is not None or (path.is_dir() and Job.is_in(path)):
-            job = (
-                Job.load(path)
-                if box is None
-                else Job(str(path), boxes_by_name(dict([split_name(box)])), settings=settings)
-            )
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-summary-"))
+    if _is_recording(path):
+        sheet = _of_recording(Recording(path), count, name, source, console)
+    elif box is not None or (path.is_dir() and Job.is_in(path)):
+        job = Job.load(path) if box is None else _job(path, box, settings)
+        with tempfile.TemporaryDirectory(prefix="catstream-summary-") as folder:
             sheet = _of_recording(_tracked(job, Path(folder), console), count, name, source or job.source, console)
-        else:
-            sheet = _of_images(path, count, console)
-        with interrupts.deferred():
-            sheet.save(output)
+    else:
+        sheet = _of_images(path, count, console)
+    with interrupts.deferred():
+        sheet.save(output)
     console.print(f"{sheet.about[0]}\n{output} and {json_beside(output)}")
 
 
@@ -118,6 +112,12 @@ def _is_recording(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return path.suffix == _RECORDING or file.read(len(MAGIC)) == MAGIC
+
+
+def _job(path: Path, box: str, settings: Settings) -> Job:
+    from catstream.job import Job
+
+    return Job(str(path), boxes_by_name(dict([split_name(box)])), settings=settings)
 
 
 def _check_output(output: Path, json: Path, overwrite: bool) -> None:
