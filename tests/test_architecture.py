@@ -48,7 +48,7 @@ IMPORTERS = {
     ],
     "filterpy": ["catstream/kalman.py"],
     "numba": ["catstream/features/compiled.py"],
-    "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/demo.py"],
+    "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
     "filelock": ["catstream/storage.py"],
     "safetensors": ["catstream/storage.py"],
     "pyarrow": ["catstream/sinks/parquet.py"],

@@ -9,13 +9,14 @@ The same arguments give the same pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from importlib.resources import files
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from catstream.box import Box
+from catstream.video.sprite import VISIBLE, cut_out_dahlia, load_photograph
 from catstream.video.writer import VideoWriter
 
 __all__ = ["FRAMES", "RATE", "SIZE", "render", "write"]
@@ -25,7 +26,6 @@ FRAMES, RATE, SIZE = 600, 30.0, (640, 480)
 
 _ZOOM = 1.5  # enlargement of the photograph of the lake; coordinates below are in the enlarged photograph
 _BEHIND = 280  # the last frame in which the dahlia is behind the pagoda
-_VISIBLE = 0.1  # if a smaller share of the dahlia is visible, it counts as absent
 _NOISE = 4.0  # standard deviation of the sensor noise, in grey levels
 
 #: Key frames of the dahlia: frame, centre x and y, diameter, angle in degrees.
@@ -66,9 +66,6 @@ _CAMERA = np.array(
         (600, 300, 60, 0.8),
     ]
 )
-
-#: Centre of the dahlia in its photograph, in pixels.
-_DAHLIA = (308, 221)
 
 #: Outline of the pagoda in the photograph before enlargement, in pixels.
 _PAGODA = np.array(
@@ -146,22 +143,16 @@ def write(
     return path, truth
 
 
-def _load_photograph(name: str) -> np.ndarray:
-    """Load a photograph that scikit-learn ships as float32 BGR. Scikit-learn's own loader needs Pillow."""
-    path = files("sklearn") / "datasets" / "images" / f"{name}.jpg"
-    return np.array(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR), np.float32)
-
-
 class _Scene:
     """Renders single frames from the two photographs; colours are float32, 0 to 255."""
 
     def __init__(self, seed: int) -> None:
-        lake, flower = _load_photograph("china"), _load_photograph("flower")
+        lake, flower = load_photograph("china"), load_photograph("flower")
         self.lake = cv2.resize(lake, None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_CUBIC).clip(0, 255)
         pagoda = cv2.fillPoly(np.zeros(self.lake.shape[:2], np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
         self.pagoda = cv2.GaussianBlur(pagoda, (0, 0), 1.2)
-        self.dahlia, self.mask, self.outline = _cut_out_flower(flower)
-        self.decoy = self.dahlia[..., [2, 0, 1]] * np.float32(0.9)
+        self.dahlia = cut_out_dahlia(flower)
+        self.decoy = replace(self.dahlia, colours=self.dahlia.colours[..., [2, 0, 1]] * np.float32(0.9))
         self.flight, self.away, self.camera = (_interpolate(keys) for keys in (_FLIGHT, _DECOY, _CAMERA))
         self.rng = np.random.default_rng(seed)
         self.noise = self.rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
@@ -174,59 +165,14 @@ class _Scene:
         image = cv2.warpAffine(self.lake, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
         front = cv2.warpAffine(self.pagoda, view, SIZE)
 
-        self._paint(image, self.decoy, self._flower_to_picture(self.away[frame], view), 1 - front)
-        turn = self._flower_to_picture(self.flight[frame], view)
-        seen = self._paint(image, self.dahlia, turn, 1 - front if frame <= _BEHIND else np.ones_like(front))
-        low, high = self._limits(turn)
+        self.decoy.paint(image, self.decoy.turned(self.away[frame], view), 1 - front)
+        turn = self.dahlia.turned(self.flight[frame], view)
+        seen = self.dahlia.paint(image, turn, 1 - front if frame <= _BEHIND else np.ones_like(front))
 
         y, x = self.rng.integers(SIZE[1]), self.rng.integers(SIZE[0])
         image = image * np.float32(light) + self.noise[y : y + SIZE[1], x : x + SIZE[0]]
-        box = Box(*map(float, (*low, *(high - low)))) if seen >= _VISIBLE else None
+        box = self.dahlia.box(turn) if seen >= VISIBLE else None
         return image.clip(0, 255).astype(np.uint8), box
-
-    def _flower_to_picture(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """Return the affine map from the flower image to the frame, float64 (2, 3)."""
-        x, y, diameter, angle = place
-        side = self.mask.shape[0]
-        turn = cv2.getRotationMatrix2D((side / 2, side / 2), angle, diameter / side)
-        turn[:, 2] += np.array([x, y]) + view[:, 2] - side / 2
-        return turn
-
-    def _limits(self, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the top left and bottom right corners of the flower in the frame."""
-        points = self.outline @ turn[:, :2].T + turn[:, 2]
-        return points.min(axis=0), points.max(axis=0)
-
-    def _paint(self, image: np.ndarray, flower: np.ndarray, turn: np.ndarray, free: np.ndarray) -> float:
-        """Paint the flower over the unoccluded part of the image; return the visible share of the flower.
-
-        free : float32 (h, w), 1 for pixels that nothing occludes
-        """
-        low, high = self._limits(turn)
-        left, top = np.maximum(np.floor(low) - 2, 0).astype(int)
-        right, bottom = np.minimum(np.ceil(high) + 2, SIZE).astype(int)
-        if left >= right or top >= bottom:
-            return 0.0
-        patch, size = image[top:bottom, left:right], (int(right - left), int(bottom - top))
-        shift = turn - np.array([[0, 0, left], [0, 0, top]])
-        colours = cv2.warpAffine(flower, shift, size, borderMode=cv2.BORDER_REPLICATE)
-        alpha = cv2.warpAffine(self.mask, shift, size) * free[top:bottom, left:right]
-        patch += alpha[..., None] * (colours - patch)
-        return float(alpha.sum() / (self.mask.sum() * abs(np.linalg.det(turn[:, :2]))))
-
-
-def _cut_out_flower(photograph: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut the large flower out of its photograph: colours (s, s, 3), soft mask (s, s), outline points (k, 2)."""
-    (x, y), reach, side = _DAHLIA, 144, 160
-    window = slice(y - reach, y + reach), slice(x - reach, x + reach)
-    colours = cv2.resize(photograph[window], (side, side), interpolation=cv2.INTER_AREA)
-    disc: np.ndarray = cv2.circle(np.zeros((side, side), np.uint8), (side // 2, side // 2), side // 2, 1, cv2.FILLED)
-    warm = disc * (colours[..., 2] - colours[..., 0] > 40).astype(np.uint8)
-    contours, _ = cv2.findContours(warm, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = max(contours, key=len)
-    filled: np.ndarray = cv2.fillPoly(np.zeros((side, side), np.float32), [outline], 1.0)
-    mask = cv2.GaussianBlur(cv2.erode(filled, np.ones((3, 3))), (0, 0), 1.0)
-    return colours, mask, outline[:, 0].astype(float)
 
 
 def _interpolate(keys: np.ndarray) -> np.ndarray:

@@ -1,0 +1,96 @@
+"""Sprites: textured objects with a soft outline, cut out of the two photographs that scikit-learn ships."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+
+import cv2
+import numpy as np
+
+from catstream.box import Box
+
+__all__ = ["VISIBLE", "Sprite", "cut_out_dahlia", "load_photograph"]
+
+#: If a smaller share of a sprite is visible, its object counts as absent.
+VISIBLE = 0.1
+
+_DAHLIA = (308, 221)  # centre of the dahlia in its photograph, in pixels
+
+
+def load_photograph(name: str) -> np.ndarray:
+    """Load a photograph that scikit-learn ships as float32 BGR. Scikit-learn's own loader needs Pillow."""
+    path = files("sklearn") / "datasets" / "images" / f"{name}.jpg"
+    return np.array(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Sprite:
+    """An object that is painted into pictures.
+
+    colours  float32 (s, s, 3), 0 to 255, blue green red
+    mask     float32 (s, s), 1 inside the object, 0 outside
+    outline  points of the outline, float64 (k, 2), x and y in pixels of the sprite
+    """
+
+    colours: np.ndarray
+    mask: np.ndarray
+    outline: np.ndarray
+
+    def turned(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
+        """Return the affine map from the sprite to the picture, float64 (2, 3).
+
+        Parameters
+        ----------
+        place : x and y of the centre in the scene, size of the whole sprite in pixels, angle in degrees
+        view : map from the scene to the picture, a shift
+        """
+        (x, y, diameter, angle), side = place, self.mask.shape[0]
+        turn = cv2.getRotationMatrix2D((side / 2, side / 2), angle, diameter / side)
+        turn[:, 2] += np.array([x, y]) + view[:, 2] - side / 2
+        return turn
+
+    def box(self, turn: np.ndarray) -> Box:
+        """Return the box of the whole object in the picture."""
+        low, high = self._limits(turn)
+        return Box(*map(float, (*low, *(high - low))))
+
+    def paint(self, image: np.ndarray, turn: np.ndarray, free: np.ndarray) -> float:
+        """Paint the unoccluded part of the object; return the visible share of the object.
+
+        Parameters
+        ----------
+        image : float32 (h, w, 3), is changed
+        free : float32 (h, w), 1 for pixels in which nothing occludes the object
+        """
+        height, width = image.shape[:2]
+        low, high = self._limits(turn)
+        left, top = np.maximum(np.floor(low) - 2, 0).astype(int)
+        right, bottom = np.minimum(np.ceil(high) + 2, (width, height)).astype(int)
+        if left >= right or top >= bottom:
+            return 0.0
+        patch, size = image[top:bottom, left:right], (int(right - left), int(bottom - top))
+        shift = turn - np.array([[0, 0, left], [0, 0, top]])
+        colours = cv2.warpAffine(self.colours, shift, size, borderMode=cv2.BORDER_REPLICATE)
+        alpha = cv2.warpAffine(self.mask, shift, size) * free[top:bottom, left:right]
+        patch += alpha[..., None] * (colours - patch)
+        return float(alpha.sum() / (self.mask.sum() * abs(np.linalg.det(turn[:, :2]))))
+
+    def _limits(self, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the top left and bottom right corners of the object in the picture."""
+        points = self.outline @ turn[:, :2].T + turn[:, 2]
+        return points.min(axis=0), points.max(axis=0)
+
+
+def cut_out_dahlia(photograph: np.ndarray) -> Sprite:
+    """Cut the large flower out of its photograph."""
+    (x, y), reach, side = _DAHLIA, 144, 160
+    window = slice(y - reach, y + reach), slice(x - reach, x + reach)
+    colours = cv2.resize(photograph[window], (side, side), interpolation=cv2.INTER_AREA)
+    disc: np.ndarray = cv2.circle(np.zeros((side, side), np.uint8), (side // 2, side // 2), side // 2, 1, cv2.FILLED)
+    warm = disc * (colours[..., 2] - colours[..., 0] > 40).astype(np.uint8)
+    contours, _ = cv2.findContours(warm, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = max(contours, key=len)
+    filled: np.ndarray = cv2.fillPoly(np.zeros((side, side), np.float32), [outline], 1.0)
+    mask = cv2.GaussianBlur(cv2.erode(filled, np.ones((3, 3))), (0, 0), 1.0)
+    return Sprite(colours, mask, outline[:, 0].astype(float))
