@@ -51,7 +51,7 @@ from catstream.video import demo
 Found = list[tuple[float, Box]]
 Finder = Callable[[np.ndarray], Found]
 
-METHODS = ("catstream, first third", "catstream, first frame", "template matching", "ORB and RANSAC")
+METHODS = ("catstream", "catstream, first frame", "template matching", "ORB and RANSAC")
 _LEAST = 0.2  # score of a sighting of ours: low, so that precision is known at every recall
 _FACTORS = tuple(1.25**k for k in range(-4, 5))  # sizes at which a template is matched
 _MOST = 4  # sightings of one object in a frame
