@@ -47,6 +47,8 @@ from catstream.services.start import SPAWN
 from catstream.threads import one_thread
 from catstream.tracker import Tracker
 from catstream.video import demo
+from catstream.video.source import open_source
+from catstream.video.writer import VideoWriter
 
 Found = list[tuple[float, Box]]
 Finder = Callable[[np.ndarray], Found]
@@ -386,8 +388,6 @@ def _agree(found: list[Seen], plain: list[Seen]) -> bool:
 
 def _speed(models: list[Learned], frames: list[np.ndarray]) -> float:
     """Duration of a video divided by the time of its search."""
-    from catstream.video.writer import VideoWriter
-
     path = scratch() / "speed.mp4"
     if not path.exists():
         with VideoWriter(path, 25, frames[0].shape[1::-1]) as video:
@@ -409,32 +409,27 @@ def _apart(found: Found) -> Found:
     return kept
 
 
-def _spread(sequence: Sequence, begin: int, count: int) -> tuple[int, ...]:
-    """Numbers of `count` frames at equal distances, from `begin` on."""
-    return tuple(sorted({*np.linspace(begin, len(sequence) - 1, count).round().astype(int).tolist()}))
+def _spread(sequence: Sequence, begin: int, count: int) -> slice:
+    """`count` frames of a sequence at equal distances, from `begin` on."""
+    return slice(begin, len(sequence), math.ceil((len(sequence) - begin) / count))
 
 
-def _frames(sequence: Sequence, numbers: tuple[int, ...]) -> list[tuple[np.ndarray, Box | None]]:
+def _frames(sequence: Sequence, part: slice) -> list[tuple[np.ndarray, Box | None]]:
     """Some frames of a sequence, and the box of the object in each."""
-    boxes = [Box(*sequence.boxes[number].tolist()) for number in numbers]
-    return [
-        (image, box if np.isfinite(box).all() else None)
-        for image, box in zip(_images(sequence.path, sequence.begin, numbers), boxes, strict=True)
-    ]
+    boxes = [Box(*box) for box in sequence.boxes[part].tolist()]
+    shown = (box if np.isfinite(box).all() else None for box in boxes)
+    return list(zip(_images(sequence.path, sequence.begin, part.start, part.stop, part.step), shown, strict=True))
 
 
 @lru_cache(maxsize=128)
-def _images(path: Path, begin: int, numbers: tuple[int, ...]) -> list[np.ndarray]:
-    from catstream.video.source import open_source
-
-    wanted = {begin + number for number in numbers}
-    with open_source(path) as source:
-        return [frame.image for frame in islice(source, begin + max(numbers) + 1) if frame.number in wanted]
+def _images(path: Path, first: int, start: int, stop: int, step: int) -> list[np.ndarray]:
+    with open_source(path, part=slice(first + start, first + stop, step)) as source:
+        return [frame.image for frame in source]
 
 
 def _is_same_video(one: Sequence, other: Sequence) -> bool:
     """Whether two sequences are of one video: then the object of one is in the other."""
-    first, second = (_images(each.path, each.begin, (0,))[0] for each in (one, other))
+    first, second = (_frames(each, slice(0, 1, 1))[0][0] for each in (one, other))
     return first.shape == second.shape and float(cv2.absdiff(first, second).mean()) < _SAME_VIDEO
 
 
