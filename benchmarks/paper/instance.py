@@ -85,9 +85,9 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     for title, names in (("all", answers), ("check", [name for name in answers if name in CHECK])):
         if names:
             yield _summary(title, {name: answers[name] for name in names}, milliseconds)
-    yield _each(answers)
     yield _paper(found, *((8, 4) if options.quick else (_PLAIN, _OTHERS)))
     yield _scans(options, found)
+    yield _each(answers)
 
 
 def searched(name: str, options: argparse.Namespace) -> tuple[dict[str, list[Answer]], dict[str, float]]:
