@@ -59,7 +59,7 @@ _FACTORS = tuple(1.25**k for k in range(-4, 5))  # sizes at which a template is 
 _TEMPLATE = 48  # longer side of a template in pixels, at most
 _MOST = 4  # sightings of one object in a frame
 _SAME_VIDEO = 4.0  # grey levels by which the first frames of two sequences of one video differ at most
-_PLAIN, _OTHERS = 76, 120  # frames of the paper's setting: learned, and searched with and without the object
+_PLAIN, _OTHERS = 76, 80  # frames of the paper's setting: learned, and searched with and without the object
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,7 +347,7 @@ def _scans(options: argparse.Namespace, found: list[Sequence]) -> Table:
     picked = [sequence for sequence in found if sequence.name not in CHECK]
     picked = picked[:: max(1, len(picked) // 10)][:10]
     learned = [learn([next(iter(each.frames()))], Box(*each.boxes[0].tolist())) for each in picked]
-    frames = [image for image, _ in demo.render(2 if options.quick else 300)]
+    frames = [image for image, _ in demo.render(2 if options.quick else 150)]
     rows = []
     for count in (1, 3) if options.quick else (1, 3, 10):
         models = [learned[number % len(learned)] for number in range(count)]
