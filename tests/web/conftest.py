@@ -46,7 +46,7 @@ class Facts:
         return Health("detector", 1.0, {"sent": sent, "objects": len(names)}, objects=dict.fromkeys(names, counters))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def facts():
     return Facts
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as some
 
 from catstream.colours import PALETTE
 from catstream.messages import End, Health
@@ -200,3 +202,113 @@ def test_recent_pictures_are_kept_and_older_ones_are_not(dashboard, facts):
     }
     assert dashboard.picture(25).jpeg.endswith(b"25")
     assert dashboard.picture(5) is None
+
+
+def names(dashboard):
+    return [one["name"] for one in dashboard.updates({})["tracks"]["objects"]]
+
+
+def test_objects_are_listed_in_the_order_in_which_they_began_each_in_a_colour_of_its_own(dashboard, facts):
+    for frame, alive in enumerate((["ben"], ["ben", "anna"], ["ben", "anna", "carl"])):
+        for name in alive:
+            dashboard.take(facts.track(frame, name=name), float(frame))
+    objects = dashboard.updates({})["tracks"]["objects"]
+    assert [(one["name"], one["colour"]) for one in objects] == list(
+        zip(["ben", "anna", "carl"], PALETTE, strict=False)
+    )
+
+
+def test_frames_per_second_do_not_depend_on_the_number_of_objects(dashboard, facts):
+    for frame in range(100):
+        for name in ("anna", "ben", "carl"):
+            dashboard.take(facts.track(frame, name=name), frame / 50)
+    assert dashboard.rate(2.0) == pytest.approx(50, abs=1)
+
+
+def test_a_point_of_the_charts_has_each_object(dashboard, facts):
+    dashboard.take(facts.tracking(5, "anna", "ben"), 0.0)
+    dashboard.take(facts.track(5, name="anna", score=0.5), 1.0)
+    dashboard.take(facts.track(5, name="ben", state="absent", score=0.1, version=3), 1.0)
+    dashboard.take(facts.track(6, name="anna", score=0.25), 2.0)
+    now, rate, objects = dashboard.updates({})["points"][-1]
+    assert (now, rate, objects) == (2.0, 1.0, {"anna": [0.25, None, 1, True], "ben": [0.1, None, 3, False]})
+
+
+def test_the_latency_of_models_is_measured_for_each_object(dashboard, facts):
+    for frame in range(10):
+        for name in ("anna", "ben"):
+            dashboard.take(facts.track(frame, name=name), float(frame))
+    dashboard.take(facts.model(1, 8, "anna"), 9.0)
+    dashboard.take(facts.model(2, 4, "ben"), 9.5)
+    dashboard.take(facts.model(1, 8, "anna"), 20.0)  # sent again to a late joiner
+    assert {name: each.model_latency for name, each in dashboard.objects.shown.items()} == {"anna": 1.0, "ben": 5.5}
+
+
+def test_the_objects_of_a_paused_pipeline_are_known_from_its_health(dashboard, facts):
+    dashboard.take(facts.tracking(7, "anna", "ben"), 0.0)
+    shown = {"name": "anna", "colour": PALETTE[0], "state": "present", "score": 0.75, "version": 1}
+    assert dashboard.updates({})["tracks"] == {
+        "frame": None,
+        "time": None,
+        "objects": [shown, shown | {"name": "ben", "colour": PALETTE[1]}],
+    }
+
+
+def test_a_forgotten_object_leaves_the_page_with_its_surprising_frames(dashboard, facts):
+    for name in ("anna", "ben"):
+        dashboard.take(facts.model(1, 0, name), 0.0)
+    for frame in (1, 2):
+        for name in ("anna", "ben"):
+            dashboard.take(facts.track(frame, name=name), 0.1 * frame)
+    dashboard.take(facts.features(2, 1.0, "anna", "ben"), 0.2)
+    dashboard.take(facts.preview(2, "anna", "ben"), 0.2)
+    dashboard.take(facts.tracking(3, "ben"), 0.3)
+    parts = dashboard.updates({})
+    assert [one["name"] for one in parts["tracks"]["objects"]] == ["ben"]
+    assert [one["object"] for one in parts["surprising"]["frames"]] == ["ben"]
+    assert dashboard.newest == (facts.preview(2, "anna", "ben"), [facts.track(2, name="ben")])
+
+
+def test_a_restarted_detector_that_has_no_tracks_yet_drops_no_object(dashboard, facts):
+    for name in ("anna", "ben"):
+        dashboard.take(facts.track(5, name=name), 0.0)
+    dashboard.take(Health("detector", 1.0, {"sent": 6.0, "objects": 2.0}), 1.0)
+    assert names(dashboard) == ["anna", "ben"]
+
+
+def test_another_object_of_the_same_name_does_not_clear_the_others(dashboard, facts):
+    for name in ("anna", "ben"):
+        dashboard.take(facts.model(3, 0, name), 0.0)
+        dashboard.take(facts.track(5, name=name, version=3), 0.0)
+    dashboard.take(facts.features(5, 1.0, "anna", "ben"), 0.0)
+    dashboard.take(facts.preview(5, "anna", "ben"), 0.0)
+    dashboard.take(facts.track(6, name="anna", version=0, state="bootstrapping"), 0.1)
+    assert [one["object"] for one in dashboard.updates({})["surprising"]["frames"]] == ["ben"]
+    dashboard.take(facts.model(4, 5, "anna"), 0.2)
+    assert dashboard.objects.shown["anna"].model is None, "a model of frames before it is of the object before it"
+
+
+@given(
+    some.lists(
+        some.tuples(some.sampled_from(["frame", "begin", "forget", "report", "arrival"]), some.sampled_from("abc"))
+    )
+)
+def test_the_tracked_objects_are_shown_and_no_others_once_the_reports_have_arrived(facts, events):
+    dashboard, alive, seq, reports = Dashboard(), [], 0, []
+    for event, name in events:
+        if event == "begin" and name not in alive:
+            alive.append(name)
+        if event in ("frame", "begin"):
+            seq += 1
+            for each in alive:
+                dashboard.take(facts.track(seq - 1, name=each), float(seq))
+        elif event == "forget" and name in alive:
+            alive.remove(name)
+        elif event == "report":
+            reports.append(facts.tracking(float(seq), *alive))
+        elif event == "arrival" and reports:  # later than tracks that were sent after it
+            dashboard.take(reports.pop(0), float(seq))
+            assert set(alive) <= set(dashboard.objects.shown)
+    for report in (*reports, facts.tracking(float(seq), *alive)):
+        dashboard.take(report, float(seq))
+    assert set(dashboard.objects.shown) == set(alive)

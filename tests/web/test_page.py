@@ -1,4 +1,4 @@
-"""The page in a real browser: a box drawn with the mouse is followed, until the object leaves, and after a restart."""
+"""The page in a real browser: objects are drawn with the mouse, one is forgotten, one is tracked after a restart."""
 
 from __future__ import annotations
 
@@ -58,7 +58,9 @@ def browse(tmp_path):
         browser.stdout.close()
 
 
-def test_an_object_drawn_with_the_mouse_is_tracked_until_it_leaves_and_after_a_restart(browse, folder, tmp_path, until):
+def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_after_a_restart(
+    browse, folder, tmp_path, until
+):
     path, boxes = tmp_path / "demo.mp4", []
     with VideoWriter(path, RATE, SIZE) as video:
         for image, box in render(145, SIZE, begin=LEAVES - 120):
@@ -77,10 +79,11 @@ def test_an_object_drawn_with_the_mouse_is_tracked_until_it_leaves_and_after_a_r
 
             waits = {"present": 20, "absent": 5}  # how many frames of a state there are before the page is looked at
             for track in pipeline:
-                if track.state in waits:
+                if not track.object and track.state in waits:
                     waits[track.state] -= 1
                     if not waits[track.state]:
-                        until(lambda state=track.state: said(f"state {state}"))
+                        seen = {"present": "paused", "absent": "state absent"}[track.state]
+                        until(lambda seen=seen: said(seen))
                         del waits[track.state]
                 if not waits:
                     break
@@ -97,5 +100,8 @@ def test_an_object_drawn_with_the_mouse_is_tracked_until_it_leaves_and_after_a_r
                     until(lambda: "state present" in lines[seen:] and said("errors []"))
                     break
     assert lines[0] == "state waiting for a box"
+    assert "refused 'no name' is not a name: expected" in "\n".join(lines)
+    assert "objects object without a name,object-2" in lines
+    assert "forgotten object-2 is no longer tracked after frame N" in lines
     assert "surprising true" in lines
     assert "overflow 0" in lines

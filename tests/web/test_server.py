@@ -115,6 +115,32 @@ def test_the_server_is_healthy_alone_and_ready_with_all_processes(page, pipeline
     assert '\ncatstream_rejected_messages_total{process="trainer"} 1.0\n' in shown
 
 
+def test_what_is_counted_for_each_object_has_its_name_as_a_label(page, pipeline, facts, until):
+    objects = {"anna": {"rows": 3.0, "bytes": 9.0, "object_leaves": 1.0}, "ben": {"rows": 4.0, "object_leaves": 2.0}}
+
+    def shown():
+        pipeline["detector"].send(facts.tracking(time.monotonic(), "anna", "ben"))
+        pipeline["compressor"].send(Health("compressor", time.monotonic(), {"rows": 7.0}, objects=objects))
+        trained = {"ben": {"trained": 5.0}, "forgotten": {"trained": 6.0}}
+        pipeline["trainer"].send(Health("trainer", time.monotonic(), {}, objects=trained))
+        metrics = page.get("/metrics").text
+        return metrics if "catstream_models_trained_total{" in metrics and "catstream_rows_total{" in metrics else None
+
+    lines = until(shown).splitlines()
+    assert "catstream_objects 2.0" in lines
+    assert 'catstream_score{object="anna"} 0.75' in lines
+    assert 'catstream_present{object="ben"} 1.0' in lines
+    assert 'catstream_model_version{object="ben"} 1.0' in lines
+    assert [line for line in lines if line.startswith("catstream_rows_total")] == [
+        'catstream_rows_total{object="anna"} 3.0',
+        'catstream_rows_total{object="ben"} 4.0',
+    ]
+    assert 'catstream_tree_leaves{object="ben",tree="object"} 2.0' in lines
+    assert [line for line in lines if line.startswith("catstream_models_trained_total")] == [
+        'catstream_models_trained_total{object="ben"} 5.0'
+    ]
+
+
 def test_the_server_is_not_ready_if_one_process_is_silent(page, pipeline, until, monkeypatch):
     monkeypatch.setattr("catstream.web.dashboard.SILENCE_SECONDS", 0.5)
 

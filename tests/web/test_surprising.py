@@ -16,9 +16,9 @@ def selection(facts):
     return selection
 
 
-def add(selection, facts, frame, wrong):
-    selection.add_features(facts.features(frame, wrong))
-    selection.add_preview(facts.preview(frame))
+def add(selection, facts, frame, wrong, *names):
+    selection.add_features(facts.features(frame, wrong, *names))
+    selection.add_preview(facts.preview(frame, *names))
 
 
 def frames(selection):
@@ -66,3 +66,35 @@ def test_features_without_a_picture_are_dropped(selection, facts):
         selection.add_features(facts.features(frame, 1.0))
     assert not selection.add_preview(facts.preview(0))
     assert selection.add_preview(facts.preview(999))
+
+
+@pytest.fixture
+def two(facts):
+    """A selection of the frames of two objects."""
+    selection = SurprisingFrames()
+    for name in ("anna", "ben"):
+        selection.adopt(facts.model(1, 0, name))
+    return selection
+
+
+def test_one_frame_may_be_the_most_surprising_one_of_two_objects(two, facts):
+    add(two, facts, 10, 1.0, "anna", "ben")
+    add(two, facts, 12, 2.0, "ben")
+    assert [(one.frame, one.object) for one in two.frames] == [(10, "anna"), (12, "ben")]
+    assert two.measured == 3
+
+
+def test_an_object_that_is_not_in_the_picture_is_not_measured(two, facts):
+    two.add_features(facts.features(10, 1.0, "anna", "ben"))
+    two.add_preview(facts.preview(10, "ben"))
+    assert [(one.frame, one.object) for one in two.frames] == [(10, "ben")]
+
+
+def test_nothing_of_a_dropped_object_is_kept(two, facts):
+    add(two, facts, 10, 1.0, "anna", "ben")
+    two.add_features(facts.features(30, 1.0, "anna", "ben"))
+    two.drop({"anna"})
+    two.add_preview(facts.preview(30, "anna", "ben"))
+    add(two, facts, 50, 1.0, "anna", "ben")
+    assert {one.object for one in two.frames} == {"ben"}
+    assert two.measured == 3

@@ -58,19 +58,22 @@ export class Objects {
     choose.setAttribute("aria-pressed", String(name === this.chosen));
     add(choose, "i", { className: "swatch" });
     add(choose, "b", { textContent: name || "object without a name" });
-    const [state, score] = [add(choose, "span", { className: "state" }), add(choose, "span", { className: "score number" })];
+    const about = add(choose, "span", { className: "state" });
+    const [state, model] = [add(about, "span", {}), add(about, "span", { className: "model" })];
+    const score = add(choose, "span", { className: "score number" });
     const share = add(add(choose, "span", { className: "share" }), "i");
     const forget = add(element, "button", { type: "button", className: "forget", textContent: "Forget", onclick: () => this.actions.forget(name) });
     forget.setAttribute("aria-label", `Forget ${name || "the object without a name"}`);
-    return { element, choose, state, score, share };
+    return { element, choose, state, model, score, share };
   }
 
-  fill({ element, state, score, share }, one) {
+  fill({ element, state, model, score, share }, one) {
     element.style.setProperty("--colour", one.colour);
     element.dataset.state = one.state;
     share.style.width = `${100 * Math.max(0, Math.min(1, one.score))}%`;
     const write = (target, text) => target.textContent !== text && (target.textContent = text);
-    write(state, `${one.state}, model ${one.version}`);
+    write(state, one.state);
+    write(model, `, model ${one.version}`);
     write(score, one.score.toFixed(2));
   }
 }

@@ -199,7 +199,8 @@ export class Stage {
       const { colour } = this.objects.get(name);
       const scaled = box.map((side) => side * scale);
       outline(context, scaled, colour, wide / (single || name !== chosen ? 260 : 170));
-      if (!single) label(context, scaled, name || "no name", colour, wide);
+      const size = Math.max((13 * wide) / this.canvas.clientWidth, wide / 48);
+      if (!single) label(context, scaled, name || "no name", colour, size, wide);
     }
   }
 }
@@ -215,8 +216,7 @@ function outline(context, box, colour, width) {
 }
 
 /** Write a name above a box, or below its upper side if there is no room. */
-function label(context, [x, y], name, colour, wide) {
-  const size = Math.max(13, wide / 48);
+function label(context, [x, y], name, colour, size, wide) {
   context.font = `600 ${size}px system-ui, "DejaVu Sans", sans-serif`;
   const [across, down] = [Math.min(context.measureText(name).width + 0.8 * size, wide), 1.45 * size];
   const left = Math.max(0, Math.min(x - 1, wide - across));
