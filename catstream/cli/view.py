@@ -26,10 +26,11 @@ __all__ = ["view"]
 def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> None:
     """Watch and steer a running pipeline in a browser.
 
-    The page shows the picture with the box, the score, frames per second, the
-    coreset trees, and the most surprising frames. If you draw a box on the
-    picture, the pipeline tracks that object. If no pipeline runs, the page
-    waits for the next one. Ctrl-C ends the server; the pipeline continues.
+    The page shows the picture with the box of each object, the score, frames
+    per second, the coreset trees, and the most surprising frames. If you draw
+    a box on the picture, the pipeline tracks that object. If no pipeline runs,
+    the page waits for the next one. Ctrl-C ends the server; the pipeline
+    continues.
 
     If the host is not a loopback address, a token is required; the printed
     addresses end with it. The connection is not encrypted: use an ssh tunnel,
