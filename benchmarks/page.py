@@ -283,8 +283,8 @@ _SAVED = """
     both. `best` is the share of frames in which the best window of the whole frame overlaps the object by half, and
     `found` the share in which a run that starts with the model has a box that does. The models of `saved_models.py`
     are learned from the first third of a sequence; `stranger` is the share of frames of other sequences in which a box
-    is reported. The tables have the sequences that are not on the check list. See [Saved
-    models](how-to/saved-models.md)."""
+    is reported. Both were measured on ten short sequences that are not on the check list: see
+    [Saved models](how-to/saved-models.md)."""
 _INGREDIENTS = """
     The loss of AUC without one component; the largest losses of each run. A loss of less than two standard errors
     may be chance. The first run is on all 44 sequences, the second on the first 20, before decision 49."""
