@@ -99,7 +99,7 @@ def loadtest(
       p50 p95 p99 p99.9 max     seconds from a frame to its track, at most
       model-p50 ... model-max   seconds from a frame to the model trained on it, at most
       skipped                   share of frames that were not tracked, at most
-      missed                    share of tracks that fast subscribers missed, at most
+      missed                    share of frames whose tracks fast subscribers missed, at most
       recovery                  seconds from a kill to the next track, at most
       success                   share of frames with an overlap above 0.5, at least
 

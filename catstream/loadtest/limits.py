@@ -41,7 +41,7 @@ KINDS: dict[str, _Quantity] = {
         "share of frames that were not tracked",
         lambda result: max(stream.skipped_share for stream in result.streams),
     ),
-    "missed": _Quantity("share of tracks that fast subscribers missed", lambda result: result.missed_share),
+    "missed": _Quantity("share of frames whose tracks fast subscribers missed", lambda result: result.missed_share),
     "recovery": _Quantity("seconds from a kill to the next track", _recovery),
     "success": _Quantity(
         "share of frames with an overlap above 0.5",

@@ -220,8 +220,9 @@ def _subscribers(result: Result) -> str:
     received, missed = result.received or [0], result.missed or [0]
     return (
         f'<h2>Subscribers</h2><p class="about">{plan.subscribers} to each stream, of which {plan.slow} are slow; '
-        f"{plan.frozen} of these were frozen for {result.frozen:.0f} s. The fast ones received {min(received)} to "
-        f"{max(received)} tracks each, and missed {sum(missed)} in total, {max(missed)} at most.</p>"
+        f"{plan.frozen} of these were frozen for {result.frozen:.0f} s. The fast ones received the tracks of "
+        f"{min(received)} to {max(received)} frames each, and missed those of {sum(missed)} in total, "
+        f"{max(missed)} at most.</p>"
     )
 
 

@@ -61,7 +61,7 @@ class Result:
     restarts     total number of restarted processes
     recoveries   recovery of each kill
     usage        readings of each process, and of the load by processes outside the load test
-    received     number of tracks that each fast subscriber received; `missed` is the number that it missed
+    received     number of frames whose tracks each fast subscriber received; `missed` is the number that it missed
     frozen       seconds for which the frozen subscribers were stopped
     camera_late  largest delay in seconds of a frame that the camera itself caused
     errors       errors of failed streams
@@ -98,7 +98,7 @@ class Result:
 
     @property
     def missed_share(self) -> float:
-        """Share of the tracks that fast subscribers missed."""
+        """Share of the frames whose tracks fast subscribers missed."""
         return sum(self.missed) / max(1, sum(self.missed) + sum(self.received))
 
 

@@ -81,11 +81,11 @@ class Subscribers:
             process.join(max(0.0, deadline - monotonic()))
 
     def received(self) -> list[int]:
-        """Return the number of tracks that each fast subscriber has received."""
+        """Return the number of frames whose tracks each fast subscriber has received."""
         return list(self._received[: self._quick])
 
     def missed(self) -> list[int]:
-        """Return the number of tracks that each fast subscriber has missed, by the gaps in `seq`."""
+        """Return the number of frames whose tracks each fast subscriber has missed, by the gaps in `seq`."""
         return list(self._missed[: self._quick])
 
     def __enter__(self) -> Self:
@@ -116,9 +116,11 @@ def _read_until_end(
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     readers = {number: Subscriber(TRACKS, Endpoint.parse(endpoint, keys)) for number in numbers}
     gaps = {number: GapCounter() for number in numbers}
+    last = dict.fromkeys(numbers, 0)  # number of the last frame: the tracks of all objects in it have the same
     most, pause = pace
     for number, message in rounds(readers, pause, most):
         gaps[number].take(message.seq)
         missed[number] = gaps[number].missed
-        if not isinstance(message, End):
+        if not isinstance(message, End) and message.seq != last[number]:
             received[number] += 1
+            last[number] = message.seq
