@@ -45,7 +45,7 @@ __all__ = ["MAGIC", "Entry", "Index", "Topic", "end_of_data", "entries", "entry_
 #: The first and the last bytes of the file.
 MAGIC = b"\x89MCAP0\r\n"
 
-_LARGEST = 64 << 20  # bytes of a chunk; no message is as large
+_LARGEST = 512 << 20  # bytes of a chunk; no message is as large
 _RECORD = struct.Struct("<BQ")  # opcode and length, in front of each record
 _FACTS = struct.Struct("<HIQ")  # channel, sequence and time: the first fields of a message
 _BLOCK = 1 << 20  # bytes of the summary in memory

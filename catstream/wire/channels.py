@@ -102,9 +102,10 @@ class Channel(Generic[Message]):
 
 
 _ALL = ("detector", "compressor", "trainer")
+_FEATURES = 512  # MiB: an object takes 1.6 MB in its first frame, and there are at most 256
 
 FEATURES: Channel[Features | End] = Channel(
-    "features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=64
+    "features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES
 )
 SAMPLES: Channel[Sample | End] = Channel(
     "samples", (Sample, End), ("compressor",), None, "newest", port=1, megabytes=512, role="watch", high_water_mark=16
@@ -132,7 +133,7 @@ TRAINING: Channel[Run | Features | End] = Channel(
     None,
     "every",
     port=10,
-    megabytes=64,
+    megabytes=_FEATURES,
     role="watch",
     high_water_mark=64,
 )

@@ -36,7 +36,7 @@ HELLO = b""
 #: Seconds without a reply after which a sender asks for the position, and between two reports of a missing message.
 PATIENCE = 0.2
 
-_MAX_SAMPLES = 65536  # samples that a sender remembers, at most one a message: as many as `run.lag_frames` may be
+_MAX_CHANGES = 65536  # newest samples that a sender remembers until it is asked for them
 _MAX_ASKING = 64  # peers that may wait for a position at a time; any other asks again
 
 
@@ -87,7 +87,7 @@ class SendWindow:
         self._sent_before = 0  # newest seq that a sender before this one may have sent
         self._last_reply = now
         self.versions: dict[str, int] = {}
-        self._changes: deque[tuple[int, dict[str, int]]] = deque(maxlen=_MAX_SAMPLES)  # seq that led to these versions
+        self._changes: deque[tuple[int, str, int]] = deque()  # seq that led to a version of an object; 0: it is gone
         self._versions: dict[str, int] = {}  # that `samples_of` returned last
 
     def resume(self, seq: int, known: int) -> None:
@@ -147,10 +147,7 @@ class SendWindow:
             before = f"{self.taken} were processed and {self.acknowledged} acknowledged before"
             return Reject("acknowledgement", f"expected no step back ({before}), got {reply.taken} and {reply.seq}")
         self._last_reply = now
-        versions = {name: max(version, self.versions.get(name, 0)) for name, version in reply.versions.items()}
-        if versions != self.versions:
-            self.versions = versions
-            self._changes.append((self.taken + 1, versions))
+        self._note_samples(reply.versions)
         self._forget(reply)
         self.taken = min(reply.seq if isinstance(reply, Position) else reply.taken, self.sent)
         return None
@@ -161,8 +158,25 @@ class SendWindow:
         If the receiver did not reply to each message, a sample counts from the first message that it may be of.
         """
         while self._changes and self._changes[0][0] <= seq:
-            self._versions = self._changes.popleft()[1]
-        return self._versions
+            self._count_oldest()
+        return dict(self._versions)
+
+    def _count_oldest(self) -> None:
+        """Count the oldest change."""
+        _, name, version = self._changes.popleft()
+        self._versions[name] = version
+        if not version:
+            del self._versions[name]
+
+    def _note_samples(self, replied: dict[str, int]) -> None:
+        """Remember which versions are new with a reply; those of an object never fall while it is named."""
+        before = self.versions
+        self.versions = {name: max(version, before.get(name, 0)) for name, version in replied.items()}
+        for name in before.keys() | self.versions.keys():
+            if (version := self.versions.get(name, 0)) != before.get(name, 0):
+                self._changes.append((self.taken + 1, name, version))
+                if len(self._changes) > _MAX_CHANGES:
+                    self._count_oldest()
 
     def _go_back(self, position: Position) -> None:
         """Transmit everything again that the receiver has not."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import struct
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgpack
 import numpy as np
@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from catstream.box import Box, Window
+from catstream.detection.objects import Detectors
 from catstream.errors import ProtocolError
+from catstream.features.pyramid import Pyramid
 from catstream.messages import (
     Answer,
     Command,
@@ -38,6 +40,9 @@ from catstream.messages import (
     TrainingRows,
 )
 from catstream.schema import LARGEST_INTEGER, Array, ByObject, Bytes, Field, Name, Named, OnlyWith, Whole, fields
+from catstream.settings import RunSettings, Settings
+from catstream.video.source import open_source
+from catstream.wire.channels import FEATURES, TRAINING
 from catstream.wire.codec import KINDS, VERSION, decode, encode
 
 
@@ -209,6 +214,16 @@ def test_arrays_travel_row_by_row_whatever_their_layout():
     message = Features(3, 2, 0.08, {"": ObjectFeatures(BOX, {"appearance": rows})})
     arrived = decode(encode(message), Features)
     np.testing.assert_array_equal(arrived.objects[""].training["appearance"].rows, array(3, 5))
+
+
+def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel(demo_video):
+    path, (box, *_) = demo_video(50)
+    detectors = Detectors(Settings())
+    with open_source(str(path)) as frames:
+        pyramid = Pyramid.of(next(iter(frames)).image)
+    _, features = detectors.step(pyramid, given={"": detectors.begin("", pyramid, box)})
+    (limit,) = get_type_hints(RunSettings, include_extras=True)["objects_most"].__metadata__
+    assert limit.le * len(encode(features)) < FEATURES.limit == TRAINING.limit
 
 
 def test_a_field_of_a_later_version_is_ignored():

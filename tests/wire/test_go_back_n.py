@@ -227,6 +227,7 @@ class Histories(RuleBasedStateMachine):
         if self.senders:
             assert len(self.receiver._asking) <= 64
             assert len(self.sender._changes) <= 65536
+            assert len(self.sender._versions) <= 2
 
     def teardown(self):
         """Once nothing is lost any more, everything that was sent is taken and stored."""
