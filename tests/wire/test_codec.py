@@ -42,7 +42,7 @@ from catstream.messages import (
 from catstream.schema import LARGEST_INTEGER, Array, ByObject, Bytes, Field, Name, Named, OnlyWith, Whole, fields
 from catstream.settings import RunSettings, Settings
 from catstream.video.source import open_source
-from catstream.wire.channels import FEATURES, TRAINING
+from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
 
 
@@ -223,7 +223,7 @@ def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel(demo
         pyramid = Pyramid.of(next(iter(frames)).image)
     _, features = detectors.step(pyramid, given={"": detectors.begin("", pyramid, box)})
     (limit,) = get_type_hints(RunSettings, include_extras=True)["objects_most"].__metadata__
-    assert limit.le * len(encode(features)) < FEATURES.limit == TRAINING.limit
+    assert limit.le * len(encode(features)) < CHANNELS["features"].limit == CHANNELS["training"].limit
 
 
 def test_a_field_of_a_later_version_is_ignored():
