@@ -107,8 +107,9 @@ def every(record: Record) -> Iterator[Table]:
 
 def merged(record: Record) -> Iterator[Table]:
     """Select the means of the models of parts of a sequence, and the differences between them."""
-    yield from select(columns=(), without="(?!mean)")(record)
-    yield from select(1)(record)
+    yield from select(without="(?!mean)")(record)
+    differences = record["tables"][1]
+    yield Table("", differences["columns"], differences["rows"])
 
 
 def means_only(record: Record) -> Iterator[Table]:
