@@ -23,9 +23,9 @@ class ShownObject:
     """
 
     colour: str
-    state: State
-    score: float
-    version: int
+    state: State = "absent"
+    score: float = 0.0
+    version: int = 0
     seq: int = 0
     model: Model | None = None
     model_latency: float | None = None
@@ -55,7 +55,7 @@ class Objects:
             if (model := self._models.get(name)) is not None and model.frame < track.frame:
                 del self._models[name]
         if before is None or begins:
-            self.shown[name] = ShownObject(self.colours.of(name), track.state, track.score, track.model_version)
+            self.shown[name] = ShownObject(self.colours.of(name))
         each = self.shown[name]
         each.state, each.score, each.version, each.seq = track.state, track.score, track.model_version, track.seq
         each.model = self._models.get(name)

@@ -16,8 +16,14 @@ import cv2
 import numpy as np
 import pytest
 
+from catstream.detection.objects import Detectors
 from catstream.errors import ServiceError
+from catstream.features.pyramid import Pyramid
 from catstream.messages import Health
+from catstream.services.commands import CommandHandler
+from catstream.services.control import CommandChannel
+from catstream.services.desired import DesiredState
+from catstream.settings import Settings
 from catstream.web.dashboard import Dashboard
 from catstream.web.guard import Guard, TokenBucket
 from catstream.web.server import Server
@@ -267,6 +273,33 @@ def test_malformed_json_is_rejected_like_any_invalid_command(page, body):
     answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 400
     assert "expected" in answer.json()["reason"]
+
+
+def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered(page, pipeline, folder, until, rng):
+    handler = CommandHandler(Detectors(Settings(run={"objects_most": 2})), DesiredState())
+    frame = Pyramid.of(rng.integers(0, 255, (120, 160, 3), np.uint8))
+    with CommandChannel(Endpoint.parse(str(folder)), handler, None) as channel, ThreadPoolExecutor(1) as pool:
+
+        def answer(verb, name, **more):
+            asked = pool.submit(page.post, "/control", json={"verb": verb, "object": name, **more})
+            while not asked.done():
+                channel.carry_out()
+                channel.begin(frame, 0.0)
+            return asked.result().status_code, asked.result().json()["reason"]
+
+        def attached():
+            pipeline["detector"].send(Health("detector", time.monotonic(), {}))
+            return "\ncatstream_up 1.0\n" in page.get("/metrics").text
+
+        until(attached)
+        for name in ("anna", "ben"):
+            assert answer("set-box", name, box=[40, 30, 48, 48])[0] == 200
+        status, reason = answer("set-box", "carl", box=[40, 30, 48, 48])
+        assert (status, "3 objects are more than 2" in reason) == (409, True)
+        status, reason = answer("forget", "carl")
+        assert (status, "there is no object 'carl'" in reason) == (409, True)
+        assert answer("forget", "ben")[0] == 200
+        assert list(handler.desired.objects) == ["anna"]
 
 
 def test_commands_above_the_rate_limit_are_rejected(page):

@@ -74,24 +74,28 @@ async function follow(box, leave) {
 }
 
 function showDrawing(drawing, box) {
-  if (drawing && $("#drawing").hidden) offerRoles();
+  if (drawing && $("#drawing").hidden) {
+    const first = !objects.list.length;
+    $("#name").value = first ? "" : objects.suggestion;
+    $("#name").placeholder = first ? "optional" : "";
+    offerRoles(objects.single ? "another" : "new");
+  }
   $("#watching").hidden = drawing;
   $("#drawing").hidden = !drawing;
   $("#follow").disabled = !box;
 }
 
-/** Offer what the drawn box may be: a new object, or the chosen one. */
-function offerRoles() {
-  const name = objects.chosen;
-  const option = (value, text) => Object.assign(document.createElement("option"), { value, textContent: text });
-  const another = option("another", name ? `another object as ${name}` : "another object in its place");
-  const roles = [option("new", objects.single ? "one more object" : "a new object"),
-    option("keep", name ? `the same ${name}: keep what was learned` : "the same object: keep what was learned"), another];
-  $("#role").replaceChildren(...(objects.list.length ? roles : roles.slice(0, 1)));
-  $("#role").value = objects.single && objects.list.length ? "another" : "new";
-  $("#role").parentElement.hidden = !objects.list.length; // the first object is a new one
-  $("#name").value = objects.list.length ? objects.suggestion : "";
-  $("#name").placeholder = objects.list.length ? "" : "optional";
+/** Offer what the drawn box may be: a new object, or the chosen one. The first object is a new one. */
+function offerRoles(role) {
+  const name = objects.chosen, count = objects.list.length;
+  const roles = Object.entries({
+    new: objects.single ? "one more object" : "a new object",
+    keep: `the same ${name || "object"}: keep what was learned`,
+    another: name ? `another object as ${name}` : "another object in its place",
+  });
+  $("#role").replaceChildren(...roles.slice(0, count ? 3 : 1).map(([value, textContent]) => Object.assign(document.createElement("option"), { value, textContent })));
+  $("#role").value = count ? role : "new";
+  $("#role").parentElement.hidden = !count;
   showRole();
 }
 
@@ -109,6 +113,7 @@ function askToForget(name) {
 function showChosen(name) {
   charts.choose(name);
   trees.choose(name);
+  if (stage.drawing) offerRoles($("#role").value);
   showFrame();
   showObjects();
 }
