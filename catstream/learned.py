@@ -1,7 +1,7 @@
 """A saved model: everything that was learned of one object, as one file.
 
 The file contains the coreset trees whole, with the energy that they have lost, and the model that was trained from
-them. Tracking goes on from it in another video, as if the frames had come from one stream.
+them. A run in another video continues from it, as if the frames of both had come from one stream.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import combinations
 from pathlib import Path
 from typing import Self
 
@@ -141,13 +142,17 @@ class Learned:
         Raises
         ------
         ServiceError
-            If it does not exist.
+            If it does not exist, or cannot be read.
         ProtocolError
             If it is damaged, another file, or one of other features.
         """
         if not Path(path).is_file():
             raise ServiceError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
-        return cls.from_bytes(Path(path).read_bytes(), str(path))
+        try:
+            data = Path(path).read_bytes()
+        except OSError as error:
+            raise ServiceError(f"cannot read {str(path)!r} ({error.strerror}): give another file") from None
+        return cls.from_bytes(data, str(path))
 
     @classmethod
     def from_bytes(cls, data: bytes, name: str) -> Self:
@@ -201,6 +206,8 @@ def merge(parts: Sequence[Learned]) -> Learned:
     the energy that the merge itself loses; both are in its `dropped_energy`. The order of the parts does not matter
     for the numbers of rows; the rows themselves may differ within the bound.
 
+    The size is the geometric mean of the sizes. An object without a name may be merged with one that has a name.
+
     Raises
     ------
     SettingsError
@@ -208,10 +215,27 @@ def merge(parts: Sequence[Learned]) -> Learned:
     """
     if len(parts) < 2:
         raise SettingsError(f"{len(parts)} saved model given: a merge needs two or more")
-    return reduce(_merged, parts)
+    for one, other in combinations(parts, 2):
+        _check_merge(one, other)
+    first = parts[0]
+    trees = {head: reduce(CoresetTree.merged, [part.trees[head] for part in parts]) for head in HEADS}
+    name = next((part.object for part in parts if part.object), "")
+    centres = next((part.centres for part in parts if len(part.centres)), first.centres)
+    version = max(part.model.version for part in parts)
+    width, height = np.exp(np.mean(np.log([part.box[2:] for part in parts]), axis=0))  # the geometric means
+    return replace(
+        first,
+        object=name,
+        trees=trees,
+        centres=centres,
+        origins=tuple(origin for part in parts for origin in part.origins),
+        box=first.box.scaled(float(width) / first.box.w, float(height) / first.box.h),
+        model=_trained(trees, centres, version, name, first.settings),
+    )
 
 
-def _merged(one: Learned, other: Learned) -> Learned:
+def _check_merge(one: Learned, other: Learned) -> None:
+    """Raise SettingsError if two saved models cannot be merged."""
     if one.object and other.object and one.object != other.object:
         raise SettingsError(
             f"one saved model is of {one.object!r}, another of {other.object!r}: "
@@ -223,20 +247,6 @@ def _merged(one: Learned, other: Learned) -> Learned:
             "two of the saved models have learned from the same frames, which would count twice: "
             "merge models of different videos"
         )
-    trees = {name: one.trees[name].merged(other.trees[name]) for name in HEADS}
-    version = max(one.model.version, other.model.version)
-    centres, name = one.centres if len(one.centres) else other.centres, one.object or other.object
-    # The geometric mean of the sizes does not depend on the order.
-    scale = np.sqrt(np.divide(other.box[2:], one.box[2:]))
-    return replace(
-        one,
-        object=name,
-        trees=trees,
-        centres=centres,
-        origins=one.origins + other.origins,
-        box=one.box.scaled(*map(float, scale)),
-        model=_trained(trees, centres, version, name, one.settings),
-    )
 
 
 def _trained(trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings) -> Model:

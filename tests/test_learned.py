@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from itertools import islice
 
 import numpy as np
@@ -172,7 +173,15 @@ def test_the_order_of_a_merge_changes_no_count(learned):
             assert tree.rows_seen == learned.trees[name].rows_seen + other.trees[name].rows_seen
             assert_sums = learned.trees[name].sum + other.trees[name].sum
             np.testing.assert_allclose(tree.sum, assert_sums, rtol=1e-9, atol=1e-6)
-        assert np.sqrt(merged.box.area) == pytest.approx(np.sqrt(BOX.area))
+        assert (merged.box.w, merged.box.h) == pytest.approx((BOX.w, BOX.h))
+
+
+def test_the_size_of_a_merged_object_is_the_geometric_mean_in_any_order(learned):
+    large = dataclasses.replace(learn(stream(2)), box=BOX.scaled(4, 2))
+    larger = dataclasses.replace(learn(stream(3)), box=BOX.scaled(16, 4))
+    for parts in ([learned, large, larger], [larger, learned, large]):
+        box = merge(parts).box
+        assert (box.w, box.h) == pytest.approx((4 * BOX.w, 2 * BOX.h))
 
 
 def test_frames_cannot_be_merged_twice(learned, messages):
