@@ -18,6 +18,7 @@ EXTRAS = {
     "loadtest": ("the load test", ("hdrh", "psutil")),
     "parquet": ("a Parquet file", ("pyarrow",)),
     "supervision": ("to_supervision", ("supervision",)),
+    "mot": ("the accuracy of several objects", ("motmetrics",)),
 }
 
 

@@ -35,7 +35,7 @@ LEVELS = [
 #: The files or folders that may import a foreign library.
 IMPORTERS = {
     "numpy": ["catstream", "services"],
-    "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py"],
+    "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py", "catstream/evaluation/multiple.py"],
     "cv2": [
         "catstream/features",
         "catstream/detection",
@@ -53,6 +53,7 @@ IMPORTERS = {
     "safetensors": ["catstream/storage.py"],
     "pyarrow": ["catstream/sinks/parquet.py"],
     "supervision": ["catstream/adapters.py"],
+    "motmetrics": ["catstream/evaluation/multiple.py"],
     "av": ["catstream/video"],
     "zmq": [
         "catstream/wire/socket.py",
@@ -77,7 +78,7 @@ IMPORTERS = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"filelock", "sklearn", "av", "scipy", "filterpy", "pyarrow", "supervision"}
+SLOW = {"filelock", "sklearn", "av", "scipy", "filterpy", "pyarrow", "supervision", "motmetrics"}
 
 #: Modules of I/O, threads, clocks and randomness, which a stage does not import.
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
