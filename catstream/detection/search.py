@@ -194,7 +194,7 @@ def seek(
     )
     if state.sightings < limits.sighting_frames:
         return state, best
-    found = replace(_at_likely_size(frame, best, model, likeness), redetected=True)
+    found = replace(_at_likely_size(frame, best, model, likeness), score=best.score, redetected=True)
     return replace(state, window=found.window, first_window=found.window), found
 
 
