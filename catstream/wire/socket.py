@@ -7,8 +7,10 @@ connects needs a key with the role of the channel (`catstream.wire.zap`).
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Callable
-from typing import Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
+from weakref import WeakSet
 
 import zmq
 
@@ -41,6 +43,18 @@ _OPTIONS = {
 Message = TypeVar("Message")
 Kind = TypeVar("Kind")
 
+_OPEN: WeakSet[ChannelSocket[Any]] = WeakSet()  # sockets that were not closed yet
+
+
+@atexit.register
+def _transmit_rest() -> None:
+    """Wait until the messages that closed sockets have queued are transmitted, at most `LINGER_MILLISECONDS`.
+
+    They are transmitted by a thread of ZeroMQ from the memory of Python, which is freed when the process ends.
+    """
+    if not _OPEN:
+        zmq.Context.instance().term()
+
 
 class ChannelSocket(Generic[Message]):
     """One ZeroMQ socket of a channel.
@@ -64,6 +78,7 @@ class ChannelSocket(Generic[Message]):
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
         self._monitor: Monitor | None = None
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+        _OPEN.add(self)
         for option, value in _OPTIONS.items():
             self._socket.set(option, value)
         self._socket.set(zmq.IPV6, int("[" in str(endpoint)))
@@ -77,6 +92,7 @@ class ChannelSocket(Generic[Message]):
 
     def close(self) -> None:
         """Transmit what is queued, then close; the address is free for the next socket."""
+        _OPEN.discard(self)
         if self._listens:
             self._socket.close()
             # libzmq stops listening some time later, and would remove the socket file of the next one with its own.
