@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
@@ -76,3 +77,10 @@ class Storing(RuleBasedStateMachine):
 
 
 TestStoring = Storing.TestCase
+
+
+@given(took=st.integers(0, 60), interval=st.integers(1, 20), later=st.integers(0, 1000))
+def test_at_most_a_tenth_of_the_time_is_spent_writing(took, interval, later):
+    progress = Progress(Position(1), 1, 0.0).after(Position(2), 100.0, 100.0 + took, saved=True, urgent=False)
+    due = progress.is_due(3, 100.0 + took + later, interval)
+    assert due == (later >= interval and took * 10 <= took + later)
