@@ -245,11 +245,14 @@ def average_precision(answers: list[Answer]) -> float:
 
 
 def recall_at(answers: list[Answer], rate: float) -> float:
-    """Share of the frames with the object in which it is found, if there is a false alarm in `rate` of all frames."""
-    scores, right, present = marked(answers)
-    wrong = np.sort(scores[~right])[::-1]
-    allowed = int(rate * len(answers))
+    """Share of the frames with the object in which it is found, if `rate` of the frames without it have a false alarm."""
+    alarms = [
+        max((score for score, _ in answer.sightings), default=-np.inf) for answer in answers if not answer.present
+    ]
+    wrong = np.sort(alarms)[::-1]
+    allowed = int(rate * len(wrong))
     threshold = wrong[allowed] if allowed < len(wrong) else -np.inf
+    scores, right, present = marked([answer for answer in answers if answer.present])
     return float((scores[right] > threshold).sum() / max(present, 1))
 
 
