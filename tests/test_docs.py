@@ -150,13 +150,12 @@ def test_the_tree_of_files_is_complete_and_current():
     assert not gone, f"docs/architecture.md, the modules: remove {', '.join(gone)}"
 
 
-def test_every_file_that_track_writes_is_explained(tmp_path):
-    from catstream.video.results import ResultsWriter
+def test_every_file_that_track_writes_is_explained():
+    from catstream.video.results import result_files
 
-    with ResultsWriter(tmp_path, "NAME"):
-        names = [path.name for path in tmp_path.iterdir()]
-    for name in [*names, "NAME.mp4"]:
-        assert f"`{name}`" in page("docs/tutorial.md"), f"docs/tutorial.md does not say what is in {name}"
+    for of, objects in (("docs/tutorial.md", [""]), ("docs/how-to/several-objects.md", ["anna"])):
+        for name in [*result_files("NAME", objects), "NAME.mp4"]:
+            assert f"`{name}`" in page(of), f"{of} does not say what is in {name}"
 
 
 def errors_on(check: Callable[[Path], Iterator[str]]) -> str:
