@@ -245,7 +245,7 @@ def average_precision(answers: list[Answer]) -> float:
 
 
 def recall_at(answers: list[Answer], rate: float) -> float:
-    """Share of the frames with the object in which it is found, if `rate` of the frames without it have a false alarm."""
+    """Recall in the frames with the object, if `rate` of the frames without it have a false alarm."""
     alarms = [
         max((score for score, _ in answer.sightings), default=-np.inf) for answer in answers if not answer.present
     ]
