@@ -8,15 +8,19 @@ import os
 import pty
 import select
 import signal
+import threading
 import time
 
 import pytest
 
 from catstream.features.cells import row_length
-from catstream.messages import Track
+from catstream.messages import End, Health, Track
 from catstream.pipeline import Pipeline
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
+from catstream.wire.channels import HEALTH, TRACKS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import Publisher
 
 SECONDS = 60  # that anything may take on a busy machine
 
@@ -56,6 +60,58 @@ def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(v
     assert len(lines) == 3
     assert all(word in lines[0] for word in ("frame ", "background ", "appearance ", "extent "))
     assert (tracks.returncode, features.returncode) == (0, 0)
+
+
+@pytest.fixture
+def two_objects(folder):
+    """The endpoint of a pipeline of anna and an object without a name, whose source ends after four frames."""
+    endpoint, over = Endpoint.parse(str(folder)), threading.Event()
+
+    def run():
+        with Publisher(TRACKS, endpoint) as tracks, Publisher(HEALTH, endpoint, "detector") as health:
+            sent = False
+            while not over.wait(0.01):
+                health.send(Health("detector", time.time()))
+                tracks.serve_late_joiners()
+                if not sent and len(tracks._subscribed) == 2:  # to its tracks, and to their end
+                    for seq in range(1, 5):
+                        for name in ("anna", ""):
+                            tracks.send(Track(seq, seq - 1, 0.1, "absent", None, 0.0, 0, object=name))
+                    tracks.send(End(5, "the source has ended"))
+                    sent = True
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield folder
+    over.set()
+    thread.join()
+
+
+@pytest.mark.parametrize(
+    ("options", "objects"),
+    [((), ["anna", ""] * 4), (("--object", "anna"), ["anna"] * 4), (("--object", ""), [""] * 4)],
+    ids=["all", "anna", "without a name"],
+)
+def test_all_objects_are_watched_or_one(two_objects, said, options, objects):
+    code, output, errors = said("watch", "tracks", *options, "--endpoint", two_objects, "--json")
+    assert (code, errors) == (0, f"{len(objects)} tracks, 0 missed: the source has ended\n")
+    assert [json.loads(line)["object"] for line in output.splitlines()] == objects
+
+
+def test_the_name_of_an_object_is_shown_if_it_has_one(two_objects, said):
+    _, output, _ = said("watch", "tracks", "--endpoint", two_objects)
+    assert [line.startswith("object anna  frame ") for line in output.splitlines()] == [True, False] * 4
+
+
+def test_an_object_of_a_channel_without_objects_and_a_name_that_is_none_are_errors_of_one_line(said, tmp_path):
+    for arguments, expected in (
+        (("health", "--object", "anna"), "catstream: a message of health is about all objects: subscribe to "),
+        (("tracks", "--object", "an na"), "catstream: 'an na' is not a name: expected "),
+    ):
+        code, output, errors = said("watch", *arguments, "--endpoint", tmp_path)
+        assert (code, output) == (1, "")
+        assert errors.startswith(expected)
+        assert errors.count("\n") == 1
 
 
 def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):

@@ -41,7 +41,7 @@ from catstream.messages import (
 )
 from catstream.schema import LARGEST_INTEGER, Array, ByObject, Bytes, Field, Name, Named, OnlyWith, Whole, fields
 from catstream.settings import RunSettings, Settings
-from catstream.video.source import open_source
+from catstream.video import demo
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
 
@@ -216,11 +216,9 @@ def test_arrays_travel_row_by_row_whatever_their_layout():
     np.testing.assert_array_equal(arrived.objects[""].training["appearance"].rows, array(3, 5))
 
 
-def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel(demo_video):
-    path, (box, *_) = demo_video(50)
-    detectors = Detectors(Settings())
-    with open_source(str(path)) as frames:
-        pyramid = Pyramid.of(next(iter(frames)).image)
+def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel():
+    detectors, ((image, box),) = Detectors(Settings()), demo.render(1, (320, 240))
+    pyramid = Pyramid.of(image)
     _, features = detectors.step(pyramid, given={"": detectors.begin("", pyramid, box)})
     (limit,) = get_type_hints(RunSettings, include_extras=True)["objects_most"].__metadata__
     assert limit.le * len(encode(features)) < CHANNELS["features"].limit == CHANNELS["training"].limit
