@@ -143,7 +143,7 @@ def _learn(
 
 
 def _training_cells(result: Retraining) -> list[str]:
-    levels = ", ".join(" ".join(filter(None, [name, *map(str, own)])) for name, own in result.levels.items())
+    levels = "\n".join(" ".join(filter(None, [name, *map(str, own)])) for name, own in result.levels.items())
     rows, megabytes = result.counters["rows"], result.counters["bytes"] / 1e6
     return [f"{rows:.0f}", levels, f"{megabytes:.1f}", f"{result.seconds:.2f}"]
 
