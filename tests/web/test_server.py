@@ -92,7 +92,18 @@ def test_the_page_loads_nothing_from_other_hosts_and_has_no_inline_script(page):
 
 
 @pytest.mark.parametrize(
-    "name", ["style.css", "page.js", "stage.js", "objects.js", "charts.js", "trees.js", "surprising.js", "svg.js"]
+    "name",
+    [
+        "style.css",
+        "page.js",
+        "boxform.js",
+        "stage.js",
+        "objects.js",
+        "charts.js",
+        "trees.js",
+        "surprising.js",
+        "svg.js",
+    ],
 )
 def test_each_file_of_the_page_has_its_content_type(page, name):
     answer = page.get(f"/page/{name}")

@@ -1,5 +1,6 @@
 // Passes updates of the server to the parts of the page, and commands of the user to the pipeline.
 
+import { BoxForm } from "./boxform.js";
 import { Charts } from "./charts.js";
 import { Objects } from "./objects.js";
 import { Stage } from "./stage.js";
@@ -11,6 +12,7 @@ const charts = new Charts($(".charts"));
 const trees = new Trees($(".trees"), $("#tree-summary"));
 const surprising = new SurprisingFrames($(".surprising"), $("#surprising-summary"));
 const objects = new Objects($(".objects"), { choose: showChosen, forget: askToForget });
+const form = new BoxForm(objects);
 const stage = new Stage($("#stage"), $("#picture"), objects, { pause, follow, changed: showDrawing });
 let status = { phase: "waiting" };
 let frame = null; // number and time of the newest frame
@@ -56,14 +58,12 @@ async function pause() {
 
 /** Send the box, as that of a new object or of the chosen one. */
 async function follow(box, leave) {
-  const role = $("#role").value;
-  const name = role === "new" ? $("#name").value.trim() : objects.chosen ?? "";
-  if (role === "new" && objects.list.length && (!name || objects.get(name))) {
-    showMessage(name ? `There is an object ${name} already: give another name.` : "Give the new object a name.", true);
-    $("#name").focus();
+  if (form.error) {
+    showMessage(form.error, true);
+    form.name.focus();
     return false;
   }
-  const answer = await sendCommand("set-box", { object: name, box: box.map((side) => Math.round(side * 10) / 10), keep: role === "keep" });
+  const answer = await sendCommand("set-box", { ...form.fields, box: box.map((side) => Math.round(side * 10) / 10) });
   if (!answer) return false;
   objects.choose(answer.object);
   if (leave) {
@@ -74,33 +74,10 @@ async function follow(box, leave) {
 }
 
 function showDrawing(drawing, box) {
-  if (drawing && $("#drawing").hidden) {
-    const first = !objects.list.length;
-    $("#name").value = first ? "" : objects.suggestion;
-    $("#name").placeholder = first ? "optional" : "";
-    offerRoles(objects.single ? "another" : "new");
-  }
+  if (drawing && $("#drawing").hidden) form.begin();
   $("#watching").hidden = drawing;
   $("#drawing").hidden = !drawing;
   $("#follow").disabled = !box;
-}
-
-/** Offer what the drawn box may be: a new object, or the chosen one. The first object is a new one. */
-function offerRoles(role) {
-  const name = objects.chosen, count = objects.list.length;
-  const roles = Object.entries({
-    new: objects.single ? "one more object" : "a new object",
-    keep: `the same ${name || "object"}: keep what was learned`,
-    another: name ? `another object as ${name}` : "another object in its place",
-  });
-  $("#role").replaceChildren(...roles.slice(0, count ? 3 : 1).map(([value, textContent]) => Object.assign(document.createElement("option"), { value, textContent })));
-  $("#role").value = count ? role : "new";
-  $("#role").parentElement.hidden = !count;
-  showRole();
-}
-
-function showRole() {
-  $("#name").parentElement.hidden = $("#role").value !== "new";
 }
 
 function askToForget(name) {
@@ -113,7 +90,7 @@ function askToForget(name) {
 function showChosen(name) {
   charts.choose(name);
   trees.choose(name);
-  if (stage.drawing) offerRoles($("#role").value);
+  if (stage.drawing) form.offer();
   showFrame();
   showObjects();
 }
@@ -248,8 +225,7 @@ function listen() {
 $("#draw").onclick = () => { $("#stage").focus(); stage.begin(); };
 $("#follow").onclick = () => stage.accept();
 $("#cancel").onclick = () => stage.cancel();
-$("#role").onchange = () => showRole();
-$("#name").onkeydown = (event) => {
+form.name.onkeydown = (event) => {
   if (event.key === "Enter") stage.accept();
   if (event.key === "Escape") stage.cancel();
 };
