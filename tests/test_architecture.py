@@ -56,6 +56,7 @@ IMPORTERS = {
     "motmetrics": ["catstream/evaluation/multiple.py"],
     "av": ["catstream/video"],
     "zmq": [
+        "catstream/wire/context.py",
         "catstream/wire/socket.py",
         "catstream/wire/acknowledged.py",
         "catstream/wire/newest.py",

@@ -17,6 +17,7 @@ import zmq
 from catstream.errors import ProtocolError, ServiceError
 from catstream.wire.channels import Channel
 from catstream.wire.codec import decode
+from catstream.wire.context import context
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.monitor import Event, Monitor
 from catstream.wire.rejects import count, reject
@@ -53,7 +54,7 @@ def _transmit_rest() -> None:
     They are transmitted by a thread of ZeroMQ from the memory of Python, which is freed when the process ends.
     """
     if not _OPEN:
-        zmq.Context.instance().term()
+        context().term()
 
 
 class ChannelSocket(Generic[Message]):
@@ -77,7 +78,7 @@ class ChannelSocket(Generic[Message]):
         self._listens = False
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
         self._monitor: Monitor | None = None
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+        self._socket: zmq.Socket[bytes] = context().socket(kind)
         _OPEN.add(self)
         for option, value in _OPTIONS.items():
             self._socket.set(option, value)

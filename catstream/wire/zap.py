@@ -18,6 +18,7 @@ from zmq.utils import z85
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import Channel
+from catstream.wire.context import context
 from catstream.wire.keys import ROLES, Keys
 from catstream.wire.rejects import reject
 
@@ -43,7 +44,7 @@ class ZapHandler:
             domain = f"{channel.name} {next(self._numbers)}".encode()
             self._sockets[domain] = channel, keys
             if self._thread is None:
-                socket = _socket(zmq.REP)
+                socket = context().socket(zmq.REP)
                 socket.bind(_ADDRESS)
                 self._thread = threading.Thread(target=self._serve, args=(socket,), name="zap", daemon=True)
                 self._thread.start()
@@ -54,7 +55,7 @@ class ZapHandler:
         with self._lock:
             self._sockets.pop(domain, None)
             if self._thread is not None and not self._sockets:
-                with _socket(zmq.REQ) as last:
+                with context().socket(zmq.REQ) as last:
                     last.connect(_ADDRESS)
                     last.send(b"")
                     self._thread.join()
@@ -88,10 +89,6 @@ class ZapHandler:
             reject(channel.name, "role", text, once=public)
             return _DENIED, b""
         return _ALLOWED, name.encode()
-
-
-def _socket(kind: int) -> zmq.Socket[bytes]:
-    return zmq.Context.instance().socket(kind)
 
 
 #: The handler of this process: libzmq asks one for each context.
