@@ -143,4 +143,5 @@ def prints_well_and_is_ready_for_json(track):
         "score": track.score,
         "model_version": 0,
         "pts": None,
+        "object": "",
     }
