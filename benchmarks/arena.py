@@ -47,7 +47,7 @@ LINKS = {
 }
 
 _PATIENCE_SECONDS = 120.0  # the run counts as stuck after this time without a track
-_DISK = "128m"  # size of the small disk: a few checkpoints, as a new one is written before the old one is removed
+_DISK = 128  # megabytes of the small disk for each object: three checkpoints, as the oldest of them is removed last
 #: The module `sitecustomize` of each process: it shifts the wall clock by the seconds in a file. Monotonic clocks are
 #: unchanged, as they are if an administrator or NTP sets the clock.
 _CLOCK = """
@@ -286,8 +286,8 @@ class Arena:
 
 
 @contextmanager
-def small_disk(folder: Path) -> Iterator[Path]:
-    """Mount a small file system on a folder; needs root.
+def small_disk(folder: Path, objects: int = 1) -> Iterator[Path]:
+    """Mount a file system on a folder that is small, but large enough for the checkpoints of some objects; needs root.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def small_disk(folder: Path) -> Iterator[Path]:
         If it cannot be mounted.
     """
     folder.mkdir(exist_ok=True)
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={_DISK},mode=0700", "catstream", str(folder)]
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={_DISK * objects}m,mode=0700", "catstream", str(folder)]
     done = subprocess.run(mount, capture_output=True, text=True, check=False)
     if done.returncode:
         raise OSError(f"a small disk cannot be mounted: {done.stderr.strip()}")

@@ -218,7 +218,7 @@ def endure(source: str, boxes: dict[str, Box], settings: Settings, faults: list[
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-arena-")))
         if FULL in faults:
             try:
-                stack.enter_context(small_disk(folder / "state"))
+                stack.enter_context(small_disk(folder / "state", len(boxes)))
             except OSError as error:
                 print(f"without full disks: {error}", file=sys.stderr)
                 faults = [name for name in faults if name != FULL]
