@@ -22,15 +22,16 @@ JOB = Job(
 
 numbers = st.none() | st.integers(0, 10**6)
 paths = st.none() | st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).map(Path)
+files = st.dictionaries(st.sampled_from(["ben", "carl"]), st.text("ab/.", min_size=1).map(Path))
 jobs = st.builds(
     Job,
     source=st.text(),
     boxes=st.dictionaries(st.sampled_from(["", "anna"]), st.just(Box(1, 2, 30, 40))),
-    models=st.dictionaries(st.sampled_from(["ben", "carl"]), st.text("ab/.", min_size=1).map(Path)),
+    models=files,
     part=st.builds(slice, numbers, numbers, numbers),
     settings=st.builds(lambda lag: Settings(run={"lag_frames": lag}), st.integers(0, 100)),
     size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
-    results=st.builds(Results, paths, st.booleans(), st.lists(paths.filter(bool)).map(tuple), paths),
+    results=st.builds(Results, paths, st.booleans(), st.lists(paths.filter(bool)).map(tuple), files),
     state=paths,
     record=paths,
     since=st.none() | st.floats(0, 1e9),
