@@ -77,34 +77,26 @@ class _Collector:
         """The metrics with a value for each object; the label of an object without a name is empty."""
         dashboard = self._feed.dashboard
         for name, process, counter, meaning in _COUNTED_BY_OBJECT:
-            counted = CounterMetricFamily(f"catstream_{name}", meaning, labels=["object"])
-            yield _with_objects(counted, dashboard.object_counters(process, counter))
+            yield _by_object(CounterMetricFamily, name, meaning, dashboard.object_counters(process, counter))
         for name, process, counter, meaning in _GAUGES_BY_OBJECT:
-            gauge = GaugeMetricFamily(f"catstream_{name}", meaning, labels=["object"])
-            yield _with_objects(gauge, dashboard.object_counters(process, counter))
-        score = GaugeMetricFamily(
-            "catstream_score",
-            "Score of the newest track: about 0 on background, about 1 on the object.",
-            labels=["object"],
-        )
-        present = GaugeMetricFamily("catstream_present", "Whether the object is present.", labels=["object"])
-        latency = GaugeMetricFamily(
-            "catstream_learning_latency_seconds",
-            "Seconds from the track of a frame to the model trained on it.",
-            labels=["object"],
-        )
-        for name, each in dashboard.objects.shown.items():
-            score.add_metric([name], each.score)
-            present.add_metric([name], float(each.state != "absent"))
-            if each.model_latency is not None:
-                latency.add_metric([name], each.model_latency)
+            yield _by_object(GaugeMetricFamily, name, meaning, dashboard.object_counters(process, counter))
+        shown = dashboard.objects.shown
+        latencies = {name: each.model_latency for name, each in shown.items() if each.model_latency is not None}
+        for name, meaning, values in (
+            ("score", "Score of the newest track: about 0 on background, about 1 on the object.",
+             {name: each.score for name, each in shown.items()}),
+            ("present", "Whether the object is present.",
+             {name: float(each.state != "absent") for name, each in shown.items()}),
+            ("learning_latency_seconds", "Seconds from the track of a frame to the model trained on it.", latencies),
+        ):  # fmt: skip
+            yield _by_object(GaugeMetricFamily, name, meaning, values)
         leaves = GaugeMetricFamily(
             "catstream_tree_leaves", "Leaves ever inserted into a coreset tree.", labels=["object", "tree"]
         )
         for tree in HEADS:
             for name, value in dashboard.object_counters("compressor", f"{tree}_leaves").items():
                 leaves.add_metric([name, tree], value)
-        yield from (score, present, latency, leaves)
+        yield leaves
 
     def _processes(self) -> Iterator[Metric]:
         ages = GaugeMetricFamily(
@@ -120,12 +112,13 @@ class _Collector:
         yield from (ages, rejected)
 
 
-def _with_objects(
-    family: CounterMetricFamily | GaugeMetricFamily, values: dict[str, float]
-) -> CounterMetricFamily | GaugeMetricFamily:
-    """Add a value for each object, by name."""
-    for name, value in values.items():
-        family.add_metric([name], value)
+def _by_object(
+    kind: type[CounterMetricFamily] | type[GaugeMetricFamily], name: str, meaning: str, values: dict[str, float]
+) -> Metric:
+    """Return a metric with a value for each object, by name."""
+    family = kind(f"catstream_{name}", meaning, labels=["object"])
+    for each, value in values.items():
+        family.add_metric([each], value)
     return family
 
 
