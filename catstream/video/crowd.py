@@ -186,7 +186,7 @@ def _path(number: int, count: int, frames: int, rng: np.random.Generator) -> np.
     path[:, :2] = path[:, :2].clip(margin, np.array(SIZE) - margin)
     if number % 3 == 2:  # it leaves through the nearer side, and comes back
         begin, end = (share * frames for share in _OUTSIDE)
-        away = np.clip(np.minimum(time - begin, end - time) / 15, 0, 1)
+        away = np.clip(np.minimum(time - begin, end - time) / min(15, (end - begin) / 4), 0, 1)
         path[:, 0] += away * ((SIZE[0] + size if x > SIZE[0] / 2 else -size) - path[:, 0])
     return path
 

@@ -24,3 +24,14 @@ def test_render_only_starts_no_pipeline(tmp_path):
     result = CliRunner().invoke(demo, ["--output", str(tmp_path), "--frames", "2", "--render-only"])
     assert result.exit_code == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == ["demo.mp4", "groundtruth_rect.txt"]
+
+
+def test_several_objects_are_followed_and_measured(tmp_path):
+    arguments = ["--objects", "3", "--output", str(tmp_path), "--frames", "20"]
+    result = CliRunner().invoke(demo, arguments, catch_exceptions=False)
+    assert result.exit_code == 0
+    scores = re.search(r"MOTA ([\d.]+), IDF1 ([\d.]+), HOTA ([\d.]+), identity switches (\d+)", result.output)
+    assert scores
+    assert float(scores[1]) > 0.9
+    assert scores[4] == "0"
+    assert (tmp_path / "tracks" / "crowd.mp4").exists()
