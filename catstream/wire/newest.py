@@ -7,7 +7,8 @@ messages.
 
 If a channel keeps the newest message, it keeps that of each object. They are transmitted again to late joiners, and to
 all if nothing newer followed within 0.2 s, 0.6 s, 1.4 s ...: a burst may have cost a subscriber the last ones. A
-`Subscriber` drops repeats. Only as many are repeated at once as fit into the queue of a subscriber.
+`Subscriber` drops repeats. No more are repeated at once than the queue of a subscriber holds, and the rate halves each
+time, so that all of them reach any subscriber that is not frozen.
 
 The number of topics that a peer can make either side remember is limited.
 """
@@ -67,7 +68,8 @@ class Publisher(ChannelSocket[Message]):
         if first_message is not None:
             self._last[b""] = encode(first_message)
         self._due: list[bytes] = []  # topics whose last message is sent again, in this order
-        self._repeat_at, self._pause = math.inf, _REPEAT_SECONDS
+        self._next_part = 0.0  # when some of them are sent
+        self._repeat_at, self._pause = math.inf, _REPEAT_SECONDS  # when all are due again; seconds from time to time
         self._bind(sender)
 
     @property
@@ -119,21 +121,24 @@ class Publisher(ChannelSocket[Message]):
             joined |= self._process(subscribes=change.startswith(b"\x01"), topic=change[1:])
         if joined or monotonic() >= self._repeat_at:
             self._due = list(dict.fromkeys([*self._due, *self._last]))
+            self._next_part = 0.0
             if self._newest:
                 self._repeat_after(_REPEAT_SECONDS if joined else 2 * self._pause)
-        self._repeat_some()
+        if self._due and monotonic() >= self._next_part:
+            self._repeat_part()
 
     def _repeat_after(self, seconds: float) -> None:
         """Send the last messages again after so many seconds."""
         self._repeat_at, self._pause = monotonic() + seconds, seconds
 
-    def _repeat_some(self) -> None:
-        """Send some of the last messages again that are due: those that half the queue of a subscriber can hold."""
+    def _repeat_part(self) -> None:
+        """Send as many of the due messages again as half the queue of a subscriber holds."""
         count = max(1, self.channel.high_water_mark // 2)
         for topic in self._due[:count]:
             if (data := self._last.get(topic)) is not None:
                 self._socket.send(data, copy=False)
         del self._due[:count]
+        self._next_part = monotonic() + self._pause * min(1.0, count / max(1, len(self._last)))
 
     def _process(self, subscribes: bool, topic: bytes) -> bool:
         """Process one subscription or its end; returns whether there is a new subscriber."""

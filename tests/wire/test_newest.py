@@ -169,7 +169,7 @@ def test_of_a_burst_that_no_queue_holds_the_newest_of_each_object_still_arrives(
     with Publisher(SAMPLES, endpoint) as samples, Subscriber(SAMPLES, endpoint) as trainer:
         joined(samples, 1, until)
         for version in range(1, objects + 1):  # nothing is read meanwhile
-            samples.send(sample(version, f"o{version}", width=2000))
+            samples.send(sample(version, f"o{version}", width=500))
         heard = heard_by_all(samples, trainer, objects, until)
     assert heard == {f"o{version}": version for version in range(1, objects + 1)}
 
