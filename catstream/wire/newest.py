@@ -146,10 +146,11 @@ class Publisher(ChannelSocket[Message]):
             self._expected.discard(topic)
         elif topic and not topic.startswith(self._kinds):
             self._reject(
-                "subscription", "a message was dropped: one subscribes to everything, or to messages of a kind"
+                "subscription",
+                "a message was dropped: expected a subscription to everything, to a kind of message, or to one object",
             )
         elif subscribes and topic not in self._subscribed and len(self._subscribed) >= _MOST_TOPICS:
-            self._reject("subscription", f"a subscription was not counted: there are {_MOST_TOPICS} others already")
+            self._reject("subscription", f"a subscription was not counted: expected at most {_MOST_TOPICS} topics")
         elif subscribes:
             self._subscribed.add(topic)
             return True
