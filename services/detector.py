@@ -220,7 +220,8 @@ class DetectorLoop:
         the results of the objects whose boxes commands have set for it
         """
         if self._commands.desired.holds:
-            self._outputs.show(self.detectors.seq, frame.image, {})
+            kept = {name: each for name, each in self._tracks.tracks.items() if name in self._commands.desired.objects}
+            self._outputs.show(self.detectors.seq, frame.image, kept)  # the other objects, while a box is drawn
         live = self._source is not None and self._source.live
         while self._commands.desired.holds and not self.end_reason and not live:
             time.sleep(_TURN_SECONDS)
