@@ -494,8 +494,11 @@ def _saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterat
         for error in _save(files, state, settings):
             _log.warning("%s", error)
         raise
-    for error in _save(files, state, settings):
-        raise error
+    errors = _save(files, state, settings)
+    for error in errors[1:]:
+        _log.warning("%s", error)
+    if errors:
+        raise errors[0]
 
 
 def _save(files: Mapping[str, Path], state: Path, settings: Settings) -> list[CatstreamError]:

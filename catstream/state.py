@@ -61,7 +61,8 @@ def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
     if name == UNNAMED and len(forest.compressors) == 1:
         (name,) = forest.compressors
     if forest.compressors and name not in forest.compressors:
-        raise ObjectError(f"there is no object {name!r}: the objects are {listed(forest.compressors)}")
+        wanted = repr(name) if name else "without a name"
+        raise ObjectError(f"there is no object {wanted}: the objects are {listed(forest.compressors)}")
     return Learned.of(forest.compressors.get(name) or Compressor(settings, name), settings)
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.interrupts import Interrupts
 from catstream.messages import Run
+from catstream.names import listed
 from catstream.services.options import with_part
 from catstream.settings import Settings
 from catstream.sinks.sink import check_writable, open_sink
@@ -71,10 +72,12 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in tracks:
                 max_repeats = max_repeats or _max_repeats(place)
-                if max(newest.values(), default=-1) - track.frame > max_repeats:
+                last = max(newest.values(), default=-1)
+                if last - track.frame > max_repeats:
                     reason = ": the run had no end, and another one started"
                     break
-                if track.frame <= newest.get(track.object, -1):  # a restarted detector repeats some frames
+                # A restarted detector repeats some frames; a track that was missed before is not written out of order.
+                if track.frame < last or track.frame == newest.get(track.object):
                     continue
                 with interrupts.deferred():  # a track is written to all files or to none
                     for each in sinks:
@@ -83,7 +86,7 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
                 status.update(f"frame {track.frame}, {tracks.missed} missed")
         if tracks.end is not None:
             reason = f": {tracks.end.reason}"
-        of = f" of {', '.join(newest)}" if any(newest) else ""
+        of = f" of {listed(newest)}" if any(newest) else ""
         click.echo(f"{written} tracks{of}, {tracks.losses()}{reason}", err=True)
 
 

@@ -21,6 +21,7 @@ from catstream.errors import ServiceError
 from catstream.extras import require_extra
 from catstream.job import Job, Results
 from catstream.messages import Track
+from catstream.names import UNNAMED
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
 from catstream.services.options import named, with_given, with_object, with_part, with_reading
@@ -176,6 +177,8 @@ def track(
         known=[*known.write, *([known.output] if known.output is not None else [])],
     )
     _check_models(saved, overwrite)
+    if UNNAMED in saved and len(boxes) + len(models) > 1:
+        raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
     if resume is not None:
         pipeline = pipeline.starting_after(files.position())
     output = results.output

@@ -173,11 +173,11 @@ class RunFiles:
         return [*(self.output / file for file in files), self._video_file()]
 
     def _discard_objects(self, folder: Path) -> None:
-        """Remove the files of objects with names that are to be replaced, and those of an earlier run."""
+        """Remove the files of objects that are to be replaced, and those of an earlier run."""
         earlier = {track.object for track in results.read_tracks(folder, self.name)}
-        for name in {*self.objects, *earlier} - {UNNAMED}:
+        for name in {*self.objects, *earlier} - ({UNNAMED} & {*self.objects}):  # which the writer replaces itself
             for file in results.object_files(self.name, name):
-                (folder / file).unlink(missing_ok=True)
+                discard(folder / file)
 
     def _video_file(self) -> Path:
         return (self.output or Path()) / f"{self.name}.mp4"

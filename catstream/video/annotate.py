@@ -160,35 +160,38 @@ def _plain(text: str) -> str:
     return "".join(letters).encode("ascii", "replace").decode()
 
 
+def _text_width(text: str, unit: float) -> int:
+    return cv2.getTextSize(text, _FONT, 0.45 * unit, max(1, round(unit)))[0][0]
+
+
+def _write(canvas: np.ndarray, text: str, left: int, unit: float) -> None:
+    """Write text in the line below an image."""
+    place = (left, canvas.shape[0] - round(9 * unit))
+    cv2.putText(canvas, text, place, _FONT, 0.45 * unit, _WHITE, max(1, round(unit)), cv2.LINE_AA)
+
+
 def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], unit: float) -> None:
     """Write the name and score of each object, with a ring in place of the disc if it is absent, and the frame number;
     if there is not enough room, the number of objects that are left out."""
     height, width = canvas.shape[:2]
     canvas[:] = _DARK
-    middle, line, thick = height // 2, height - round(9 * unit), max(1, round(unit))
-
-    def long(text: str) -> int:
-        return cv2.getTextSize(text, _FONT, 0.45 * unit, thick)[0][0]
-
-    def write(text: str, left: int) -> None:
-        cv2.putText(canvas, text, (left, line), _FONT, 0.45 * unit, _WHITE, thick, cv2.LINE_AA)
-
+    middle = height // 2
     gap, left = round(12 * unit), round(8 * unit)
     end = f"frame {drawn[0][0].frame}"
-    right = width - long(end) - gap
+    right = width - _text_width(end, unit) - gap
     if right > left:
-        write(end, right)
+        _write(canvas, end, right, unit)
     for count, (track, colour) in enumerate(drawn):
         text, rest = f"{_plain(track.object)} {track.score:.2f}".strip(), f"+{len(drawn) - count}"
         is_last = count == len(drawn) - 1
-        if left + gap + long(text) + (0 if is_last else gap + long(rest)) > right - gap:
-            if left + long(rest) < right:
-                write(rest, left)
+        if left + gap + _text_width(text, unit) + (0 if is_last else gap + _text_width(rest, unit)) > right - gap:
+            if left + _text_width(rest, unit) < right:
+                _write(canvas, rest, left, unit)
             return
-        disc = cv2.FILLED if track.box is not None else thick
+        disc = cv2.FILLED if track.box is not None else max(1, round(unit))
         cv2.circle(canvas, (left + round(4 * unit), middle), round(4 * unit), colour, disc, cv2.LINE_AA)
-        write(text, left + gap)
-        left += 2 * gap + long(text)
+        _write(canvas, text, left + gap, unit)
+        left += 2 * gap + _text_width(text, unit)
 
 
 def _draw_text(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -> None:
@@ -196,28 +199,21 @@ def _draw_text(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -
     the first of these."""
     height, width = canvas.shape[:2]
     canvas[:] = _DARK
-    middle, line, thick = height // 2, height - round(9 * unit), max(1, round(unit))
-
-    def long(text: str) -> int:
-        return cv2.getTextSize(text, _FONT, 0.45 * unit, thick)[0][0]
-
-    def write(text: str, left: int) -> None:
-        cv2.putText(canvas, text, (left, line), _FONT, 0.45 * unit, _WHITE, thick, cv2.LINE_AA)
-
+    middle = height // 2
     cv2.circle(canvas, (round(14 * unit), middle), round(5 * unit), colour, cv2.FILLED, cv2.LINE_AA)
-    write(track.state, round(26 * unit))
+    _write(canvas, track.state, round(26 * unit), unit)
     bar, right, half, score = round(132 * unit), round(222 * unit), max(2, round(3 * unit)), f"{track.score:.2f}"
     number = right + round(8 * unit)
-    if number + long(score) > width:
+    if number + _text_width(score, unit) > width:
         return
     filled = bar + round((right - bar) * min(max(track.score, 0.0), 1.0))
     cv2.rectangle(canvas, (bar, middle - half), (right, middle + half), _GREY, cv2.FILLED)
     cv2.rectangle(canvas, (bar, middle - half), (filled, middle + half), colour, cv2.FILLED)
-    write(score, number)
+    _write(canvas, score, number, unit)
     end = f"model {track.model_version}   frame {track.frame}"
-    start = width - long(end) - round(10 * unit)
-    if start > number + long(score):
-        write(end, start)
+    start = width - _text_width(end, unit) - round(10 * unit)
+    if start > number + _text_width(score, unit):
+        _write(canvas, end, start, unit)
 
 
 class AnnotatedVideo:

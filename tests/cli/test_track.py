@@ -173,6 +173,7 @@ REJECTED = {
     ),
     "a box and a model of one object": (["--box", "anna=1,2,30,40", "--model", "anna=notes.txt"], "give one of them"),
     "models of two objects in one file": (["--save-model", "a=m", "--save-model", "b=m"], "named twice"),
+    "a model of several objects": (["--box", "a=1,2,30,40", "--box", "b=1,2,30,40", "--save-model", "m"], "NAME=FILE"),
     "two models of an object": (["--save-model", "a=m", "--save-model", "a=n"], "its own name"),
     "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset.size'"),
     "a value that does not fit": (["--set", "coreset.size=x"], "coreset.size cannot be 'x'"),

@@ -154,6 +154,14 @@ HISTORIES = st.lists(NAMES_IN_FRAME, min_size=2, max_size=5)
 CUT = ["t.ndjson", "t.json", "t.csv"]
 
 
+def test_no_file_of_an_object_of_replaced_results_is_left(tmp_path):
+    run = in_folder(tmp_path, [])
+    add(run, [["anna", ""], ["ben"]])
+    add(run, [["carl"]])
+    rows = ("walk-carl.txt", "walk-carl_confidence.value", "walk-carl_time.txt")
+    assert {path.name for path in run.output.iterdir()} == {*rows, "walk.csv"}
+
+
 def in_folder(folder, names=CUT):
     return RunFiles("walk", "", ALL_FRAMES, folder / "out", files=[folder / name for name in names])
 
