@@ -1,0 +1,98 @@
+"""Frames per second with 1, 2, 4 and 8 objects, in one process and in the pipeline's three, on a rendered video.
+
+The same video of 640x480 pixels is tracked each time, with more or fewer of its objects. The runs alternate, so that
+other load of the machine affects all alike: the ratios are more reliable than the rates.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping
+from statistics import median
+from time import perf_counter, process_time
+
+import psutil
+from sequences import scratch
+from table import Table, command, publish
+
+from catstream.box import Box
+from catstream.multi import MultiTracker
+from catstream.pipeline import Pipeline
+from catstream.video import crowd
+from catstream.video.source import open_source
+
+COUNTS = (1, 2, 4, 8)
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    counts, frames, runs = ((1, 2), 8, 1) if options.quick else (COUNTS, options.frames, options.runs)
+    path, truth = crowd.write(scratch(), counts[-1], frames)
+    starts = {name: box for name, box in truth[0].items() if box is not None}
+    for title, measure in (("One process", in_one_process), ("Three processes", in_three_processes)):
+        yield Table(
+            f"Objects: {title.lower()}",
+            ("objects", "ms a frame", "frames/s", "each further object, of the first", "processor, ms a frame"),
+            list(rows(measure, str(path), starts, counts, runs)),
+            f"640x480 pixels, {frames} frames with decoding, median of {runs} runs; {psutil.cpu_count()} cores",
+        )
+
+
+def rows(
+    measure: Callable[[str, Mapping[str, Box]], tuple[float, float]],
+    source: str,
+    starts: Mapping[str, Box],
+    counts: tuple[int, ...],
+    runs: int,
+) -> Iterator[tuple[object, ...]]:
+    """Measure each number of objects in turn, some times; return a row for each."""
+    found: dict[int, list[tuple[float, float]]] = {count: [] for count in counts}
+    for _ in range(runs):
+        for count in counts:
+            found[count].append(measure(source, dict(list(starts.items())[:count])))
+    first = median(seconds for seconds, _ in found[1])
+    for count, each in found.items():
+        seconds, processor = (median(values) for values in zip(*each, strict=True))
+        further = None if count == 1 else (seconds - first) / (count - 1) / first
+        yield count, seconds * 1000, 1 / seconds, further, processor * 1000
+
+
+def in_one_process(source: str, boxes: Mapping[str, Box]) -> tuple[float, float]:
+    """Seconds, and processor seconds, a frame after the first."""
+    tracker, count = MultiTracker(), 0
+    with open_source(source) as frames:
+        for frame in frames:
+            if not count:
+                tracker.init(frame.image, boxes)
+                begin, used = perf_counter(), process_time()
+            else:
+                tracker.update(frame.image)
+            count += 1
+    return (perf_counter() - begin) / (count - 1), (process_time() - used) / (count - 1)
+
+
+def in_three_processes(source: str, boxes: Mapping[str, Box]) -> tuple[float, float]:
+    """Seconds, and processor seconds of the three processes, a frame from the first track to the last."""
+    moments, used = [], []
+    with Pipeline(source, boxes) as pipeline:
+        processes: list[psutil.Process] = []
+        for _ in pipeline.by_frame():
+            processes = processes or [psutil.Process(pid) for pid in pipeline.pids.values()]
+            moments.append(perf_counter())
+            if len(moments) == 1 or len(moments) % 20 == 0:
+                used.append((len(moments), processor_seconds(processes)))
+    (first, before), (last, after) = used[0], used[-1]
+    processor = (after - before) / (last - first) if last > first else 0.0
+    return (moments[-1] - moments[0]) / (len(moments) - 1), processor
+
+
+def processor_seconds(processes: list[psutil.Process]) -> float:
+    """Return the processor time of the processes so far."""
+    return sum(sum(process.cpu_times()[:2]) for process in processes if process.is_running())
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--frames", type=int, default=200, help="length of the video (default: %(default)s)")
+    parser.add_argument("--runs", type=int, default=3, help="number of runs of each (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options)
