@@ -13,7 +13,7 @@ from time import perf_counter, process_time
 
 import psutil
 from sequences import scratch
-from table import Table, command, publish
+from table import Cell, Table, command, publish
 
 from catstream.box import Box
 from catstream.multi import MultiTracker
@@ -43,7 +43,7 @@ def rows(
     starts: Mapping[str, Box],
     counts: tuple[int, ...],
     runs: int,
-) -> Iterator[tuple[object, ...]]:
+) -> Iterator[tuple[Cell, ...]]:
     """Measure each number of objects in turn, some times; return a row for each."""
     found: dict[int, list[tuple[float, float]]] = {count: [] for count in counts}
     for _ in range(runs):
