@@ -67,7 +67,7 @@ class DesiredState:
     def begun(self, name: str, box: Box, seq: int) -> DesiredState:
         """The state after an object has begun in message `seq`, in the place of another one of its name."""
         before = self.without(name, seq - 1) if name in self.objects else self
-        return replace(before, objects=self.objects | {name: DesiredObject(box, seq)})
+        return replace(before, objects=before.objects | {name: DesiredObject(box, seq)})
 
     def without(self, name: str, last: int) -> DesiredState:
         """The state after an object was forgotten; message `last` is the last one with a track of it."""

@@ -61,11 +61,13 @@ class Detectors:
         is_new = name not in self.detectors
         detector = self.add(name)
         try:
-            return detector.init(frame, self.seq + 1, time, box)
+            result = detector.init(frame, self.seq + 1, time, box)
         except BaseException:
             if is_new:
                 del self.detectors[name]
             raise
+        self.detectors[name] = self.detectors.pop(name)  # the last one, also if another object had the name
+        return result
 
     def begin_all(self, boxes: Mapping[str, Box], frame: Pyramid, time: float = 0.0) -> dict[str, Result]:
         """Start several objects with their boxes in the next frame, by name; if one is refused, none of them.
