@@ -25,7 +25,7 @@ def test_the_first_models_need_no_filterpy_and_its_import_begins_half_a_block_of
         assert not begun
         tracker.update(frame)
     assert begun == [4]
-    assert tracker.detector.model.version
+    assert tracker.track.model_version
 
 
 def test_a_filter_requested_during_the_import_waits_for_it_without_output():
