@@ -156,7 +156,7 @@ class SearchLog:
         if head["search"] != self.search:
             changed = ", ".join(name for name in self.search if head["search"].get(name) != self.search[name])
             raise ServiceError(
-                f"{str(self.path.parent)!r} has the results of a search with another {changed or 'version'}: give "
+                f"{str(self.path.parent)!r} has the results of a search that differs in {changed or 'version'}: give "
                 "another folder, or replace them with --overwrite"
             )
         return data.rfind(b"\n") + 1
