@@ -54,11 +54,12 @@ class MultiTracker:
 
     Examples
     --------
+    >>> from catstream.box import Box
     >>> frame = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
     >>> tracker = MultiTracker()
     >>> tracker.init(frame, {"anna": (60, 40, 40, 40), "ben": (10, 70, 30, 30)})
     >>> tracks = tracker.update(np.roll(frame, 2, axis=1))
-    >>> tracks["ben"].box.overlap((12, 70, 30, 30)) > 0.9
+    >>> tracks["anna"].box.overlap(Box(62, 40, 40, 40)) > 0.9
     True
     """
 

@@ -106,6 +106,6 @@ def listed(names: Iterable[str]) -> str:
     Examples
     --------
     >>> listed(["anna", ""]), listed([])
-    ("anna, the object without a name", 'none')
+    ('anna, the object without a name', 'none')
     """
     return ", ".join(name or "the object without a name" for name in names) or "none"

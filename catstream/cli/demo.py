@@ -41,7 +41,7 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool) -> N
     \b
     Writes
       OUTPUT/demo.mp4, groundtruth_rect.txt   the video and its ground truth: a sequence for `catstream evaluate`
-      OUTPUT/crowd.mp4, groundtruth.txt       with --objects: the same; the truth in the format of MOTChallenge
+      OUTPUT/crowd.mp4, groundtruth.txt       with --objects: the same; columns of MOTChallenge, pixels from 0
       OUTPUT/tracks/                          the results of `catstream track`, with the annotated video
 
     \b

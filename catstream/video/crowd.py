@@ -90,7 +90,7 @@ def write(
     size: tuple[int, int] = SIZE,
     done: Callable[[int], None] = lambda _: None,
 ) -> tuple[Path, list[dict[str, Box | None]]]:
-    """Render into a folder: crowd.mp4, and groundtruth.txt in the format of MOTChallenge.
+    """Render into a folder: crowd.mp4, and groundtruth.txt with the columns of MOTChallenge; pixels count from 0.
 
     Parameters
     ----------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 from dataclasses import replace
 
 import pytest
@@ -101,6 +102,8 @@ def test_the_messages_of_a_pipeline_are_recorded_by_another_process(video, catst
         tracks = iter(pipeline)
         next(tracks)
         recorders = [catstream("record", "--output", path, "--endpoint", tmp_path) for path in paths]
+        while not all(path.exists() for path in paths):  # they have found the pipeline, which waits for its tracks
+            time.sleep(0.01)
         for track in tracks:
             if recorders[1].poll() is None and track.frame > 40 and all(map(holds_tracks, paths)):
                 recorders[1].send_signal(signal.SIGINT)
