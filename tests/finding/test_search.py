@@ -83,7 +83,7 @@ def test_the_log_of_another_search_is_not_continued(search, tmp_path):
     with SearchLog(tmp_path / "log", search.description):
         pass
     other = dataclasses.replace(search, threshold=0.7)
-    with pytest.raises(ServiceError, match="another threshold"):
+    with pytest.raises(ServiceError, match="differs in threshold"):
         SearchLog(tmp_path / "log", other.description)
     with SearchLog(tmp_path / "log", other.description, overwrite=True) as log:
         assert not log.results
