@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Detector", "Result"]
 
-#: What a detector makes of one frame.
+#: The track and the features of an object in one frame.
 Result = tuple[Track, ObjectFeatures]
 
 

@@ -44,9 +44,13 @@ class Detectors:
             If the name is not valid, or there are too many objects.
         """
         if name not in self.detectors:
-            check_count(len(self.detectors) + 1, self.settings.run.objects_most)
-            self.detectors[name] = Detector(self.settings, check_name(name))
+            self.detectors[name] = self._made(name)
         return self.detectors[name]
+
+    def _made(self, name: str) -> Detector:
+        """A new detector, for one more object."""
+        check_count(len(self.detectors) + 1, self.settings.run.objects_most)
+        return Detector(self.settings, check_name(name))
 
     def begin(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:
         """Start an object with its box in the next frame; another one of this name is forgotten.
@@ -58,15 +62,10 @@ class Detectors:
         ObjectError
             If the name is not valid, or there are too many objects. Nothing changes.
         """
-        is_new = name not in self.detectors
-        detector = self.add(name)
-        try:
-            result = detector.init(frame, self.seq + 1, time, box)
-        except BaseException:
-            if is_new:
-                del self.detectors[name]
-            raise
-        self.detectors[name] = self.detectors.pop(name)  # the last one, also if another object had the name
+        detector = self.detectors.get(name) or self._made(name)
+        result = detector.init(frame, self.seq + 1, time, box)
+        self.detectors.pop(name, None)
+        self.detectors[name] = detector  # the last one, also if another object had the name
         return result
 
     def begin_all(self, boxes: Mapping[str, Box], frame: Pyramid, time: float = 0.0) -> dict[str, Result]:
@@ -77,13 +76,11 @@ class Detectors:
         BoxError, ObjectError
             As `begin` does. Nothing changes.
         """
-        before = dict(self.detectors)
-        self.detectors = {name: copy(each) if name in boxes else each for name, each in before.items()}
-        try:
-            return {name: self.begin(name, frame, box, time) for name, box in boxes.items()}
-        except BaseException:
-            self.detectors = before
-            raise
+        trial = copy(self)
+        trial.detectors = {name: copy(each) if name in boxes else each for name, each in self.detectors.items()}
+        results = {name: trial.begin(name, frame, box, time) for name, box in boxes.items()}
+        self.detectors = trial.detectors
+        return results
 
     def correct(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:
         """Continue an object at another box in the next frame: see `Detector.correct`."""
