@@ -23,7 +23,7 @@ from catstream.compression.reduce import energy
 from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
 from catstream.detection.likeness import Likeness
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.features.cells import row_length
+from catstream.features.layout import row_length
 from catstream.heads import HEADS
 from catstream.messages import Model
 from catstream.names import check_name

@@ -6,7 +6,7 @@ A message is frozen and complete by itself. In one process the stages pass the o
 The annotations are the schema (see `catstream.schema`), and the docstrings describe the fields. The checks, the files
 of `catstream.packing`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
 
-`d` is the length of a feature row (`catstream.features.cells.row_length`), `n` the coreset size, frames count from 0.
+`d` is the length of a feature row (`catstream.features.layout.row_length`), `n` the coreset size, frames count from 0.
 The objects of a stream have names (`catstream.names`); an object that is alone may have the name "".
 """
 

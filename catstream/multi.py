@@ -20,7 +20,7 @@ from catstream.compression.forest import Forest
 from catstream.detection.detector import Detector
 from catstream.detection.objects import Detectors, prepare
 from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, ServiceError
-from catstream.features.cells import row_length
+from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.image import as_bgr
 from catstream.learned import Learned

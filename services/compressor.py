@@ -28,6 +28,7 @@ _SENDER_SECONDS = 5.0  # limit for the detector to send the end, once all proces
 _END_SECONDS = 5.0  # limit for the end of the tracks, after that of the features
 _STORE_SECONDS = 60.0  # limit for a slow disk
 _READ_SECONDS = 1e-7  # limit for reading one byte
+_IMPORT_SECONDS = 60.0  # limit for importing a library from a slow disk
 _LOCK_SECONDS = 10.0  # limit for an earlier compressor to end
 
 
@@ -61,6 +62,7 @@ class CompressorLoop:
         self._forest = _forest(job, self._checkpoints)
         position = self._forest.position
         self._progress = Progress(position, position.seq, time.monotonic())
+        self._prepared = False
         self._recorder = None
         if job.record is not None:
             process.allow(reading_seconds(job.record))
@@ -83,7 +85,7 @@ class CompressorLoop:
         """The next message, None if none arrives in a tenth of a second."""
         message = self._features.receive(0.1)
         if message is None:
-            reduce.prepare()
+            self._prepare()
         if self._recorder is not None:
             self._recorder.receive()
         return message
@@ -92,11 +94,19 @@ class CompressorLoop:
         """Insert features into the trees, and send the sample if there is a new one."""
         if self._recorder is not None:  # before a checkpoint: the recording then contains all of its features
             self._recorder.write(features)
+        self._prepare()
         before = self._forest.compressors.keys()
         for sample in self._forest.take(features):
             self._samples.send(sample)
         if self._forest.compressors.keys() != before:
             self._samples.keep_only(self._forest.compressors)
+
+    def _prepare(self) -> None:
+        """Import what the first reduction needs, after a detector that waits for the position has got its answer."""
+        if not self._prepared:
+            self._process.allow(_IMPORT_SECONDS)
+            reduce.prepare()
+            self._prepared = True
 
     def store_and_acknowledge(self, message: Features | End | None) -> None:
         """Write a checkpoint if one is due, then answer position requests and acknowledge the message."""

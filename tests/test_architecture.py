@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
@@ -172,6 +173,13 @@ def slow_at_the_top(path: Path) -> Iterator[str]:
 
 def test_slow_libraries_are_imported_by_the_functions_that_use_them():
     assert not violations(slow_at_the_top)
+
+
+@pytest.mark.parametrize("name", ["compressor", "trainer"])
+def test_a_process_without_a_camera_starts_without_compiled_kernels(name):
+    check = f"import sys, catstream.services.{name}; sys.exit({SLOW | {'cv2', 'numba'}!r} & sys.modules.keys() or 0)"
+    found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stderr) == (0, "")
 
 
 def impure(path: Path) -> Iterator[str]:

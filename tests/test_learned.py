@@ -13,7 +13,7 @@ from catstream.box import Box, Window
 from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import energy
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.features.cells import row_length
+from catstream.features.layout import row_length
 from catstream.heads import APPEARANCE, EXTENT
 from catstream.learned import Learned, merge
 from catstream.messages import DetectorState, ObjectFeatures, TrainingRows

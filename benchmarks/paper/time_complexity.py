@@ -24,7 +24,7 @@ from catstream.box import Window
 from catstream.compression.tree import CoresetTree
 from catstream.detection.teacher import affine_copies
 from catstream.evaluation.datasets import Sequence
-from catstream.features.cells import row_length
+from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.paper.one_class import one_class
 

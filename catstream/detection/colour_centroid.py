@@ -15,8 +15,7 @@ import numpy as np
 
 from catstream.box import Window
 from catstream.detection.search import ScoreMap
-from catstream.features.colours import SIDE
-from catstream.features.hog import WINDOW
+from catstream.features.layout import SIDE, WINDOW
 
 __all__ = ["recentred"]
 

@@ -14,8 +14,7 @@ from catstream.detection.search import Detection, ScoreMap
 from catstream.detection.step import looked, replaced, settled, taught, track_of
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
-from catstream.features.cells import row_length
-from catstream.features.hog import WINDOW
+from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.messages import DetectorState, Model, ObjectFeatures, Track
 from catstream.settings import Settings

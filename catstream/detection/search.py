@@ -15,7 +15,7 @@ from catstream.box import Window
 from catstream.detection import belief, extent
 from catstream.detection.likeness import Likeness
 from catstream.features.cells import Cells
-from catstream.features.hog import WINDOW
+from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.heads import EXTENT
 from catstream.messages import DetectorState, Model

@@ -11,7 +11,7 @@ from catstream.detection import belief, colour_centroid, extent, motion, search,
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
-from catstream.features.cells import COLOURS
+from catstream.features.layout import COLOURS
 from catstream.features.pyramid import Pyramid
 from catstream.messages import DetectorState, Model, State, Track
 from catstream.settings import Settings

@@ -20,8 +20,8 @@ from catstream.detection import extent
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import ScoreMap, non_maximum_suppression
 from catstream.errors import BoxError
-from catstream.features.cells import COLOURS, Cells, row_length
-from catstream.features.hog import CELL, MARGIN, WINDOW
+from catstream.features.cells import Cells
+from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.heads import APPEARANCE, BETWEEN_RIDGE, EXTENT
 from catstream.messages import Model, TrainingRows

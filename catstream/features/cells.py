@@ -11,24 +11,13 @@ import numpy as np
 
 from catstream.arrays import Float32
 from catstream.features import colours
-from catstream.features.colours import SHADES
 from catstream.features.compiled import kernel
-from catstream.features.hog import CELL, CHANNELS, MARGIN, WINDOW, grid
+from catstream.features.hog import grid
+from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, WINDOW, row_length
 
-__all__ = ["COLOURS", "Cells", "row_length"]
+__all__ = ["Cells"]
 
-_PLACES = WINDOW * WINDOW * CHANNELS
-#: The columns of a row that hold the histogram of colours.
-COLOURS = slice(_PLACES, _PLACES + SHADES)
-
-
-def row_length() -> int:
-    """Length d of a feature row.
-
-    >>> row_length()
-    2464
-    """
-    return _PLACES + SHADES
+_PLACES = COLOURS.start  # features of the cells of a window, before those of its colours
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,14 +15,11 @@ import numpy as np
 
 from catstream.arrays import Float32, UInt8, UInt16
 from catstream.features.compiled import kernel
-from catstream.features.hog import CELL, WINDOW
+from catstream.features.layout import CHROMA, LIGHT, SIDE, WINDOW
 
-__all__ = ["SHADES", "SIDE", "add_scores", "highest_score", "histogram", "shades"]
+__all__ = ["add_scores", "highest_score", "histogram", "shades"]
 
-SIDE = CELL // 2  #: shades a cell is wide and high
-_LIGHT, _CHROMA, _CHROMA_STEP = 8, 6, 10  # levels of lightness, of a and of b; Lab units from one of these to the next
-SHADES = _LIGHT * _CHROMA * _CHROMA  #: how many are distinguished
-
+_CHROMA_STEP = 10  # Lab units from one level of a or b to the next
 _WEIGHT = 3.0  # length of a histogram as features; that of a window's HOG is about 9
 _EDGE = SIDE  # shades of a window's first cell, which is not counted
 _COUNTED = WINDOW * SIDE - 2 * _EDGE  # shades along a side of the middle
@@ -81,9 +78,9 @@ def _table() -> np.ndarray:
     levels = np.arange(4, 256, 8, dtype=np.uint8)
     colours = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1)
     lab = cv2.cvtColor(colours.reshape(-1, 1, 3), cv2.COLOR_BGR2LAB).reshape(-1, 3).astype(int)
-    light = lab[:, 0] * _LIGHT // 256
-    chroma = ((lab[:, 1:] - 128) // _CHROMA_STEP + _CHROMA // 2).clip(0, _CHROMA - 1)
-    bins: np.ndarray = ((light * _CHROMA + chroma[:, 0]) * _CHROMA + chroma[:, 1]).astype(np.uint16)
+    light = lab[:, 0] * LIGHT // 256
+    chroma = ((lab[:, 1:] - 128) // _CHROMA_STEP + CHROMA // 2).clip(0, CHROMA - 1)
+    bins: np.ndarray = ((light * CHROMA + chroma[:, 0]) * CHROMA + chroma[:, 1]).astype(np.uint16)
     return bins
 
 

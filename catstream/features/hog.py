@@ -17,13 +17,9 @@ from numpy import float32
 
 from catstream.arrays import Float32, UInt8
 from catstream.features.compiled import kernel
+from catstream.features.layout import CELL, CHANNELS
 
-__all__ = ["CELL", "CHANNELS", "MARGIN", "WINDOW", "grid"]
-
-CELL = 8  #: pixels a cell is wide and high
-WINDOW = 8  #: cells a window is wide and high
-CHANNELS = 34  #: numbers a cell: 31 HOG, 3 colour
-MARGIN = 2  #: cells around a crop beyond which no pixel changes a feature
+__all__ = ["grid"]
 
 _ORIENTATIONS = 9
 _SIGNED = 2 * _ORIENTATIONS

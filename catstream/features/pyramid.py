@@ -8,7 +8,7 @@ import numpy as np
 from catstream.arrays import UInt8
 from catstream.box import Window
 from catstream.features.compiled import kernel
-from catstream.features.hog import CELL, MARGIN, WINDOW
+from catstream.features.layout import CELL, MARGIN, WINDOW
 
 __all__ = ["Pyramid"]
 

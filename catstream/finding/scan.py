@@ -18,7 +18,7 @@ from catstream.box import Box, Window
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection, ScoreMap, fitted, non_maximum_suppression
 from catstream.features.cells import Cells
-from catstream.features.hog import CELL, WINDOW
+from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.learned import Learned
 from catstream.messages import Model

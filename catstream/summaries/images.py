@@ -16,7 +16,7 @@ import numpy as np
 
 from catstream.errors import VideoError
 from catstream.features.cells import Cells
-from catstream.features.hog import CELL, WINDOW
+from catstream.features.layout import CELL, WINDOW
 from catstream.image import as_bgr
 from catstream.summaries.selection import RowSelection
 from catstream.threads import one_thread

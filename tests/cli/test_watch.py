@@ -13,7 +13,7 @@ import time
 
 import pytest
 
-from catstream.features.cells import row_length
+from catstream.features.layout import row_length
 from catstream.messages import End, Health, Track
 from catstream.pipeline import Pipeline
 from catstream.services.supervisor import NAMES

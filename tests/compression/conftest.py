@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.features import hog
 from catstream.features.cells import Cells
+from catstream.features.layout import CELL, MARGIN, WINDOW
 
 ROWS = 208  #: 13 leaves of 16: levels 3, 2 and 0
 
@@ -28,7 +28,7 @@ def low_rank_rows(rng: np.random.Generator) -> np.ndarray:
 def hog_rows(rng: np.random.Generator) -> np.ndarray:
     """Real features: a textured object that drifts, turns, grows and changes light in a noisy video."""
     texture = cv2.resize(rng.integers(0, 255, (24, 24, 3), np.uint8), (240, 240), interpolation=cv2.INTER_CUBIC)
-    side = (hog.WINDOW + 2 * hog.MARGIN) * hog.CELL
+    side = (WINDOW + 2 * MARGIN) * CELL
     rows = []
     for frame in range(ROWS):
         turn = cv2.getRotationMatrix2D((120, 120), 20 * np.sin(frame / 30), 1 + 0.2 * np.sin(frame / 50))

@@ -5,7 +5,8 @@ import pytest
 
 from catstream.box import Window
 from catstream.detection.teacher import affine_copies
-from catstream.features.cells import COLOURS, Cells
+from catstream.features.cells import Cells
+from catstream.features.layout import COLOURS
 from catstream.features.pyramid import Pyramid
 
 WINDOW = Window(64, 48, 64, 64)

@@ -6,7 +6,7 @@ import pytest
 from catstream.box import Box, Window
 from catstream.detection.assignment import assigned
 from catstream.detection.search import Detection, ScoreMap, local
-from catstream.features.hog import WINDOW
+from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.messages import DetectorState, Model
 from catstream.settings import SearchSettings

@@ -7,7 +7,7 @@ from catstream.box import Window
 from catstream.detection.colour_centroid import recentred
 from catstream.detection.search import ScoreMap
 from catstream.features import colours
-from catstream.features.cells import COLOURS, row_length
+from catstream.features.layout import COLOURS, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.messages import Model
 

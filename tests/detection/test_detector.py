@@ -12,7 +12,7 @@ from catstream.detection.detector import Detector
 from catstream.detection.likeness import Likeness
 from catstream.detection.step import looked, settled, taught
 from catstream.errors import BoxError, ProtocolError
-from catstream.features.cells import row_length
+from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.messages import Model, Motion
 from catstream.settings import Settings

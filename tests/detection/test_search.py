@@ -6,7 +6,7 @@ import pytest
 from catstream.box import Window
 from catstream.detection.search import ScoreMap, non_maximum_suppression
 from catstream.features.cells import Cells
-from catstream.features.hog import WINDOW
+from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.messages import Model
 

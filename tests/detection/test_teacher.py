@@ -6,8 +6,8 @@ import pytest
 from catstream.box import Window
 from catstream.detection import teacher
 from catstream.detection.search import ScoreMap
-from catstream.features.cells import COLOURS, Cells, row_length
-from catstream.features.hog import WINDOW
+from catstream.features.cells import Cells
+from catstream.features.layout import COLOURS, WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.heads import APPEARANCE, EXTENT
 from catstream.messages import Model

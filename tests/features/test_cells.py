@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from catstream.features.cells import COLOURS, Cells, row_length
+from catstream.features.cells import Cells
+from catstream.features.layout import COLOURS, row_length
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from catstream.features import colours
-from catstream.features.colours import SHADES
+from catstream.features.layout import SHADES
 
 
 def colour_features(image, row=0, column=0):

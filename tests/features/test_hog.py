@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.features.hog import CELL, CHANNELS, MARGIN, grid
+from catstream.features.hog import grid
+from catstream.features.layout import CELL, CHANNELS, MARGIN
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 from catstream.box import Box, Window
 from catstream.compression.compressor import Compressor
-from catstream.features.cells import row_length
+from catstream.features.layout import row_length
 from catstream.heads import APPEARANCE, EXTENT
 from catstream.learned import Learned
 from catstream.messages import DetectorState, ObjectFeatures, SavedModel, TrainingRows
