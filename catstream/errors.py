@@ -9,6 +9,8 @@ __all__ = [
     "BoxError",
     "CatstreamError",
     "CommandRejectedError",
+    "FencedError",
+    "FleetError",
     "FrameError",
     "MissingExtraError",
     "ObjectError",
@@ -17,6 +19,7 @@ __all__ = [
     "ServiceError",
     "SettingsError",
     "SilenceError",
+    "StoreError",
     "StreamRewoundError",
     "VideoError",
 ]
@@ -79,3 +82,15 @@ class SilenceError(ServiceError, TimeoutError):
 
 class CommandRejectedError(ServiceError):
     """A running pipeline did not carry out a command; the message has the reason."""
+
+
+class FleetError(ServiceError):
+    """A fleet cannot do what was asked for; the message names the stream or the node."""
+
+
+class FencedError(FleetError):
+    """Another holder has claimed a stream since; this one may not write its state any more, and has to stop."""
+
+
+class StoreError(FleetError):
+    """The store of a fleet is unreachable, full or damaged. The call may be repeated later."""

@@ -18,6 +18,8 @@ EXTRAS = {
     "loadtest": ("the load test", ("hdrh", "psutil")),
     "parquet": ("a Parquet file", ("pyarrow",)),
     "supervision": ("to_supervision", ("supervision",)),
+    "fleet": ("a fleet", ("fsspec", "ray")),
+    "s3": ("a store on S3", ("s3fs",)),
     "mot": ("the accuracy of several objects", ("motmetrics",)),
 }
 

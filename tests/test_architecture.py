@@ -28,6 +28,7 @@ LEVELS = [
     {"tracker", "summaries"},
     {"services", "web"},
     {"pipeline"},
+    {"fleet"},
     {"evaluation"},
     {"loadtest"},
     {"cli"},
@@ -52,6 +53,9 @@ IMPORTERS = {
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
     "filelock": ["catstream/storage.py"],
     "safetensors": ["catstream/storage.py"],
+    "fsspec": ["catstream/fleet/store.py"],
+    "s3fs": ["catstream/fleet/store.py"],
+    "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/parquet.py"],
     "supervision": ["catstream/adapters.py"],
     "motmetrics": ["catstream/evaluation/multiple.py"],
@@ -80,7 +84,19 @@ IMPORTERS = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"filelock", "sklearn", "av", "scipy", "filterpy", "pyarrow", "supervision", "motmetrics"}
+SLOW = {
+    "filelock",
+    "sklearn",
+    "av",
+    "scipy",
+    "filterpy",
+    "pyarrow",
+    "supervision",
+    "motmetrics",
+    "fsspec",
+    "ray",
+    "s3fs",
+}
 
 #: Modules of I/O, threads, clocks and randomness, which a stage does not import.
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
