@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import os
 import time
 import warnings
@@ -273,17 +274,25 @@ class Pipeline:
             async for track in self._tracks_async():
                 yield track
 
-    def by_frame(self) -> Iterator[dict[str, Track]]:
+    def by_frame(self, seconds: float = math.inf) -> Iterator[dict[str, Track]]:
         """Iterate over the frames: the track of each object, by name. The pipeline must be used in a `with`.
+
+        Parameters
+        ----------
+        seconds : float
+            Time without a frame after which an empty mapping is returned, for a program that has other work too.
 
         Raises
         ------
         ServiceError
             If the pipeline was not started, or runs no more.
         """
+        returned = time.monotonic()
         while not self._over():
-            if (tracks := self._take(_CHECK_SECONDS)) is not None:
-                yield tracks.tracks
+            tracks = self._take(min(seconds, _CHECK_SECONDS))
+            if tracks is not None or time.monotonic() - returned >= seconds:
+                yield tracks.tracks if tracks is not None else {}
+                returned = time.monotonic()
         for _ in self._wait_for_exit():
             time.sleep(_TURN_SECONDS)
         self._raise_failure()

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from catstream import storage
@@ -25,12 +26,15 @@ from catstream.messages import Position
 from catstream.names import UNNAMED, listed
 from catstream.settings import Settings
 
-__all__ = ["TREES", "began", "learned", "locked", "position"]
+__all__ = ["TREES", "began", "files", "learned", "locked", "position", "restore", "skip"]
 
 #: Folder of the checkpoints, in that of the state.
 TREES = "trees"
 
 _HELP = "give another folder"
+_SMALL = ("job.safetensors", "desired_state.json")
+_NAMES = re.compile(rf"job\.safetensors|desired_state\.json|{TREES}/[0-9]+\.safetensors")
+_ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
 
 
 def began(folder: Path) -> bool:
@@ -64,6 +68,49 @@ def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
         wanted = repr(name) if name else "without a name"
         raise ObjectError(f"there is no object {wanted}: the objects are {listed(forest.compressors)}")
     return Learned.of(forest.compressors.get(name) or Compressor(settings, name), settings)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """The content of the files that a pipeline needs to continue from its newest checkpoint, by their names.
+
+    Empty if there is no checkpoint yet. The pipeline may be running.
+    """
+    for _ in range(_ATTEMPTS):
+        checkpoints = sorted((folder / TREES).glob("[0-9]*.safetensors"))
+        names = [
+            *(name for name in _SMALL if (folder / name).exists()),
+            *(f"{TREES}/{path.name}" for path in checkpoints[-1:]),
+        ]
+        with contextlib.suppress(FileNotFoundError):  # a newer checkpoint has just taken its place
+            return {name: (folder / name).read_bytes() for name in names} if checkpoints else {}
+    raise ServiceError(f"the state in {str(folder)!r} changes too quickly to be read: try again")
+
+
+def restore(folder: Path, content: Mapping[str, bytes]) -> None:
+    """Write what `files` returned to a new folder, from which a pipeline can be resumed.
+
+    Raises
+    ------
+    ServiceError
+        If a name is not one that `files` returns, or a file cannot be written.
+    """
+    for name, data in content.items():
+        if not _NAMES.fullmatch(name):
+            raise ServiceError(f"{name!r} is not a file of the state of a pipeline")
+        try:
+            (folder / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            storage.write_atomically(folder / name, data, 0o600)
+        except OSError as error:
+            raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
+
+
+def skip(folder: Path, settings: Settings, frames: int) -> None:
+    """Count frames of a live source that were lost while no pipeline was running: the numbers go on after them."""
+    store = CheckpointStore(folder / TREES)
+    forest = store.load(settings)
+    forest.skip(frames)
+    if not store.save(forest):
+        raise ServiceError(f"cannot keep the state in {str(folder)!r}: {store.trouble}")
 
 
 @contextlib.contextmanager

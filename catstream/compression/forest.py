@@ -40,6 +40,10 @@ class Forest:
         self.compressors[compressor.name] = compressor
         self.version = max(self.version, compressor.version)
 
+    def skip(self, frames: int) -> None:
+        """Count frames of a live source that nobody saw: the next message has a number after theirs."""
+        self.seq, self.frame = self.seq + frames, self.frame + frames
+
     def check_features(self, features: Features) -> None:
         """Raise ProtocolError if rows have another length than those before."""
         width = max((compressor.width for compressor in self.compressors.values()), default=0)

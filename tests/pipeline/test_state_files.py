@@ -1,0 +1,43 @@
+"""The files from which a run continues on another machine."""
+
+from __future__ import annotations
+
+import pytest
+
+from catstream.errors import ServiceError
+from catstream.pipeline import Pipeline
+from catstream.state import files, position, restore, skip
+
+
+@pytest.fixture
+def state(video, tmp_path):
+    path, truth = video
+    with Pipeline(path, truth[0], {"run.lockstep": True}, part=slice(0, 12), state=tmp_path / "here") as pipeline:
+        assert len(list(pipeline)) == 12
+    return tmp_path / "here"
+
+
+def test_a_restored_state_is_at_the_same_position(state, tmp_path):
+    content = files(state)
+    restore(tmp_path / "there", content)
+    pipeline = Pipeline(resume=tmp_path / "there")
+    assert sorted(content)[0] == "job.safetensors"
+    assert files(tmp_path / "there") == content
+    assert position(tmp_path / "there", pipeline.settings).seq == 12
+
+
+def test_numbers_go_on_after_the_frames_that_were_lost(state):
+    settings = Pipeline(resume=state).settings
+    skip(state, settings, 30)
+    assert (position(state, settings).seq, position(state, settings).frame) == (42, 41)
+
+
+def test_a_folder_without_a_checkpoint_has_no_files(tmp_path):
+    assert files(tmp_path) == {}
+
+
+@pytest.mark.parametrize("name", ["../other", "trees/../../other", "/etc/passwd", "trees/1.safetensors.part"])
+def test_a_file_that_is_not_of_a_state_is_not_written(name, tmp_path):
+    with pytest.raises(ServiceError, match="not a file of the state"):
+        restore(tmp_path, {name: b""})
+    assert list(tmp_path.iterdir()) == []
