@@ -29,19 +29,26 @@ __all__ = [
     "DetectorState",
     "End",
     "Features",
+    "FleetStatus",
     "Health",
     "Level",
+    "Listing",
     "Model",
     "Motion",
+    "NodeState",
+    "NodeStatus",
     "ObjectFeatures",
     "ObjectPosition",
     "Position",
     "Preview",
+    "Question",
     "Run",
     "Sample",
     "SavedModel",
     "State",
     "Stored",
+    "StreamState",
+    "StreamStatus",
     "Summary",
     "Track",
     "Tracks",
@@ -54,6 +61,11 @@ State = Literal["bootstrapping", "present", "absent"]
 Level = Literal["lost", "redetected", "weak", "confident"]
 
 Verb = Literal["set-box", "forget", "pause", "resume", "save", "stop"]
+
+#: The state of a stream of a fleet: "waiting" is for a box, "unplaced" is without a node that fits.
+StreamState = Literal["starting", "running", "waiting", "paused", "moving", "unplaced", "failed", "ended"]
+
+NodeState = Literal["alive", "draining", "dead"]
 
 #: The name of an object.
 ObjectName = Annotated[str, Name()]
@@ -490,3 +502,119 @@ class Answer:
     box: Box | None = None
     version: int = 0
     object: ObjectName = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStatus:
+    """The state of one stream of a fleet: where it runs, and how it is.
+
+    name            name of the stream, unique in its fleet
+    state           "waiting" for a box, "unplaced" if it fits on no node, "moving" between two nodes
+    node            name of the node on which it runs, empty if it runs on none
+    source          the video source without user and password
+    endpoint        of its pipeline, in the format of the setting `run.endpoint`; empty if it does not run
+    server          public key of the sockets of its pipeline, empty if the pipeline has no keys
+    token           fencing token of its pipeline: each pipeline that is started for the stream has a larger one
+    frame           number of the newest frame that was tracked
+    rate            tracked frames per second
+    skipped         frames of a live source that were not tracked, because the pipeline was too slow
+    cores           processor cores that it uses, as measured; 0 before the first measurement
+    models          version of the newest model of each object that has one, by name
+    restarts        how many times it was started again after a failure
+    lost_frames     frames of a live source that were lost because of failures and moves
+    lost_seconds    duration of these frames
+    stored_seconds  seconds since its newest state in the store was written; None if there is none
+    trouble         description of a problem, empty if there is none
+    """
+
+    name: str
+    state: StreamState
+    node: str = ""
+    source: str = ""
+    endpoint: str = ""
+    server: str = ""
+    token: int = 0
+    frame: int = 0
+    rate: float = 0.0
+    skipped: int = 0
+    cores: float = 0.0
+    models: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
+    restarts: int = 0
+    lost_frames: int = 0
+    lost_seconds: float = 0.0
+    stored_seconds: float | None = None
+    trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatus:
+    """The state of one node of a fleet.
+
+    name     name of the node, unique in its fleet
+    state    "draining" if its streams are moved away and none is placed on it
+    address  name or address of the machine
+    cores    processor cores that streams may use
+    used     cores that the streams placed on it need
+    labels   labels of the node, by name
+    streams  number of streams placed on it
+    trouble  description of a problem, empty if there is none
+    """
+
+    name: str
+    state: NodeState
+    address: str = ""
+    cores: float = 0.0
+    used: float = 0.0
+    labels: dict[str, str] = field(default_factory=dict)
+    streams: int = 0
+    trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetStatus:
+    """The state of a fleet. It may have more streams than one message holds, and is transmitted as `Listing`s.
+
+    name     name of the fleet
+    time     seconds since the epoch (1970)
+    streams  state of each stream, by name
+    nodes    state of each node, by name
+    """
+
+    name: str
+    time: float
+    streams: dict[str, StreamStatus] = field(default_factory=dict)
+    nodes: dict[str, NodeStatus] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question about the streams and nodes of a fleet, anyone -> manager of the fleet.
+
+    id      unique for each question
+    stream  name of the one stream that it is about; empty for all streams and nodes
+    after   only streams and nodes whose names sort after this one are listed; empty for the first part
+    """
+
+    id: str
+    stream: str = ""
+    after: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """The answer to a Question, manager of the fleet -> its sender.
+
+    id       id of the question
+    fleet    name of the fleet
+    time     seconds since the epoch (1970)
+    streams  state of the streams, by name
+    nodes    state of the nodes, by name
+    more     whether there are more: the next question has the last name of this listing as `after`
+    """
+
+    id: str
+    fleet: str
+    time: float
+    streams: dict[str, StreamStatus] = field(default_factory=dict)
+    nodes: dict[str, NodeStatus] = field(default_factory=dict)
+    more: bool = False

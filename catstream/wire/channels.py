@@ -14,6 +14,10 @@
     saved-models   the coreset trees of each object as a file, the newest; none is made while nobody subscribes
     training   a copy of the messages of `features`, to any number of subscribers; nothing is sent while there is none
 
+The manager of a fleet has an endpoint of its own, with one channel:
+
+    registry   questions about the streams of the fleet, and their answers
+
 The receiver of an acknowledged channel binds its address, and so does the sender of any other; the rest connect,
 in any order. `catstream.wire.endpoint` says what the addresses are. If the pipeline has keys (`catstream.wire.keys`),
 a peer that connects needs the role in the table.
@@ -30,8 +34,10 @@ from catstream.messages import (
     End,
     Features,
     Health,
+    Listing,
     Model,
     Preview,
+    Question,
     Run,
     Sample,
     SavedModel,
@@ -47,6 +53,7 @@ __all__ = [
     "MODELS",
     "PORT",
     "PREVIEWS",
+    "REGISTRY",
     "RESULTS",
     "SAMPLES",
     "SAVED_MODELS",
@@ -154,3 +161,8 @@ CHANNELS: dict[str, Channel[object]] = {
     channel.name: channel
     for channel in (FEATURES, SAMPLES, MODELS, TRACKS, RESULTS, HEALTH, PREVIEWS, CONTROL, TRAINING, SAVED_MODELS)
 }
+
+#: The only channel of the manager of a fleet, which is no process of a pipeline and has an endpoint of its own.
+REGISTRY: Channel[Question | Listing] = Channel(
+    "registry", (Question, Listing), ("anyone",), "manager", "every", port=0, megabytes=16, role="watch"
+)

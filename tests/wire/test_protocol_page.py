@@ -22,9 +22,11 @@ from catstream.messages import (
     DetectorState,
     End,
     Motion,
+    NodeStatus,
     ObjectFeatures,
     ObjectPosition,
     Stored,
+    StreamStatus,
     Summary,
     Track,
     TrainingRows,
@@ -43,13 +45,14 @@ from catstream.schema import (
     fields,
 )
 from catstream.wire import codec
-from catstream.wire.channels import CHANNELS, TRACKS
+from catstream.wire.channels import CHANNELS, REGISTRY, TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
 PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
-MESSAGES = [*codec.KINDS.values(), DetectorState, Motion, ObjectFeatures, ObjectPosition, Summary, TrainingRows]
+PARTS = [DetectorState, Motion, NodeStatus, ObjectFeatures, ObjectPosition, StreamStatus, Summary, TrainingRows]
+MESSAGES = [*codec.KINDS.values(), *PARTS]
 PLAIN = {int: "whole number", float: "number", str: "text", bool: "boolean", Box: "box", Window: "window"}
 
 
@@ -122,7 +125,7 @@ def section(kind):
     return found
 
 
-@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
+@pytest.mark.parametrize("channel", [*CHANNELS.values(), REGISTRY], ids=lambda channel: channel.name)
 def test_every_channel_has_its_row(channel):
     kinds = ", ".join(f"`{kind.__name__.lower()}`" for kind in channel.messages)
     ports = ", ".join(f"+{channel.port + offset}" for offset in range(len(channel.senders)))
