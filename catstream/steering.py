@@ -22,7 +22,7 @@ from catstream.errors import CommandRejectedError, SilenceError
 from catstream.learned import Learned
 from catstream.messages import Answer, Command, SavedModel, Verb
 from catstream.names import UNNAMED, check_name
-from catstream.wire.channels import SAVED_MODELS
+from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.endpoint import find
 from catstream.wire.newest import Subscriber
@@ -55,7 +55,7 @@ class Control:
     def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> None:
         self._place = find(endpoint, keys, source)
         self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
-        self._commands = Requester(self._place)
+        self._commands = Requester[Command, Answer](CONTROL, self._place)
 
     def set_box(self, box: str | Iterable[float], object: str = UNNAMED, *, keep: bool = False) -> Answer:
         """Set the box of an object in the next frame that is tracked: x, y, w, h in pixels.

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from catstream.detection.detector import Result
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Answer
+from catstream.messages import Answer, Command
 from catstream.services.commands import CommandHandler
 from catstream.services.desired import DesiredState
+from catstream.wire.channels import CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint
 
@@ -19,7 +20,7 @@ __all__ = ["CommandChannel"]
 _log = logging.getLogger(__name__)
 
 
-class CommandChannel(Responder):
+class CommandChannel(Responder[Command, Answer]):
     """Connects a `CommandHandler` to its socket and to its file.
 
     The desired state is written to disk before a command is answered. If the disk is full, this is logged, and the
@@ -31,7 +32,7 @@ class CommandChannel(Responder):
     """
 
     def __init__(self, endpoint: Endpoint, handler: CommandHandler, file: Path | None) -> None:
-        super().__init__(endpoint)
+        super().__init__(CONTROL, endpoint)
         self._handler, self._file = handler, file
         self._kept: DesiredState | None = None
         self._conclude([])

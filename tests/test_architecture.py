@@ -23,7 +23,7 @@ LEVELS = [
     {"features"},
     {"paper"},
     {"detection", "compression", "training", "wire", "video", "adapters", "job"},
-    {"learned"},
+    {"learned", "registry"},
     {"multi", "subscription", "steering", "recording", "sinks", "state", "finding"},
     {"tracker", "summaries"},
     {"services", "web"},

@@ -1,97 +1,132 @@
-"""Commands and their answers (`control`): each command is carried out once, though its answer may get lost.
+"""Questions and their answers (`control`, `registry`): each is taken once, though its answer may get lost.
 
-The detector binds a ROUTER socket (`Responder`); any number of clients connect DEALER sockets (`Requester`). A client
-sends a command again until an answer with its `id` arrives. The responder remembers its last 64 answers, and repeats
-the answer to a command that it has carried out already. At most 64 commands wait; any further one is dropped and sent
-again by its client.
+One process binds a ROUTER socket (`Responder`); any number of clients connect DEALER sockets (`Requester`). A client
+sends a question again until an answer with its `id` arrives. The responder remembers its last 64 answers, and repeats
+the answer to a question that it has answered already. At most 64 questions wait; any further one is dropped and sent
+again by its client. A command is a question that asks for an action.
 """
 
 from __future__ import annotations
 
 import contextlib
 from time import monotonic
+from typing import Generic, Protocol, TypeVar, cast
 
 import zmq
 
-from catstream.messages import Answer, Command
-from catstream.wire.channels import CONTROL
+from catstream.wire.channels import Channel
 from catstream.wire.codec import encode
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.socket import ChannelSocket
 
 __all__ = ["Requester", "Responder"]
 
-_MAX_COMMANDS = 64  # that wait, that are remembered with their answers, and that are received at once
+_MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and that are received at once
+_LONGEST_QUESTION = 1 << 20  # bytes
 _REPEAT_SECONDS = 0.2
 
 
-class Requester(ChannelSocket[Command | Answer]):
-    """Sends commands, one at a time, and waits for the answer to each."""
+class _HasId(Protocol):
+    @property
+    def id(self) -> str: ...
 
-    def __init__(self, endpoint: Endpoint) -> None:
-        super().__init__(zmq.DEALER, CONTROL, endpoint, high_water_mark=_MAX_COMMANDS)
-        self._socket.set(zmq.LINGER, 0)  # a command that nobody received is given up
+
+Question = TypeVar("Question", bound=_HasId)
+Answer = TypeVar("Answer", bound=_HasId)
+
+
+class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
+    """Sends questions and receives their answers; it connects.
+
+    Parameters
+    ----------
+    channel : its first kind of message is the question, its second one the answer
+    """
+
+    def __init__(self, channel: Channel[Question | Answer], endpoint: Endpoint) -> None:
+        super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=_MAX_QUESTIONS)
+        self._answer_kind = cast(type[Answer], channel.messages[1])
+        self._socket.set(zmq.LINGER, 0)  # a question that nobody received is given up
         self._socket.set(zmq.IMMEDIATE, 1)
         self._connect()
 
-    def ask(self, command: Command, seconds: float) -> Answer | None:
-        """Send a command until it is answered; None if no answer arrived in time."""
-        data, deadline = encode(command), monotonic() + seconds
+    def ask(self, question: Question, seconds: float) -> Answer | None:
+        """Send a question until it is answered; None if no answer arrived in time."""
+        data, deadline = encode(question), monotonic() + seconds
         while (left := deadline - monotonic()) > 0:
-            with contextlib.suppress(zmq.Again):  # nobody is connected yet
-                self._socket.send(data, zmq.NOBLOCK)
-            answer = self._receive(command.id, min(left, _REPEAT_SECONDS))
-            if answer is not None:
+            self._send(data)
+            if (answer := self.receive(question.id, min(left, _REPEAT_SECONDS))) is not None:
                 return answer
         return None
 
-    def _receive(self, command: str, seconds: float) -> Answer | None:
-        """The answer to a command if it arrives in time; late answers to others are dropped."""
+    def send(self, question: Question) -> None:
+        """Send a question once, without waiting for a connection or for the answer: `receive` returns it."""
+        self._send(encode(question))
+
+    def receive(self, question: str, seconds: float) -> Answer | None:
+        """The answer to the question with this id if it arrives in time; late answers to others are dropped."""
         deadline = monotonic() + seconds
-        while (left := deadline - monotonic()) > 0:
-            answer = self._decode(self._socket.recv(), Answer) if self._wait(left) else None
-            if answer is not None and answer.id == command:
+        while self._wait(max(0.0, deadline - monotonic())):
+            answer = self._decode(self._socket.recv(), self._answer_kind)
+            if answer is not None and answer.id == question:
                 return answer
         return None
 
+    def _send(self, data: bytes) -> None:
+        with contextlib.suppress(zmq.Again):  # nobody is connected yet
+            self._socket.send(data, zmq.NOBLOCK)
 
-class Responder(ChannelSocket[Command | Answer]):
-    """Receives commands from any number of clients and answers them; it binds."""
 
-    def __init__(self, endpoint: Endpoint) -> None:
-        super().__init__(zmq.ROUTER, CONTROL, endpoint, high_water_mark=_MAX_COMMANDS)
-        self._waiting: dict[str, bytes] = {}  # the peer that asked last, by the id of its command
-        self._answers: dict[str, bytes] = {}  # the last ones, by the id of their command
+class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
+    """Receives questions from any number of clients and answers them; it binds.
+
+    Parameters
+    ----------
+    channel : its first kind of message is the question, its second one the answer
+    """
+
+    def __init__(self, channel: Channel[Question | Answer], endpoint: Endpoint) -> None:
+        super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=_MAX_QUESTIONS)
+        self._socket.set(zmq.MAXMSGSIZE, _LONGEST_QUESTION)
+        self._question_kind = cast(type[Question], channel.messages[0])
+        self._waiting: dict[str, bytes] = {}  # the peer that asked last, by the id of its question
+        self._answers: dict[str, bytes] = {}  # the last ones, by the id of their question
         self._bind()
 
-    def receive_all(self) -> list[Command]:
-        """The new commands, oldest first; each has to be answered. A command that was repeated is not among them."""
-        commands = []
-        for _ in range(_MAX_COMMANDS):  # the rest waits for the next call: a flood does not stop the process
-            if not self._wait(0):
+    def receive_all(self, seconds: float = 0.0) -> list[Question]:
+        """The new questions, oldest first; each has to be answered. One that was repeated is not among them.
+
+        Parameters
+        ----------
+        seconds : time to wait for the first one
+        """
+        questions: list[Question] = []
+        for _ in range(_MAX_QUESTIONS):  # the rest waits for the next call: a flood does not stop the process
+            if not self._wait(seconds):
                 break
             peer, data = self._receive_from_peer()
-            command = self._decode(data, Command) if data is not None else None
-            if command is not None and self._is_new(command, peer):
-                commands.append(command)
-        return commands
+            question = self._decode(data, self._question_kind) if data is not None else None
+            if question is not None and self._is_new(question, peer):
+                questions.append(question)
+            seconds = 0.0
+        return questions
 
     def answer(self, answer: Answer) -> None:
-        """Answer a command, now and whenever it is repeated."""
+        """Answer a question, now and whenever it is repeated."""
         self._answers[answer.id] = data = encode(answer)
-        if len(self._answers) > _MAX_COMMANDS:
+        if len(self._answers) > _MAX_QUESTIONS:
             del self._answers[next(iter(self._answers))]
         if (peer := self._waiting.pop(answer.id, None)) is not None:
             self._send(peer, data)
 
-    def _is_new(self, command: Command, peer: bytes) -> bool:
-        """Whether a command has to be carried out; one that was answered is answered again."""
-        if (answer := self._answers.get(command.id)) is not None:
+    def _is_new(self, question: Question, peer: bytes) -> bool:
+        """Whether a question has to be answered; one that was answered is answered again."""
+        if (answer := self._answers.get(question.id)) is not None:
             self._send(peer, answer)
             return False
-        known = command.id in self._waiting
-        if known or len(self._waiting) < _MAX_COMMANDS:
-            self._waiting[command.id] = peer
+        known = question.id in self._waiting
+        if known or len(self._waiting) < _MAX_QUESTIONS:
+            self._waiting[question.id] = peer
             return not known
         return False
 

@@ -21,17 +21,19 @@ from pathlib import Path
 
 from catstream.errors import ServiceError
 from catstream.storage import is_locked, lock
-from catstream.wire.channels import CHANNELS, Channel
+from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 
-__all__ = ["Endpoint", "find", "homes", "meeting_place", "notes", "private_folder", "running"]
+__all__ = ["Endpoint", "find", "fleets", "homes", "meeting_place", "notes", "private_folder", "running"]
 
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
-_SOURCE = "source"  # file beside the next one that names the source of the pipeline
 _NOTE = "endpoint"  # file in the private folder of a running pipeline that holds its endpoint
+_SOURCE = "source"  # file beside it that names the source of the pipeline
+_FLEET_NOTE = "fleet-endpoint"  # file in the private folder of the manager of a fleet that holds its endpoint
+_FLEET_NAME = "fleet-name"  # file beside it that names the fleet
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +43,7 @@ class Endpoint:
     host    of all processes that `hosts` does not name, as ZeroMQ takes it
     hosts   of single processes, by name
     keys    to connect with; None if the pipeline has no keys
-    source  of the pipeline's frames, without a password; empty if it is not known here
+    source  of the pipeline's frames, without a password; empty if it is not known here, or for a fleet
 
     >>> Endpoint.parse("tcp://localhost:5700").address(CHANNELS["models"])
     'tcp://127.0.0.1:5702'
@@ -63,8 +65,8 @@ class Endpoint:
         return f"tcp://{','.join([self.host, *map('='.join, self.hosts.items())])}:{self.port}"
 
     @classmethod
-    def parse(cls, text: str, keys: str = "") -> Endpoint:
-        """Read the settings `endpoint` and `keys`.
+    def parse(cls, text: str, keys: str | Keys = "") -> Endpoint:
+        """Read the settings `endpoint` and `keys`; the keys may have been loaded already.
 
         Raises
         ------
@@ -73,7 +75,7 @@ class Endpoint:
         """
         if not text:
             raise ServiceError("this process needs the endpoint of its pipeline: --set run.endpoint=FOLDER")
-        known = Keys.load(keys) if keys else None
+        known = keys if isinstance(keys, Keys) else Keys.load(keys) if keys else None
         if text.startswith("tcp://"):
             return cls._tcp(text, known)
         if "://" in text:
@@ -191,14 +193,15 @@ def _sweep(home: Path) -> None:
 
 
 @contextlib.contextmanager
-def meeting_place(text: str, default: Path, keys: str = "", source: str = "") -> Iterator[Endpoint]:
-    """The endpoint of one pipeline, locked for it; removes all socket files afterwards.
+def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fleet: str = "") -> Iterator[Endpoint]:
+    """The endpoint of one pipeline, or of the manager of a fleet, locked for it; removes all socket files afterwards.
 
     Parameters
     ----------
     text, keys : the settings `endpoint` and `keys`
-    default : the pipeline's private folder, used if `text` is empty; `running` finds the pipeline by it
+    default : the private folder of the process, used if `text` is empty; `running` and `fleets` find the endpoint by it
     source : of the pipeline's frames, without a password, by which a user tells several pipelines apart
+    fleet : name of the fleet whose manager has this endpoint; empty for a pipeline
 
     Raises
     ------
@@ -207,7 +210,7 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "") ->
     """
     endpoint = Endpoint.parse(text or str(default), keys)
     if endpoint.folder is None:  # the kernel gives a port to one process only
-        with _noted(endpoint, default, source):
+        with _noted(endpoint, default, source, fleet):
             yield endpoint
         return
     folder = endpoint.folder.absolute()
@@ -229,10 +232,10 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "") ->
             )
         try:
             endpoint = Endpoint.parse(str(folder), keys)
-            with _noted(endpoint, default, source):
+            with _noted(endpoint, default, source, fleet):
                 yield endpoint
         finally:
-            for channel in CHANNELS.values():
+            for channel in (*CHANNELS.values(), REGISTRY):
                 for sender in channel.senders:
                     (folder / _file(channel, sender)).unlink(missing_ok=True)
     finally:
@@ -240,29 +243,37 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "") ->
 
 
 @contextlib.contextmanager
-def _noted(endpoint: Endpoint, folder: Path, source: str) -> Iterator[None]:
-    """Keep a file with the endpoint and the source of a running pipeline, locked until the process ends."""
-    path = folder / _NOTE
+def _noted(endpoint: Endpoint, folder: Path, source: str, fleet: str) -> Iterator[None]:
+    """Keep a file with an endpoint, locked until the process ends, and beside it one with the source or the fleet."""
+    path = folder / (_FLEET_NOTE if fleet else _NOTE)
+    about = folder / (_FLEET_NAME if fleet else _SOURCE)
     with path.open("w") as note:
         lock(note.fileno(), math.inf)
-        (folder / _SOURCE).write_text(source)
+        about.write_text(fleet or source)
         note.write("\n".join([str(endpoint), *([str(endpoint.keys.folder)] if endpoint.keys is not None else [])]))
         note.flush()
         try:
             yield
         finally:
             path.unlink(missing_ok=True)
-            (folder / _SOURCE).unlink(missing_ok=True)
+            about.unlink(missing_ok=True)
 
 
 def running() -> list[Endpoint]:
     """Endpoints of this user's running pipelines, in no order."""
-    endpoints = []
-    for path, text in notes(set(homes()), f"{_PREFIX}*/{_NOTE}"):
-        if text:  # empty until the pipeline has written it
-            endpoint = Endpoint.parse(*text.split("\n"))
-            endpoints.append(replace(endpoint, source=_read(path.with_name(_SOURCE))))
-    return endpoints
+    return [replace(endpoint, source=source) for endpoint, source in _endpoints(_NOTE, _SOURCE)]
+
+
+def fleets() -> dict[str, Endpoint]:
+    """Endpoints of the managers of this user's running fleets on this machine, by the names of the fleets."""
+    return {name: endpoint for endpoint, name in _endpoints(_FLEET_NOTE, _FLEET_NAME)}
+
+
+def _endpoints(note: str, about: str) -> Iterator[tuple[Endpoint, str]]:
+    """The endpoint in each note whose process is running, and the text of the file beside it."""
+    for path, text in notes(set(homes()), f"{_PREFIX}*/{note}"):
+        if text:  # empty until the process has written it
+            yield Endpoint.parse(*text.split("\n")), _read(path.with_name(about))
 
 
 def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:

@@ -18,22 +18,25 @@ import os
 import re
 import tempfile
 import tomllib
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import get_args
 
 import zmq
 
 from catstream.errors import ServiceError
+from catstream.storage import write_atomically
 from catstream.wire.channels import Role
 
-__all__ = ["ROLES", "Client", "Keys", "allow", "clients", "create", "revoke"]
+__all__ = ["ROLES", "Client", "Keys", "allow", "clients", "clients_of_fleet", "create", "replace_clients", "revoke"]
 
 #: The permissions of a client: each role includes those before it.
 ROLES: tuple[Role, ...] = get_args(Role)
 
 _SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS = "server.key", "server.pub", "client.key", "clients"
 _OWN = "pipeline"  # the name of the pipeline's own processes among the clients
+_FLEET = "fleet.pipeline"  # the name of the fleet's own processes among the clients of its streams
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _KEY = re.compile(r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}")  # Z85, as ZeroMQ writes a key
 _LONGEST = 4096  # bytes of a file
@@ -88,6 +91,17 @@ class Keys:
             )
         return _key(_read(self.folder / _SERVER), "secret", self.folder)
 
+    def for_server(self, public: str) -> Keys:
+        """The same key pair, to connect to sockets with another public key.
+
+        Raises
+        ------
+        ServiceError
+            If it is not a public key.
+        """
+        _check_public(public)
+        return replace(self, server=public.encode())
+
     def client(self, public: str) -> tuple[str, Role] | None:
         """Current name and role of the client with this public key; None if it is not allowed to connect."""
         for name, client in clients(self.folder).items():
@@ -125,10 +139,9 @@ def allow(folder: Path, name: str, role: Role, output: Path | None = None, publi
     ServiceError
         If there is a client with that name or key, or `output` holds keys already.
     """
-    if not _NAME.fullmatch(name):
-        raise ServiceError(f"a client's name is of letters, digits, dots and dashes, at most 64, got {name!r}")
-    if public is not None and not _KEY.fullmatch(public):
-        raise ServiceError(f"a public key is 40 characters of Z85, got {public!r}")
+    _check_name(name)
+    if public is not None:
+        _check_public(public)
     server = _key(_read(folder / _SERVER_PUBLIC), "public", folder)
     known = clients(folder)
     if name in known:
@@ -156,6 +169,47 @@ def revoke(folder: Path, name: str) -> None:
     if name not in known:
         raise ServiceError(f"there is no client {name!r}: there are {', '.join(known)}")
     (folder / _CLIENTS / name).unlink(missing_ok=True)
+
+
+def clients_of_fleet(folder: Path) -> dict[str, Client]:
+    """The clients that may connect to the streams of a fleet, by name, for `replace_clients` of each stream.
+
+    Parameters
+    ----------
+    folder : keys of the fleet; its own processes are one of the clients
+
+    Raises
+    ------
+    ServiceError
+        If the folder holds no keys, or one of its files is damaged.
+    """
+    return {_FLEET if name == _OWN else name: client for name, client in clients(folder).items()}
+
+
+def replace_clients(folder: Path, wanted: Mapping[str, Client]) -> None:
+    """Allow these clients and no others, besides the pipeline's own processes; all others are revoked.
+
+    A client that stays is allowed at any time. A connection that is open stays open.
+
+    Raises
+    ------
+    ServiceError
+        If a name or a key is not valid, or the folder holds no keys, or cannot be written.
+    """
+    for name, client in wanted.items():
+        _check_name(name)
+        _check_public(client.public)
+    known = {path.name for path in _listed(folder)} - {_OWN}
+    try:
+        for name in known - wanted.keys():
+            (folder / _CLIENTS / name).unlink(missing_ok=True)
+        for name in wanted.keys() - {_OWN}:
+            client, path = wanted[name], folder / _CLIENTS / name
+            text = _text(role=client.role.encode(), public=client.public.encode())
+            if name not in known or path.read_bytes() != text:
+                write_atomically(path, text, 0o600)
+    except OSError as error:
+        raise ServiceError(f"cannot write the clients in {folder} ({error.strerror})") from None
 
 
 def clients(folder: Path) -> dict[str, Client]:
@@ -199,13 +253,12 @@ def _pair(folder: Path) -> bytes:
 
 def _write(path: Path, **facts: bytes) -> None:
     """Write a new file atomically; only its owner can read it at any time."""
-    text = b"".join(b'%s = "%s"\n' % (name.encode(), value) for name, value in facts.items())
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle, part = tempfile.mkstemp(dir=path.parent, prefix=".")  # mode 0600; no client's name begins with a dot
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(text)
+                file.write(_text(**facts))
                 file.flush()
                 os.fsync(handle)
             os.link(part, path)  # unlike a rename, this never replaces a file
@@ -215,6 +268,21 @@ def _write(path: Path, **facts: bytes) -> None:
         raise ServiceError(f"{path} exists already and is not written over: give another folder") from None
     except OSError as error:
         raise ServiceError(f"cannot write {path} ({error.strerror}): give another folder") from None
+
+
+def _text(**facts: bytes) -> bytes:
+    """The content of a file, as TOML."""
+    return b"".join(b'%s = "%s"\n' % (name.encode(), value) for name, value in facts.items())
+
+
+def _check_name(name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise ServiceError(f"a client's name is of letters, digits, dots and dashes, at most 64, got {name!r}")
+
+
+def _check_public(public: str) -> None:
+    if not _KEY.fullmatch(public):
+        raise ServiceError(f"a public key is 40 characters of Z85, got {public!r}")
 
 
 def _read(path: Path) -> dict[str, object]:

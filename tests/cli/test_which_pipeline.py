@@ -12,6 +12,7 @@ from click.testing import CliRunner, _NamedTextIOWrapper
 
 from catstream.cli import group
 from catstream.messages import Answer
+from catstream.wire.channels import CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import meeting_place, private_folder
 
@@ -41,7 +42,7 @@ def _commanded(source):
     with (
         private_folder() as folder,
         meeting_place("", folder, source=source) as place,
-        Responder(place) as responder,
+        Responder(CONTROL, place) as responder,
         ThreadPoolExecutor(1) as pool,
     ):
         serving = pool.submit(serve)

@@ -13,7 +13,7 @@ from catstream.box import Box
 from catstream.errors import CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages import Answer, Command
 from catstream.steering import Control
-from catstream.wire.channels import CHANNELS
+from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.codec import decode, encode
 from catstream.wire.commands import Requester, Responder
 
@@ -31,7 +31,7 @@ def answering(endpoint, answer):
                 heard.append(command)
                 responder.answer(answer(command))
 
-    with Responder(endpoint) as responder, ThreadPoolExecutor(1) as pool:
+    with Responder(CONTROL, endpoint) as responder, ThreadPoolExecutor(1) as pool:
         serving = pool.submit(serve)
         try:
             yield responder, heard
@@ -54,13 +54,13 @@ def raw(endpoint):
 
 
 def test_a_command_gets_its_answer(endpoint):
-    with answering(endpoint, done) as (_, heard), Requester(endpoint) as requester:
+    with answering(endpoint, done) as (_, heard), Requester(CONTROL, endpoint) as requester:
         assert requester.ask(PAUSE, 20) == done(PAUSE)
     assert heard == [PAUSE]
 
 
 def test_a_command_sent_before_the_pipeline_runs_is_answered_as_soon_as_it_does(endpoint):
-    with ThreadPoolExecutor(1) as pool, Requester(endpoint) as requester:
+    with ThreadPoolExecutor(1) as pool, Requester(CONTROL, endpoint) as requester:
         assert requester.ask(PAUSE, 0.3) is None
         answer = pool.submit(requester.ask, PAUSE, 20)
         with answering(endpoint, done) as (_, heard):
@@ -69,7 +69,7 @@ def test_a_command_sent_before_the_pipeline_runs_is_answered_as_soon_as_it_does(
 
 
 def test_a_repeated_command_is_answered_again_and_executed_once(endpoint, raw, until):
-    with Responder(endpoint) as responder:
+    with Responder(CONTROL, endpoint) as responder:
         heard = []
         for _ in range(3):  # on its way when the first is taken, and after its answer
             raw.send(encode(PAUSE))
@@ -91,8 +91,8 @@ def test_a_repeated_command_is_answered_again_and_executed_once(endpoint, raw, u
 def test_two_requesters_each_receive_their_own_answer(endpoint):
     with (
         answering(endpoint, done),
-        Requester(endpoint) as one,
-        Requester(endpoint) as two,
+        Requester(CONTROL, endpoint) as one,
+        Requester(CONTROL, endpoint) as two,
         ThreadPoolExecutor(2) as pool,
     ):
         answers = [pool.submit(who.ask, Command(name, "pause"), 20) for name, who in (("one", one), ("two", two))]
@@ -115,7 +115,7 @@ def test_an_invalid_command_is_counted_and_the_next_one_is_answered(endpoint, ra
 
 
 def test_a_flood_of_commands_is_bounded_and_dropped_commands_may_be_repeated(endpoint, raw, until):
-    with Responder(endpoint) as responder:
+    with Responder(CONTROL, endpoint) as responder:
         heard = []
         for number in range(60):
             raw.send(encode(Command(f"{number}", "pause")))

@@ -27,7 +27,7 @@ from catstream.messages import (
     Tracks,
 )
 from catstream.wire.acknowledged import Receiver, Sender
-from catstream.wire.channels import CHANNELS, MODELS, RESULTS, TRACKS
+from catstream.wire.channels import CHANNELS, CONTROL, MODELS, RESULTS, TRACKS
 from catstream.wire.codec import encode
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint
@@ -100,7 +100,7 @@ def listener(place):
                 receiver = stack.enter_context(Receiver(CHANNELS[name], place(), Position(), WINDOW))
                 return lambda: receiver.receive(0.02)
             if name == "control":
-                responder = stack.enter_context(Responder(place()))
+                responder = stack.enter_context(Responder(CONTROL, place()))
                 return lambda: responder.receive_all() or None
             publisher = stack.enter_context(Publisher(CHANNELS[name], place(), channel.senders[0]))
             return lambda: publisher.send(SAID[channel.messages[0]])
@@ -205,7 +205,7 @@ def test_a_client_that_may_watch_receives_messages(name, place, listener, until)
 
 
 def test_a_client_that_may_steer_receives_answers(place, until):
-    with Responder(place()) as detector, Requester(place("helm")) as helm:
+    with Responder(CONTROL, place()) as detector, Requester(CONTROL, place("helm")) as helm:
         answers = []
 
         def turn():
@@ -254,7 +254,9 @@ def test_a_client_without_permission_receives_nothing_and_is_counted_and_logged_
 @pytest.mark.parametrize("name", ["features", "results", "control"])
 def test_a_client_that_may_only_watch_gets_an_error_if_it_sends(name, place, listener, until):
     turn = listener(name)
-    client = Requester(place("watcher")) if name == "control" else Sender(CHANNELS[name], place("watcher"), WINDOW)
+    client = (
+        Requester(CONTROL, place("watcher")) if name == "control" else Sender(CHANNELS[name], place("watcher"), WINDOW)
+    )
     with client, pytest.raises(ServiceError, match=f"does not let this key take part in {name}"):
         until(lambda: False, lambda: (turn(), client._wait(0.02)))
 

@@ -29,7 +29,7 @@ from catstream.messages import (
 )
 from catstream.settings import Settings
 from catstream.wire.acknowledged import Receiver, Sender
-from catstream.wire.channels import CHANNELS, FEATURES, RESULTS
+from catstream.wire.channels import CHANNELS, CONTROL, FEATURES, RESULTS
 from catstream.wire.codec import VERSION, encode
 from catstream.wire.commands import Responder
 from catstream.wire.newest import Publisher, Subscriber
@@ -205,7 +205,7 @@ def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(n
 
 def test_a_flood_of_commands_is_counted_and_the_next_command_is_received(endpoint, stranger, until):
     before, heard = rejected("msgpack"), []
-    with Responder(endpoint) as responder:
+    with Responder(CONTROL, endpoint) as responder:
         other = stranger(zmq.DEALER, "control")
         for _ in range(50):
             other.send(b"\xc1")

@@ -1,0 +1,300 @@
+"""The registry of a fleet: which streams there are, and where each of them runs.
+
+    from catstream.registry import Registry
+
+    with Registry("head.example.org:5690", keys="my-keys") as registry:
+        for stream in registry.streams().streams.values():
+            print(stream.name, stream.state, stream.node)
+
+The manager of the fleet serves the registry (`RegistryServer`), and knows the state of all streams. A client needs keys
+with the role "watch", or none if the fleet runs on this machine for this user alone. It gets the endpoint and the
+public key of a stream's pipeline, and connects with its own keys. No secret is transmitted.
+
+The address of a fleet is HOST:PORT of its manager, or the name of a fleet of this user on this machine; it is empty for
+the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet://STREAM` in the only fleet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from time import monotonic
+from typing import Self, TypeVar
+from uuid import uuid4
+
+from catstream.errors import ServiceError, SilenceError
+from catstream.messages import FleetStatus, Listing, NodeStatus, Question, StreamStatus
+from catstream.schema import LONGEST_LIST
+from catstream.wire.channels import REGISTRY
+from catstream.wire.commands import Requester, Responder
+from catstream.wire.endpoint import Endpoint, find, fleets
+from catstream.wire.keys import Keys
+
+__all__ = ["Place", "Registry", "RegistryServer", "address_of", "fleet_and_stream", "locate"]
+
+Status = TypeVar("Status", StreamStatus, NodeStatus)
+
+_PREFIX = "fleet://"
+_LONGEST_TROUBLE = 1000  # characters
+_TURN_SECONDS = 0.5  # after which the endpoint of a fleet on this machine is read again, while it does not answer
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a stream runs.
+
+    status    state of the stream
+    endpoint  of its pipeline, with the keys to connect with; None if it does not run
+    """
+
+    status: StreamStatus
+    endpoint: Endpoint | None = field(default=None, compare=False)
+
+    @property
+    def identity(self) -> tuple[str, str, int]:
+        """Differs for each pipeline that was started for the stream."""
+        return self.status.endpoint, self.status.server, self.status.token
+
+
+class Registry:
+    """Asks the manager of a fleet for its streams and nodes.
+
+    Parameters
+    ----------
+    fleet : str
+        Address of the fleet: HOST:PORT, the name of a fleet of this user, or empty for the only one.
+    keys : str
+        Folder of the keys of this client, if the fleet requires keys.
+    timeout : float
+        Seconds to wait for an answer.
+
+    Raises
+    ------
+    ServiceError
+        If this user has no such fleet, or the keys cannot be read; from each question, if the fleet rejects the keys.
+    SilenceError
+        From each question, if no answer arrives in time.
+    """
+
+    def __init__(self, fleet: str = "", keys: str = "", *, timeout: float = 5.0) -> None:
+        self.timeout = timeout
+        self._keys = Keys.load(keys) if keys else None
+        self._is_remote = ":" in fleet
+        self._name, self._endpoint = (fleet, self._remote(fleet)) if self._is_remote else self._local(fleet)
+        self._requester = Requester[Question, Listing](REGISTRY, self._endpoint)
+        self._question = ""  # id of the last one that was sent by `request`
+
+    def streams(self) -> FleetStatus:
+        """The state of all streams and nodes."""
+        listing = self._ask(Question(uuid4().hex))
+        status = FleetStatus(listing.fleet, listing.time, dict(listing.streams), dict(listing.nodes))
+        while listing.more and (names := [*listing.streams, *listing.nodes]):
+            listing = self._ask(Question(uuid4().hex, after=max(names)))
+            status.streams.update(listing.streams)
+            status.nodes.update(listing.nodes)
+        return status
+
+    def place(self, stream: str) -> Place:
+        """Where a stream runs.
+
+        Raises
+        ------
+        ServiceError
+            If the fleet has no such stream, or its pipeline requires keys and there are none.
+        """
+        listing = self._ask(Question(uuid4().hex, stream))
+        if stream not in listing.streams:
+            names = ", ".join(self.streams().streams) or "none"
+            raise ServiceError(f"the fleet {listing.fleet} has no stream {stream!r}: its streams are {names}")
+        return self._place(listing.streams[stream])
+
+    def request(self, stream: str) -> None:
+        """Ask for one stream without waiting; `receive` returns the answer. A new request replaces the last one."""
+        self._question = uuid4().hex
+        self._follow_manager()
+        self._requester.send(Question(self._question, stream))
+
+    def receive(self, stream: str) -> tuple[str, Place | None] | None:
+        """The answer to `request` if it has arrived: name of the fleet, and the place, None if there is no stream."""
+        listing = self._requester.receive(self._question, 0)
+        if listing is None:
+            return None
+        status = listing.streams.get(stream)
+        return listing.fleet, None if status is None else self._place(status)
+
+    def fileno(self) -> int:
+        """Readable if an answer may have arrived."""
+        return self._requester.fileno()
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._requester.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _ask(self, question: Question) -> Listing:
+        deadline = monotonic() + self.timeout
+        while (left := deadline - monotonic()) > 0:
+            self._follow_manager()
+            if (answer := self._requester.ask(question, min(left, _TURN_SECONDS))) is not None:
+                return answer
+        raise SilenceError(
+            f"no answer from the fleet {self._name} at {self._endpoint} within {self.timeout:g} s: is its manager "
+            "running there?"
+        )
+
+    def _follow_manager(self) -> None:
+        """Connect again if the manager of a fleet on this machine was started again, at another endpoint."""
+        found = None if self._is_remote else fleets().get(self._name)
+        if found is not None and str(found) != str(self._endpoint):
+            self._requester.close()
+            self._endpoint = self._with_keys(found)
+            self._requester = Requester[Question, Listing](REGISTRY, self._endpoint)
+
+    def _remote(self, fleet: str) -> Endpoint:
+        return Endpoint.parse(f"tcp://{fleet}", self._keys or "")
+
+    def _local(self, fleet: str) -> tuple[str, Endpoint]:
+        """Name and endpoint of a fleet of this user."""
+        known = fleets()
+        if not fleet and len(known) == 1:
+            fleet = next(iter(known))
+        if fleet in known:
+            return fleet, self._with_keys(known[fleet])
+        if fleet or not known:
+            which = f"no fleet {fleet!r} of yours" if fleet else "no fleet of yours"
+            listed = f"; there is {', '.join(sorted(known))}" if known else ""
+            raise ServiceError(f"{which} is running: start it (catstream fleet up), or give HOST:PORT of one{listed}")
+        raise ServiceError(f"{len(known)} fleets are running: say which (--fleet): {', '.join(sorted(known))}")
+
+    def _with_keys(self, endpoint: Endpoint) -> Endpoint:
+        return endpoint if self._keys is None else replace(endpoint, keys=self._keys)
+
+    def _place(self, status: StreamStatus) -> Place:
+        """The place of a stream, with the keys to connect to it."""
+        if not status.endpoint:
+            return Place(status)
+        keys = self._endpoint.keys
+        if status.server and keys is None:
+            raise ServiceError(
+                f"the stream {status.name} asks for keys, and none were given: give a folder of keys that its fleet "
+                "lets in (--keys DIR, see catstream keys)"
+            )
+        known = keys.for_server(status.server) if status.server and keys is not None else ""
+        return Place(status, replace(Endpoint.parse(status.endpoint, known), source=status.source))
+
+
+class RegistryServer:
+    """Answers the questions of clients about the streams and nodes of a fleet.
+
+    Parameters
+    ----------
+    endpoint : Endpoint
+        Endpoint of the manager of the fleet, with the fleet's keys; it listens at exactly this port, or in this folder.
+    status : callable
+        Returns the present state of the fleet; called by `turn`.
+    """
+
+    def __init__(self, endpoint: Endpoint, status: Callable[[], FleetStatus]) -> None:
+        self._status = status
+        self._responder = Responder[Question, Listing](REGISTRY, endpoint)
+
+    def turn(self, seconds: float = 0.0) -> int:
+        """Answer all questions that have arrived, and return their number.
+
+        Parameters
+        ----------
+        seconds : time to wait for the first question
+        """
+        questions = self._responder.receive_all(seconds)
+        if questions:
+            status = self._status()
+            for question in questions:
+                self._responder.answer(_listing(question, status))
+        return len(questions)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._responder.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _listing(question: Question, status: FleetStatus) -> Listing:
+    """The answer to a question: the stream that it asks for, or as much as one message holds."""
+    if question.stream:
+        names, more = [question.stream], False
+    else:
+        left = sorted(name for name in status.streams.keys() | status.nodes.keys() if name > question.after)
+        names, more = left[:LONGEST_LIST], len(left) > LONGEST_LIST
+    streams = {name: _shortened(status.streams[name]) for name in names if name in status.streams}
+    nodes = {name: _shortened(status.nodes[name]) for name in names if name in status.nodes and not question.stream}
+    return Listing(question.id, status.name, status.time, streams, nodes, more)
+
+
+def _shortened(status: Status) -> Status:
+    """A status whose description of a problem is short enough for a message."""
+    if len(status.trouble) <= _LONGEST_TROUBLE:
+        return status
+    return replace(status, trouble=f"{status.trouble[:_LONGEST_TROUBLE]}...")
+
+
+def address_of(fleet: str, stream: str) -> str:
+    """The address of a stream of a fleet.
+
+    >>> address_of("head:5690", "cam-7"), address_of("", "cam-7")
+    ('fleet://head:5690/cam-7', 'fleet://cam-7')
+    """
+    return f"{_PREFIX}{fleet.removeprefix(_PREFIX).rstrip('/')}/{stream}" if fleet else f"{_PREFIX}{stream}"
+
+
+def fleet_and_stream(endpoint: str) -> tuple[str, str] | None:
+    """The fleet and the stream of an address, None if it is no address of a stream of a fleet.
+
+    Raises
+    ------
+    ServiceError
+        If the address has no name of a stream.
+
+    >>> fleet_and_stream("fleet://head:5690/cam-7"), fleet_and_stream("fleet://cam-7"), fleet_and_stream("run")
+    (('head:5690', 'cam-7'), ('', 'cam-7'), None)
+    """
+    if not endpoint.startswith(_PREFIX):
+        return None
+    fleet, _, stream = endpoint.removeprefix(_PREFIX).rpartition("/")
+    if not stream or "/" in fleet or (":" in stream and not fleet):
+        raise ServiceError(
+            f"the address of a stream is fleet://STREAM, fleet://FLEET/STREAM or fleet://HOST:PORT/STREAM, "
+            f"got {endpoint!r}"
+        )
+    return fleet, stream
+
+
+def locate(endpoint: str, keys: str = "", source: str = "") -> Endpoint:
+    """The endpoint of a running pipeline, as `find` does, or of a stream of a fleet at this moment.
+
+    Raises
+    ------
+    ServiceError
+        If there is none, or more than one; if the fleet has no such stream, or it does not run.
+    SilenceError
+        If the manager of the fleet does not answer.
+    """
+    address = fleet_and_stream(endpoint)
+    if address is None:
+        return find(endpoint, keys, source)
+    fleet, stream = address
+    with Registry(fleet, keys) as registry:
+        place = registry.place(stream)
+    if place.endpoint is None:
+        trouble = f": {place.status.trouble}" if place.status.trouble else ""
+        raise ServiceError(f"the stream {stream} runs nowhere, it is {place.status.state}{trouble}")
+    return place.endpoint

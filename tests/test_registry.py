@@ -1,0 +1,188 @@
+"""The registry of a fleet: its state arrives whole, and only clients with a key of the fleet get an answer."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from threading import Event
+
+import pytest
+
+from catstream.errors import ServiceError, SilenceError
+from catstream.messages import FleetStatus, NodeStatus, StreamStatus
+from catstream.registry import Registry, RegistryServer, address_of, fleet_and_stream, locate
+from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, private_folder, running
+from catstream.wire.keys import Client, Keys, allow, clients, clients_of_fleet, create, replace_clients, revoke
+from catstream.wire.rejects import rejects
+
+CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)
+SITE = FleetStatus("site", 1.7e9, {"cam-7": CAM}, {"north": NodeStatus("north", "alive")})
+
+
+@contextmanager
+def managing(status=SITE, text="", keys=""):
+    """A manager in a thread, which answers with this state of the fleet."""
+    over = Event()
+
+    def serve():
+        while not over.is_set():
+            server.turn(0.01)
+
+    with (
+        private_folder() as folder,
+        meeting_place(text, folder, keys, fleet=status.name) as place,
+        RegistryServer(place, lambda: status) as server,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        serving = pool.submit(serve)
+        try:
+            yield place
+        finally:
+            over.set()
+            serving.result(20)
+
+
+@pytest.fixture
+def fleet_keys(folder):
+    """The keys of a fleet, and beside them those of a client that may watch."""
+    create(folder / "keys")
+    allow(folder / "keys", "anna", "watch", output=folder / "anna")
+    return folder / "keys"
+
+
+def test_the_state_of_a_fleet_arrives_as_it_is():
+    with managing(), Registry() as registry:
+        assert registry.streams() == SITE
+        place = registry.place("cam-7")
+    assert (place.status, str(place.endpoint), place.endpoint.source) == (CAM, "run", "walk.mp4")
+
+
+def test_a_fleet_with_more_streams_than_a_message_holds_arrives_whole():
+    many = FleetStatus(
+        "site",
+        1.7e9,
+        {f"cam-{number}": StreamStatus(f"cam-{number}", "running") for number in range(600)},
+        {f"cam-{number}": NodeStatus(f"cam-{number}", "alive") for number in range(500, 800)},
+    )
+    with managing(many), Registry() as registry:
+        assert registry.streams() == many
+
+
+def test_a_long_description_of_a_problem_is_shortened_and_the_rest_arrives():
+    long = replace(SITE, streams={"cam-7": replace(CAM, trouble="x" * 5000)})
+    with managing(long), Registry() as registry:
+        assert len(registry.streams().streams["cam-7"].trouble) < 1100
+
+
+def test_a_stream_that_does_not_exist_is_an_error_with_the_names_of_all():
+    with managing(), Registry() as registry, pytest.raises(ServiceError, match=r"site has no stream 'cam-8'.*cam-7"):
+        registry.place("cam-8")
+
+
+def test_a_stream_that_does_not_run_has_no_endpoint():
+    idle = replace(SITE, streams={"cam-7": StreamStatus("cam-7", "unplaced", trouble="cam-7 needs site=north")})
+    with managing(idle), Registry() as registry:
+        assert registry.place("cam-7").endpoint is None
+        with pytest.raises(ServiceError, match="cam-7 runs nowhere, it is unplaced: cam-7 needs site=north"):
+            locate("fleet://cam-7")
+
+
+def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder):
+    with managing() as manager, meeting_place("", folder, source="walk.mp4") as pipeline:
+        assert fleets() == {"site": manager}
+        assert running() == [pipeline]
+        assert find() == pipeline
+        assert str(locate("fleet://cam-7")) == str(locate("fleet://site/cam-7")) == "run"
+    assert fleets() == {}
+
+
+def test_of_several_fleets_the_name_selects_one():
+    with managing(), managing(replace(SITE, name="yard")):
+        with Registry("yard") as registry:
+            assert registry.streams().name == "yard"
+        with pytest.raises(ServiceError, match=r"2 fleets are running: say which \(--fleet\): site, yard"):
+            Registry()
+
+
+def test_without_a_fleet_the_error_says_how_to_get_one():
+    with pytest.raises(ServiceError, match=r"no fleet of yours is running: start it \(catstream fleet up\)"):
+        Registry()
+    with managing(), pytest.raises(ServiceError, match=r"no fleet 'yard' of yours is running.*; there is site"):
+        Registry("yard")
+
+
+def test_a_manager_that_was_started_again_elsewhere_is_found():
+    with managing():
+        registry = Registry()
+    with registry:
+        registry.timeout = 0.1
+        with pytest.raises(SilenceError, match="no answer from the fleet site at"):
+            registry.streams()
+        registry.timeout = 20
+        with managing():
+            assert registry.streams() == SITE
+
+
+def test_an_address_is_read_as_it_is_written():
+    for fleet in ("", "site", "head:5690", "[::1]:5690"):
+        assert fleet_and_stream(address_of(fleet, "cam-7")) == (fleet, "cam-7")
+    for wrong in ("fleet://", "fleet://site/", "fleet://a/b/c", "fleet://head:5690"):
+        with pytest.raises(ServiceError, match="the address of a stream is"):
+            fleet_and_stream(wrong)
+
+
+def test_a_client_connects_to_a_stream_with_its_own_keys_and_the_public_key_of_the_stream(fleet_keys, folder, tcp):
+    create(folder / "stream")
+    server, anna = Keys.load(folder / "stream").server, Keys.load(folder / "anna")
+    keyed = replace(SITE, streams={"cam-7": replace(CAM, endpoint="tcp://10.0.0.2:5700", server=server.decode())})
+    with managing(keyed, tcp, str(fleet_keys)), Registry(tcp.removeprefix("tcp://"), str(folder / "anna")) as registry:
+        place = registry.place("cam-7")
+    assert place.endpoint.keys == replace(anna, server=server)
+    assert str(place.endpoint) == "tcp://10.0.0.2:5700"
+
+
+def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder, tcp):
+    address = tcp.removeprefix("tcp://")
+    create(folder / "other")
+    with managing(SITE, tcp, str(fleet_keys)):
+        with Registry(address) as registry, pytest.raises(ServiceError, match="asks for keys, and none were given"):
+            registry.streams()
+        with Registry(address, str(folder / "other"), timeout=0.5) as registry, pytest.raises(SilenceError):
+            registry.streams()
+        allowed = rejects().get("rejected_key", 0)
+        revoke(fleet_keys, "anna")
+        with Registry(address, str(folder / "anna")) as registry, pytest.raises(ServiceError, match="does not let"):
+            registry.streams()
+        assert rejects()["rejected_key"] == allowed + 1
+
+
+def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(fleet_keys, folder):
+    stream = folder / "stream"
+    create(stream)
+    own = clients(stream)["pipeline"]
+    allow(stream, "old", "steer", output=folder / "old")
+    replace_clients(stream, clients_of_fleet(fleet_keys))
+    assert clients(stream) == {
+        "pipeline": own,
+        "fleet.pipeline": clients(fleet_keys)["pipeline"],
+        "anna": clients(fleet_keys)["anna"],
+    }
+    revoke(fleet_keys, "anna")
+    allow(fleet_keys, "anna", "steer", output=folder / "new")
+    replace_clients(stream, clients_of_fleet(fleet_keys))
+    assert clients(stream)["anna"] == Client("steer", Keys.load(folder / "new").public.decode())
+    assert (stream / "clients" / "anna").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize("name", ["../server.key", ".hidden", ""])
+def test_a_client_whose_name_is_no_name_changes_nothing(fleet_keys, name):
+    before = clients(fleet_keys)
+    with pytest.raises(ServiceError, match="a client's name"):
+        replace_clients(fleet_keys, {name: Client("watch", "k" * 40)})
+    assert clients(fleet_keys) == before
+
+
+def test_an_endpoint_of_a_fleet_that_others_can_reach_needs_keys():
+    with pytest.raises(ServiceError, match="other machines"):
+        Endpoint.parse("tcp://10.0.0.1:5690")
