@@ -515,6 +515,8 @@ class StreamStatus:
     endpoint        of its pipeline, in the format of the setting `run.endpoint`; empty if it does not run
     server          public key of the sockets of its pipeline, empty if the pipeline has no keys
     token           fencing token of its pipeline: each pipeline that is started for the stream has a larger one
+    began           token of the pipeline that began the stream anew, without the state of the one before it, so that
+                    frames count from 0 again; 0 if none did
     frame           number of the newest frame that was tracked
     rate            tracked frames per second
     skipped         frames of a live source that were not tracked, because the pipeline was too slow
@@ -534,6 +536,7 @@ class StreamStatus:
     endpoint: str = ""
     server: str = ""
     token: int = 0
+    began: int = 0
     frame: int = 0
     rate: float = 0.0
     skipped: int = 0

@@ -17,6 +17,7 @@ the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet://STR
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from time import monotonic
 from typing import Self, TypeVar
@@ -27,7 +28,7 @@ from catstream.messages import FleetStatus, Listing, NodeStatus, Question, Strea
 from catstream.schema import LONGEST_LIST
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
-from catstream.wire.endpoint import Endpoint, find, fleets
+from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, private_folder
 from catstream.wire.keys import Keys
 
 __all__ = ["Place", "Registry", "RegistryServer", "address_of", "fleet_and_stream", "locate"]
@@ -193,15 +194,31 @@ class RegistryServer:
 
     Parameters
     ----------
-    endpoint : Endpoint
-        Endpoint of the manager of the fleet, with the fleet's keys; it listens at exactly this port, or in this folder.
+    listen : str
+        tcp://HOST:PORT, of which this port listens; empty for a Unix socket in a private folder.
+    keys : str
+        Folder of the fleet's keys, required if other machines can reach the host; empty for none.
     status : callable
-        Returns the present state of the fleet; called by `turn`.
+        Returns the present state of the fleet; it is called once here, for the fleet's name, and then by `turn`.
+
+    Attributes
+    ----------
+    endpoint : Endpoint
+        The endpoint. While the server is open, other processes of this user find it by the fleet's name.
+
+    Raises
+    ------
+    ServiceError
+        If the address is not valid or in use, or the keys cannot be read.
     """
 
-    def __init__(self, endpoint: Endpoint, status: Callable[[], FleetStatus]) -> None:
+    def __init__(self, listen: str, keys: str, status: Callable[[], FleetStatus]) -> None:
         self._status = status
-        self._responder = Responder[Question, Listing](REGISTRY, endpoint)
+        with ExitStack() as stack:
+            folder = stack.enter_context(private_folder())
+            self.endpoint = stack.enter_context(meeting_place(listen, folder, keys, fleet=status().name))
+            self._responder = stack.enter_context(Responder[Question, Listing](REGISTRY, self.endpoint))
+            self._stack = stack.pop_all()
 
     def turn(self, seconds: float = 0.0) -> int:
         """Answer all questions that have arrived, and return their number.
@@ -219,7 +236,7 @@ class RegistryServer:
 
     def close(self) -> None:
         """Stop listening."""
-        self._responder.close()
+        self._stack.close()
 
     def __enter__(self) -> Self:
         return self

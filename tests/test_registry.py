@@ -12,8 +12,8 @@ import pytest
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import FleetStatus, NodeStatus, StreamStatus
 from catstream.registry import Registry, RegistryServer, address_of, fleet_and_stream, locate
-from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, private_folder, running
-from catstream.wire.keys import Client, Keys, allow, clients, clients_of_fleet, create, replace_clients, revoke
+from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, running
+from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, public_key, revoke, synchronise
 from catstream.wire.rejects import rejects
 
 CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)
@@ -29,15 +29,10 @@ def managing(status=SITE, text="", keys=""):
         while not over.is_set():
             server.turn(0.01)
 
-    with (
-        private_folder() as folder,
-        meeting_place(text, folder, keys, fleet=status.name) as place,
-        RegistryServer(place, lambda: status) as server,
-        ThreadPoolExecutor(1) as pool,
-    ):
+    with RegistryServer(text, keys, lambda: status) as server, ThreadPoolExecutor(1) as pool:
         serving = pool.submit(serve)
         try:
-            yield place
+            yield server.endpoint
         finally:
             over.set()
             serving.result(20)
@@ -134,11 +129,11 @@ def test_an_address_is_read_as_it_is_written():
 
 def test_a_client_connects_to_a_stream_with_its_own_keys_and_the_public_key_of_the_stream(fleet_keys, folder, tcp):
     create(folder / "stream")
-    server, anna = Keys.load(folder / "stream").server, Keys.load(folder / "anna")
-    keyed = replace(SITE, streams={"cam-7": replace(CAM, endpoint="tcp://10.0.0.2:5700", server=server.decode())})
+    server, anna = public_key(folder / "stream"), Keys.load(folder / "anna")
+    keyed = replace(SITE, streams={"cam-7": replace(CAM, endpoint="tcp://10.0.0.2:5700", server=server)})
     with managing(keyed, tcp, str(fleet_keys)), Registry(tcp.removeprefix("tcp://"), str(folder / "anna")) as registry:
         place = registry.place("cam-7")
-    assert place.endpoint.keys == replace(anna, server=server)
+    assert place.endpoint.keys == replace(anna, server=server.encode())
     assert str(place.endpoint) == "tcp://10.0.0.2:5700"
 
 
@@ -150,11 +145,11 @@ def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder
             registry.streams()
         with Registry(address, str(folder / "other"), timeout=0.5) as registry, pytest.raises(SilenceError):
             registry.streams()
-        allowed = rejects().get("rejected_key", 0)
+        before = rejects().get("rejected_key", 0)
         revoke(fleet_keys, "anna")
         with Registry(address, str(folder / "anna")) as registry, pytest.raises(ServiceError, match="does not let"):
             registry.streams()
-        assert rejects()["rejected_key"] == allowed + 1
+        assert rejects()["rejected_key"] == before + 1
 
 
 def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(fleet_keys, folder):
@@ -162,7 +157,7 @@ def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(
     create(stream)
     own = clients(stream)["pipeline"]
     allow(stream, "old", "steer", output=folder / "old")
-    replace_clients(stream, clients_of_fleet(fleet_keys))
+    synchronise(stream, allowed(fleet_keys))
     assert clients(stream) == {
         "pipeline": own,
         "fleet.pipeline": clients(fleet_keys)["pipeline"],
@@ -170,7 +165,7 @@ def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(
     }
     revoke(fleet_keys, "anna")
     allow(fleet_keys, "anna", "steer", output=folder / "new")
-    replace_clients(stream, clients_of_fleet(fleet_keys))
+    synchronise(stream, allowed(fleet_keys))
     assert clients(stream)["anna"] == Client("steer", Keys.load(folder / "new").public.decode())
     assert (stream / "clients" / "anna").stat().st_mode & 0o777 == 0o600
 
@@ -179,7 +174,7 @@ def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(
 def test_a_client_whose_name_is_no_name_changes_nothing(fleet_keys, name):
     before = clients(fleet_keys)
     with pytest.raises(ServiceError, match="a client's name"):
-        replace_clients(fleet_keys, {name: Client("watch", "k" * 40)})
+        synchronise(fleet_keys, {name: Client("watch", "k" * 40)})
     assert clients(fleet_keys) == before
 
 

@@ -29,7 +29,7 @@ from catstream.errors import ServiceError
 from catstream.storage import write_atomically
 from catstream.wire.channels import Role
 
-__all__ = ["ROLES", "Client", "Keys", "allow", "clients", "clients_of_fleet", "create", "replace_clients", "revoke"]
+__all__ = ["ROLES", "Client", "Keys", "allow", "allowed", "clients", "create", "public_key", "revoke", "synchronise"]
 
 #: The permissions of a client: each role includes those before it.
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -142,7 +142,7 @@ def allow(folder: Path, name: str, role: Role, output: Path | None = None, publi
     _check_name(name)
     if public is not None:
         _check_public(public)
-    server = _key(_read(folder / _SERVER_PUBLIC), "public", folder)
+    server = public_key(folder).encode()
     known = clients(folder)
     if name in known:
         raise ServiceError(f"there is a client {name} already: take another name, or `catstream keys revoke` it first")
@@ -171,8 +171,8 @@ def revoke(folder: Path, name: str) -> None:
     (folder / _CLIENTS / name).unlink(missing_ok=True)
 
 
-def clients_of_fleet(folder: Path) -> dict[str, Client]:
-    """The clients that may connect to the streams of a fleet, by name, for `replace_clients` of each stream.
+def allowed(folder: Path) -> dict[str, Client]:
+    """The clients that may connect to the streams of a fleet, by name, for `synchronise` at each stream.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def clients_of_fleet(folder: Path) -> dict[str, Client]:
     return {_FLEET if name == _OWN else name: client for name, client in clients(folder).items()}
 
 
-def replace_clients(folder: Path, wanted: Mapping[str, Client]) -> None:
+def synchronise(folder: Path, wanted: Mapping[str, Client]) -> None:
     """Allow these clients and no others, besides the pipeline's own processes; all others are revoked.
 
     A client that stays is allowed at any time. A connection that is open stays open.
@@ -235,6 +235,17 @@ def clients(folder: Path) -> dict[str, Client]:
             )
         found[path.name] = Client(role, _key(facts, "public", path).decode())
     return found
+
+
+def public_key(folder: Path) -> str:
+    """The public key of the sockets that listen.
+
+    Raises
+    ------
+    ServiceError
+        If the folder holds no keys, or its file is damaged.
+    """
+    return _key(_read(folder / _SERVER_PUBLIC), "public", folder).decode()
 
 
 def _listed(folder: Path) -> list[Path]:
