@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import json
 import os
+import secrets
 import tempfile
 import time
 import zlib
@@ -19,12 +20,14 @@ from catstream.errors import ProtocolError
 __all__ = [
     "Arrays",
     "Metadata",
+    "create_atomically",
     "decode",
     "encode",
     "is_locked",
     "is_writable",
     "lock",
     "read",
+    "remove_parts",
     "write",
     "write_atomically",
 ]
@@ -64,6 +67,47 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o66
     finally:
         with contextlib.suppress(OSError):  # the disk may have become read-only; the next write removes the file
             part.unlink(missing_ok=True)
+
+
+def create_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o600) -> None:
+    """Create a file atomically: it exists with its whole content, or not at all, also after a power cut.
+
+    Parameters
+    ----------
+    mode : permissions of the file, reduced by the umask
+
+    Raises
+    ------
+    FileExistsError
+        If the file exists. It stays unchanged, also if two processes create it at the same moment.
+    OSError
+        If the file cannot be written, or the file system has no hard links.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+    try:
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.link(part, path)  # unlike a rename, this fails if the file exists
+        _sync(path.parent)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def remove_parts(folder: Path, seconds: float) -> None:
+    """Remove the unfinished files that processes left in a folder when they were killed in `create_atomically`.
+
+    Parameters
+    ----------
+    seconds : age of a file from which it is removed
+    """
+    for part in folder.glob(".*.part"):
+        with contextlib.suppress(FileNotFoundError):
+            if part.stat().st_mtime < time.time() - seconds:
+                part.unlink()
 
 
 def is_writable(folder: Path) -> bool:

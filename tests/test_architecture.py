@@ -53,8 +53,8 @@ IMPORTERS = {
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
     "filelock": ["catstream/storage.py"],
     "safetensors": ["catstream/storage.py"],
-    "fsspec": ["catstream/fleet/store.py"],
-    "s3fs": ["catstream/fleet/store.py"],
+    "fsspec": ["catstream/fleet/objects.py"],
+    "s3fs": ["catstream/fleet/objects.py"],  # fsspec imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/parquet.py"],
     "supervision": ["catstream/adapters.py"],

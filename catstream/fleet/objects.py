@@ -1,0 +1,208 @@
+"""Objects in a folder or an S3 bucket: created exclusively, with time limits, and without a credential in a message.
+
+fsspec finds the credentials of S3 in the environment, in ~/.aws or in the machine's role, and the address of another
+server in AWS_ENDPOINT_URL. They are not part of the URL, which is shown in messages.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+from catstream import storage
+from catstream.errors import FleetError, StoreError
+from catstream.extras import require_extra
+
+__all__ = ["FsspecObjects"]
+
+_SECONDS = 10  # limit of a whole call
+_CONNECT_SECONDS = 3
+_READ_SECONDS = 5  # without any byte from the server
+_ABANDONED_SECONDS = 600  # after which nothing writes a part of a file any more
+_PROBE = "created-exclusively"
+_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
+_CODE = re.compile(r"\w{1,64}")
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS}
+
+_T = TypeVar("_T")
+
+
+class FsspecObjects:
+    """The objects below a folder or a prefix of a bucket.
+
+    Parameters
+    ----------
+    url : folder, file:///folder or s3://bucket/prefix
+    """
+
+    def __init__(self, url: str) -> None:
+        scheme, root = _parse(url)
+        self._local = scheme == "file"
+        self._url = root if self._local else f"s3://{root}"
+        self._root = root
+        self._fs = _local() if self._local else _s3()
+        #: Argument of each call of fsspec: it limits calls over a network, which run in a thread of fsspec.
+        self._limit: dict[str, Any] = {} if self._local else {"timeout": _SECONDS}
+
+    def __repr__(self) -> str:
+        return f"FsspecObjects({self._url!r})"
+
+    def make(self) -> None:
+        """Create the folder of the store. A bucket has to exist."""
+        if self._local:
+            self._call("", "created", lambda path: Path(path).mkdir(parents=True, exist_ok=True))
+
+    def check(self) -> None:
+        """Check that the store is there and that it creates objects exclusively.
+
+        Raises
+        ------
+        StoreError
+            If it does not.
+        """
+        if self._local:
+            if not Path(self._root).is_dir():
+                raise StoreError(f"the store {self._url} is not a folder on this machine: is its file system mounted?")
+            return
+        for _ in range(2):  # the first time, the object does not exist yet
+            try:
+                self.create(_PROBE, b"")
+            except FileExistsError:
+                return
+        raise StoreError(
+            f"the server of the store {self._url} ignores If-None-Match, so that two processes could write the state "
+            "of one stream: use a server that supports it, such as AWS S3 or a current MinIO"
+        )
+
+    def create(self, name: str, data: bytes) -> None:
+        """Create an object; see `catstream.fleet.log.Objects`."""
+
+        def created(path: str) -> None:
+            if self._local:
+                Path(path).parent.mkdir(parents=True, exist_ok=True)
+                storage.create_atomically(path, data)
+            else:
+                self._fs.pipe_file(path, data, mode="create", **self._limit)
+
+        self._call(name, "written", created, passed=FileExistsError)
+
+    def read(self, name: str) -> bytes:
+        """Return the content of an object."""
+        read: Callable[[str], bytes] = lambda path: self._fs.cat_file(path, **self._limit)  # noqa: E731
+        return self._call(name, "read", read, passed=FileNotFoundError)
+
+    def exists(self, name: str) -> bool:
+        """Return whether there is such an object."""
+        try:
+            self._call(name, "found", lambda path: self._fs.info(path, **self._limit), passed=FileNotFoundError)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """Return the sizes of all objects below a folder, by the part of their names below it."""
+        find = self._call(folder, "listed", lambda path: self._fs.find(path, detail=True, **self._limit))
+        start = len(f"{self._root}/{folder}/")
+        return {path[start:]: found["size"] for path, found in find.items()}
+
+    def remove(self, name: str) -> None:
+        """Remove an object, if it exists."""
+        try:
+            self._call(name, "removed", lambda path: self._fs.rm_file(path, **self._limit), passed=FileNotFoundError)
+        except FileNotFoundError:
+            return
+
+    def tidy(self, folder: str) -> None:
+        """Remove the old parts of files that killed processes left. S3 keeps no part of an object."""
+        if self._local:
+            self._call(folder, "tidied", lambda path: storage.remove_parts(Path(path), _ABANDONED_SECONDS))
+
+    def _call(
+        self,
+        name: str,
+        what: str,
+        function: Callable[[str], _T],
+        passed: type[OSError] | tuple[type[OSError], ...] = (),
+    ) -> _T:
+        """Call a function with the path of an object; every error except those of the type `passed` is a StoreError."""
+        try:
+            return function(f"{self._root}/{name}")
+        except Exception as error:
+            code = _code(error)
+            if code == "ConditionalRequestConflict":  # another process creates the same object at this moment
+                error = FileExistsError()
+            if isinstance(error, passed) and code != "NoSuchBucket":
+                raise type(error)(name) from None
+            raise StoreError(f"{name} of the store {self._url} cannot be {what}: {_trouble(error, code)}") from None
+
+
+def _parse(url: str) -> tuple[str, str]:
+    """The scheme of a URL, and the folder, or bucket and prefix. No error shows the URL: it may contain a password."""
+    if "://" not in url:
+        return "file", str(Path(url).resolve())
+    parts = urlsplit(url)
+    if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
+        raise FleetError(
+            "the URL of the store contains a user, a password or a query: give credentials in the environment or in "
+            "~/.aws/credentials, and s3://bucket/prefix only"
+        )
+    if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
+        return "file", str(Path(parts.path).resolve())
+    if parts.scheme == "s3" and _BUCKET.fullmatch(parts.netloc):
+        return "s3", f"{parts.netloc}{parts.path}".rstrip("/")
+    raise FleetError("the URL of the store is not valid: expected a folder, file:///folder or s3://bucket/prefix")
+
+
+def _local() -> Any:
+    require_extra("fleet")
+    import fsspec
+
+    return fsspec.filesystem("file")
+
+
+def _s3() -> Any:
+    """The file system of S3. It repeats nothing: the caller goes on, and writes a newer state later."""
+    require_extra("fleet")
+    require_extra("s3")
+    import fsspec
+
+    for library in ("botocore", "aiobotocore"):  # at the level DEBUG they log session tokens
+        logging.getLogger(library).setLevel(logging.INFO)
+    limits = {"connect_timeout": _CONNECT_SECONDS, "read_timeout": _READ_SECONDS, "retries": {"total_max_attempts": 1}}
+    fs = fsspec.filesystem("s3", skip_instance_cache=True, use_listings_cache=False, config_kwargs=limits)
+    fs.retries = 1
+    return fs
+
+
+def _code(error: BaseException) -> str:
+    """The code of an error that an S3 server answered, or ""."""
+    response = getattr(error, "response", None) or getattr(error.__cause__, "response", None) or {}
+    code = str(response.get("Error", {}).get("Code", ""))
+    return code if _CODE.fullmatch(code) else ""
+
+
+def _trouble(error: Exception, code: str) -> str:
+    """What went wrong and what to do, without the text of the error: it may contain a credential."""
+    if code == "NoSuchBucket":
+        return "there is no such bucket: create it"
+    if code:
+        return f"the server answered {code}: check the bucket and its permissions"
+    if isinstance(error, TimeoutError):
+        return f"no answer within {_SECONDS} s: check the network and the server"
+    number = error.errno if isinstance(error, OSError) else None
+    if number in _FULL:
+        return f"{os.strerror(number)}: free some space there"
+    if number in _NO_LINKS:
+        return f"{os.strerror(number)}: the folder needs to be writable, and its file system needs hard links"
+    if number is not None:
+        return f"{os.strerror(number)}: check the folder, or the network and the server"
+    if "Credentials" in type(error).__name__:
+        return "no credentials were found: set AWS_PROFILE, or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+    return f"{type(error).__name__}: check the network and the server"

@@ -1,0 +1,227 @@
+"""The store: the same laws in a folder and on an S3 server; full disks, lost servers, hidden credentials."""
+
+from __future__ import annotations
+
+import logging
+import os
+import resource
+import secrets
+import stat
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from catstream import storage
+from catstream.errors import FencedError, FleetError, StoreError
+from catstream.fleet import log
+from catstream.fleet.log import LARGEST_CLAIM
+from catstream.fleet.store import Store
+
+STATE = {"job.safetensors": secrets.token_bytes(300), "trees/12.safetensors": b""}
+SECRETS = {
+    "AWS_ACCESS_KEY_ID": "AKIA-not-to-be-seen",
+    "AWS_SECRET_ACCESS_KEY": "secret-not-to-be-seen",
+    "AWS_SESSION_TOKEN": "token-not-to-be-seen",
+}
+
+
+@pytest.fixture(scope="module")
+def s3_server():
+    """An S3 server with an empty bucket, and its address in the environment."""
+    from moto.moto_server.threaded_moto_server import ThreadedMotoServer
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in SECRETS.items():
+            patch.setenv(name, value)
+        patch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*server.get_host_and_port()))
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        Store("s3://fleet")._objects._fs.mkdir("fleet")
+        yield server
+    server.stop()
+
+
+@pytest.fixture(params=["file", "s3"])
+def url(request, tmp_path):
+    if request.param == "file":
+        return tmp_path.as_uri()
+    request.getfixturevalue("s3_server")
+    return f"s3://fleet/{secrets.token_hex(4)}"
+
+
+@pytest.fixture
+def store(url):
+    return Store(url)
+
+
+def numbers(store, stream="cam-7"):
+    return sorted(map(int, store._objects.sizes(f"streams/{stream}")))
+
+
+def test_a_state_is_read_as_it_was_written(store):
+    store.claim("cam-7", "node-1").write(STATE, {"frame": 12})
+    found = store.newest("cam-7")
+    assert (found.files, found.facts) == (STATE, {"frame": 12})
+
+
+def test_a_claim_continues_from_the_newest_state_and_has_a_higher_token(store):
+    first = store.claim("cam-7", "node-1")
+    first.write(STATE, {"frame": 1})
+    first.write(STATE, {"frame": 2})
+    second = store.claim("cam-7", "node-2")
+    assert (first.state, second.state.facts) == (None, {"frame": 2})
+    assert second.token > first.token
+
+
+def test_a_fenced_holder_writes_no_more_and_is_told_by_whom(store):
+    paused = store.claim("cam-7", "node-1")
+    paused.write(STATE, {"frame": 1})
+    store.claim("cam-7", "node-2").write(STATE, {"frame": 2})
+    for _ in range(2):
+        with pytest.raises(FencedError, match=r"streams/cam-7 was claimed by node-2 after node-1"):
+            paused.write(STATE, {"frame": 3})
+    assert store.newest("cam-7").facts == {"frame": 2}
+
+
+def test_a_holder_is_fenced_although_the_claims_after_its_own_were_removed(store, monkeypatch):
+    monkeypatch.setattr(log, "_CLAIMS", 3)
+    paused = store.claim("cam-7", "node-1")
+    for turn in range(5):
+        newest = store.claim("cam-7", f"node-{turn}")
+    with pytest.raises(FencedError):
+        paused.write(STATE, {})
+    newest.write(STATE, {"frame": 1})
+    assert store.newest("cam-7").facts == {"frame": 1}
+    assert len(numbers(store)) == 4  # three claims, one state
+
+
+def test_two_states_stay_however_many_are_written(store):
+    claim = store.claim("cam-7", "node-1")
+    for frame in range(9):
+        claim.write(STATE, {"frame": frame})
+    assert numbers(store) == [claim.token, claim.token + 8, claim.token + 9]
+
+
+def test_a_later_holder_removes_the_states_of_an_earlier_one(store):
+    store.claim("cam-7", "node-1").write(STATE, {"frame": 1})
+    claim = store.claim("cam-7", "node-2")
+    claim.write(STATE, {"frame": 2})
+    claim.write(STATE, {"frame": 3})
+    assert numbers(store) == [1, claim.token, claim.token + 1, claim.token + 2]
+
+
+def test_a_damaged_state_is_passed_over(store):
+    claim = store.claim("cam-7", "node-1")
+    claim.write(STATE, {"frame": 1})
+    store._objects.create(f"streams/cam-7/{claim.token + 2:012}", b"half of a sta")
+    assert store.newest("cam-7").facts == {"frame": 1}
+    assert store.claim("cam-7", "node-2").state.facts == {"frame": 1}
+
+
+def test_streams_are_those_that_have_a_state(store):
+    large = {"state": bytes(LARGEST_CLAIM)}
+    for stream, files in (("small", STATE), ("large", large), ("gone", STATE)):
+        store.claim(stream, "node-1").write(files, {})
+    store.claim("claimed", "node-1")
+    store.remove("gone")
+    assert store.streams() == ["large", "small"]
+
+
+def test_a_removed_stream_begins_anew_and_its_old_holder_is_fenced(store):
+    old = store.claim("cam-7", "node-1")
+    old.write(STATE, {"frame": 1})
+    store.remove("cam-7")
+    store.remove("never-seen")
+    assert store.newest("cam-7") is None
+    with pytest.raises(FencedError):
+        old.write(STATE, {"frame": 2})
+    new = store.claim("cam-7", "node-2")
+    assert (new.state, new.token > old.token) == (None, True)
+
+
+def test_the_newest_spec_and_model_are_returned(store):
+    assert (store.get_fleet(), store.get_model("anna")) == (None, None)
+    for version in (1, 2):
+        store.put_fleet(f"spec {version}")
+        store.put_model("anna", b"model %d" % version, {"version": version})
+    found = store.get_model("anna")
+    assert store.get_fleet() == "spec 2"
+    assert (found.files, found.facts) == ({"model": b"model 2"}, {"version": 2})
+    assert store.get_model("anna", after=found.number) is None
+
+
+def test_of_many_claimants_at_once_only_the_last_one_writes(tmp_path):
+    """Real processes' races: in a folder, by several threads with a store each."""
+    barrier = threading.Barrier(8)
+
+    def claimed(turn):
+        store = Store(str(tmp_path))
+        barrier.wait()
+        return store.claim("cam-7", f"node-{turn}")
+
+    with ThreadPoolExecutor(8) as pool:
+        claims = list(pool.map(claimed, range(8)))
+    *fenced, last = sorted(claims, key=lambda claim: claim.token)
+    for claim in fenced:
+        with pytest.raises(FencedError):
+            claim.write(STATE, {})
+    last.write(STATE, {"frame": 1})
+    assert len({claim.token for claim in claims}) == 8
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a\n", "é", "x" * 65])
+def test_an_invalid_name_of_a_stream_is_refused(tmp_path, name):
+    with pytest.raises(FleetError, match="is not the name of a stream"):
+        Store(str(tmp_path)).claim(name, "node-1")
+
+
+def test_a_folder_that_is_not_there_is_not_created_by_a_claim(tmp_path):
+    """It may be a file system that is not mounted on this machine."""
+    store = Store(str(tmp_path / "share"))
+    with pytest.raises(StoreError, match="is its file system mounted"):
+        store.claim("cam-7", "node-1")
+    store.put_fleet("")
+    assert store.claim("cam-7", "node-1").token == 1
+
+
+def test_files_of_a_store_are_readable_by_their_owner_only(tmp_path):
+    Store(str(tmp_path)).put_fleet("rtsp://user:password@camera")
+    (path,) = (tmp_path / "fleet").glob("*2")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_a_full_disk_is_a_store_error_and_the_next_write_succeeds(tmp_path):
+    claim = Store(str(tmp_path)).claim("cam-7", "node-1")
+    claim.write(STATE, {"frame": 1})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(StoreError, match=r"streams/cam-7/0+3 of the store .* cannot be written: .*free some space"):
+            claim.write({"state": bytes(5000)}, {"frame": 2})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert Store(str(tmp_path)).newest("cam-7").facts == {"frame": 1}
+    claim.write(STATE, {"frame": 3})
+    assert Store(str(tmp_path)).newest("cam-7").facts == {"frame": 3}
+
+
+def test_what_a_killed_writer_left_long_ago_is_removed_by_the_next_claim(tmp_path, monkeypatch):
+    store = Store(str(tmp_path))
+    with monkeypatch.context() as killed:
+        killed.setattr(Path, "unlink", lambda *_, **__: None)
+        store.claim("cam-7", "node-1").write(STATE, {})
+    old, recent = tmp_path.glob("streams/cam-7/.*.part")
+    os.utime(old, (0, 0))
+    store.claim("cam-7", "node-2")
+    assert list(tmp_path.glob("streams/cam-7/.*.part")) == [recent]
+
+
+def test_a_file_is_created_whole_or_not_at_all(tmp_path):
+    storage.create_atomically(tmp_path / "a", b"first")
+    with pytest.raises(FileExistsError):
+        storage.create_atomically(tmp_path / "a", b"second")
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"first")]
