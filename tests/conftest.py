@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import random
+import signal
 import socket
 import tempfile
 import threading
@@ -28,6 +29,9 @@ from catstream.wire.endpoint import private_folder
 
 hypothesis.settings.register_profile("catstream", deadline=None)  # no time is a pass mark
 hypothesis.settings.load_profile("catstream")
+
+# It is ignored if the tests run in the background of a script, and so it would be by the processes of the tests.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 #: Which of the processes that share the tests (pytest-xdist) this is, and of how many.
 WORKER, WORKERS = (

@@ -58,7 +58,11 @@ def interruptible() -> Iterator[None]:
     """End this process at once on Ctrl-C inside a `with`. It is for imports before any work.
 
     Kernels are compiled during these imports, and the compiler hides a KeyboardInterrupt or makes another error of it.
+    If SIGINT is ignored, as in the background job of a script, it stays ignored.
     """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        yield
+        return
 
     def leave(*_: object) -> None:
         os.write(2, b"stopped\n")

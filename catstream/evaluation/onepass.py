@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
+from contextlib import closing
 from pathlib import Path
 from time import perf_counter
 
@@ -119,18 +120,19 @@ def evaluate(
             missing.append(task)
         else:
             add(run)
-    for result in _run_all(missing, output, jobs):
-        if isinstance(result, EvaluationRun):
-            add(result)
-        elif failed is None:
-            raise result
-        else:
-            failed(result)
+    with closing(_run_all(missing, output, jobs)) as results:  # an error or Ctrl-C kills the workers
+        for result in results:
+            if isinstance(result, EvaluationRun):
+                add(result)
+            elif failed is None:
+                raise result
+            else:
+                failed(result)
     names = [(tracker, run_name(sequence, start)) for tracker, _, sequence, start in tasks]
     return [runs[name] for name in names if name in runs]
 
 
-def _run_all(tasks: list[_Task], output: Path | None, jobs: int) -> Iterator[EvaluationRun | CatstreamError]:
+def _run_all(tasks: list[_Task], output: Path | None, jobs: int) -> Generator[EvaluationRun | CatstreamError]:
     if jobs == 1:
         yield from (_follow_and_save(output, *task) for task in tasks)
         return

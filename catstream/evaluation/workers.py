@@ -1,6 +1,7 @@
-"""Runs tasks in worker processes that end on Ctrl-C without a traceback.
+"""Runs tasks in worker processes, which end with their parent.
 
-This module is the first one that a worker imports, before those that take long to import.
+SIGINT stays blocked in the workers: on Ctrl-C, the parent kills them. Otherwise they would end before the parent, which
+would report a worker that was killed, and they would end in a job whose parent ignores SIGINT, as in the background.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
@@ -24,7 +25,7 @@ _Result = TypeVar("_Result")
 _CTRL_C = {signal.SIGINT}
 
 
-def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], jobs: int) -> Iterator[_Result]:
+def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], jobs: int) -> Generator[_Result]:
     """Yield the result of `work(*task)` for each task, in order of completion, from `jobs` processes.
 
     If the caller stops early, for example on Ctrl-C, all workers are killed.
@@ -35,7 +36,7 @@ def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]],
         If a worker was killed by another process or the kernel.
     """
     others = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=_init_worker, initargs=(os.getpid(),)) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=die_with, initargs=(os.getpid(),)) as pool:
         try:
             for future in as_completed(_submit(pool, work, tasks)):
                 yield future.result()
@@ -50,16 +51,9 @@ def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]],
 def _submit(
     pool: ProcessPoolExecutor, work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]]
 ) -> list[Future[_Result]]:
-    """Submit all tasks. The workers are started here, and inherit a blocked SIGINT; `_init_worker` unblocks it."""
+    """Submit all tasks. The workers are started here, and inherit the blocked SIGINT."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _CTRL_C)
     try:
         return [pool.submit(work, *task) for task in tasks]
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _init_worker(parent: int) -> None:
-    """Let Ctrl-C end this worker without output, and end it with its parent."""
-    die_with(parent)
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _CTRL_C)

@@ -33,6 +33,11 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, 
     assert not psutil.wait_procs(children, timeout=10)[1]
 
 
+def test_ctrl_c_ends_no_worker_because_the_caller_does():
+    """A worker that ended on its own would be reported as killed, also by a caller that ignores Ctrl-C."""
+    assert list(run_tasks(signal.raise_signal, [(signal.SIGINT,)] * 2, jobs=2)) == [None, None]
+
+
 def test_a_caller_that_stops_early_leaves_no_worker():
     given = run_tasks(abs, [(-1,), (-2,), (-3,)], jobs=2)
     assert next(given) in {1, 2, 3}
@@ -49,3 +54,12 @@ def test_ctrl_c_during_imports_ends_at_once(monkeypatch, capfd):
         signal.raise_signal(signal.SIGINT)
     assert capfd.readouterr().err == "stopped\n"
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_during_imports_an_ignored_ctrl_c_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with interruptible():
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
