@@ -104,19 +104,30 @@ class Box(_Rectangle):
             ) from None
         return cls(x, y, w, h)
 
+    def checked(self) -> Box:
+        """Return the box unchanged if tracking can start with it in some frame.
+
+        Raises
+        ------
+        BoxError
+            If a number is not finite, or the box has no area.
+        """
+        if not all(math.isfinite(value) for value in self):
+            raise BoxError(f"a box needs four finite numbers, got {self}: give x,y,w,h in pixels")
+        if self.w < 2 or self.h < 2:
+            raise BoxError(f"a box needs a width and a height of at least 2 pixels, got {self.w:g} x {self.h:g}")
+        return self
+
     def validated(self, width: int, height: int) -> Box:
         """Return the box unchanged if tracking can start with it in a frame of this size.
 
         Raises
         ------
         BoxError
-            If a number is not finite, the box has no area, it is more than twice as wide or high as the frame, or its
-            centre lies outside the frame.
+            If `checked` raises it, the box is more than twice as wide or high as the frame, or its centre lies outside
+            the frame.
         """
-        if not all(math.isfinite(value) for value in self):
-            raise BoxError(f"a box needs four finite numbers, got {self}: give x,y,w,h in pixels")
-        if self.w < 2 or self.h < 2:
-            raise BoxError(f"a box needs a width and a height of at least 2 pixels, got {self.w:g} x {self.h:g}")
+        self.checked()
         # With its centre inside the frame, such a box covers the whole frame: it does not select an object.
         if self.w > 2 * width or self.h > 2 * height:
             raise BoxError(
