@@ -7,7 +7,7 @@
     [streams.cam-7]
     source = "rtsp://camera/1"
     box = [120, 80, 64, 48]            # or boxes = { anna = [...] }, model = "a.safetensors", models = { anna = "..." }
-    settings = { "search.budget" = 1 }
+    settings = { "coreset.size" = 128 }
     cores = 0.5                        # measured while it runs if this is left out
     labels = { site = "north" }        # labels that its node must have
     follow = ["anna"]                  # objects whose merged model this stream searches for
@@ -246,7 +246,7 @@ _TABLES = {
     "boxes": "{ anna = [120, 80, 64, 48] }",
     "models": '{ anna = "anna.safetensors" }',
     "labels": '{ site = "north" }',
-    "settings": '{ "search.budget" = 1 }',
+    "settings": '{ "coreset.size" = 128 }',
 }
 
 
@@ -268,7 +268,7 @@ def _models(key: str, value: object, folder: Path) -> dict[str, Path]:
 
 
 def _settings(key: str, value: object, folder: Path) -> dict[str, object]:
-    """Settings by full name: `{ search = { budget = 1 } }` is `{ "search.budget" = 1 }`."""
+    """Settings by full name: `{ search = { budget = 1 } }` is `{ "coreset.size" = 128 }`."""
     flat: dict[str, object] = {}
     for name, each in _table(key, value, folder).items():
         flat |= {f"{name}.{short}": one for short, one in each.items()} if isinstance(each, Mapping) else {name: each}
