@@ -23,6 +23,7 @@ from catstream.services.start import environment, service_command
 from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
 from catstream.subscription import subscribe
+from catstream.web.app import pipeline_site
 from catstream.web.server import Server
 from catstream.wire import keys
 from catstream.wire.channels import CHANNELS, HEALTH
@@ -113,7 +114,7 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
     verb, command, rest = group.resolve_command(options, service["command"])
     page = command.make_context(verb, rest, parent=options).params
     assert (page["endpoint"], page["port"]) == (settings("detector").run.endpoint, 8000)
-    server = Server(page["endpoint"], host=page["host"], port=0, token=page["token"])
+    server = Server(pipeline_site(page["endpoint"]), host=page["host"], port=0, token=page["token"])
     script = service["healthcheck"]["test"][-1].replace(":8000", f":{urlsplit(server.url).port}")
     with server.in_background():
         subprocess.run([sys.executable, "-P", "-c", script], check=True)
@@ -122,7 +123,7 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
 def test_without_a_token_the_page_does_not_start():
     token = filled_in(SERVICES["view"]["environment"]["VIEW_TOKEN"])
     with pytest.raises(CatstreamError, match="token"):
-        Server("tcp://127.0.0.1:5700", host="0.0.0.0", port=0, token=token)
+        Server(pipeline_site("tcp://127.0.0.1:5700"), host="0.0.0.0", port=0, token=token)
 
 
 def test_a_process_that_dies_resumes_from_its_state():

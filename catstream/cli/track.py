@@ -234,9 +234,11 @@ def _run(
 
 def _serve(pipeline: Pipeline, view: Address, token: str | None, console: Console, stack: ExitStack) -> None:
     """Serve the web page of a pipeline until the stack is left."""
+    from catstream.web.app import pipeline_site
     from catstream.web.server import Server
 
-    server = Server(pipeline.endpoint, pipeline.settings.run.keys, host=view.host, port=view.port, token=token)
+    site = pipeline_site(pipeline.endpoint, pipeline.settings.run.keys)
+    server = Server(site, host=view.host, port=view.port, token=token)
     stack.enter_context(server.in_background())
     for url in server.urls:
         console.print(f"page: {url}", highlight=False)

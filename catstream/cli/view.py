@@ -50,10 +50,11 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
       catstream view --endpoint run --port 8080
       VIEW_TOKEN=$(openssl rand -hex 16) catstream view --host 0.0.0.0
     """
+    from catstream.web.app import pipeline_site
     from catstream.web.server import Server
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    server = Server(endpoint, keys, host=host, port=port, token=token)
+    server = Server(pipeline_site(endpoint, keys), host=host, port=port, token=token)
     for url in server.urls:
         click.echo(url)
     server.run()

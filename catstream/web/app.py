@@ -1,4 +1,4 @@
-"""The web application: the page, its events and pictures, control, and metrics.
+"""The web application of one pipeline: the page, its events and pictures, control, and metrics.
 
 /                 the page
 /events           updates of the page as server-sent events, at most ten per second
@@ -15,7 +15,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -26,6 +26,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from starlette.types import Lifespan
 
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages import Answer
@@ -35,9 +36,10 @@ from catstream.video.annotate import draw_preview
 from catstream.web import metrics
 from catstream.web.feed import Feed
 from catstream.web.guard import TokenBucket, body_of, too_many
+from catstream.web.server import Site
 from catstream.wire.channels import CHANNELS
 
-__all__ = ["create"]
+__all__ = ["pipeline_app", "pipeline_site"]
 
 _PAGE = Path(__file__).with_name("page")
 _UPDATE_SECONDS = 0.1
@@ -48,18 +50,21 @@ _VERBS = ("set-box", "forget", "pause", "resume", "stop")
 _DEFAULTS: dict[str, object] = {"verb": "", "object": "", "box": None, "keep": False}  # of the fields of a command
 
 
-def create(feed: Feed) -> Starlette:
-    """Return the application for a feed, which runs while the application does. Wrap it in a `Guard`."""
-    pages = _Pages(feed)
+def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
+    """Return the site of the pipeline at an endpoint, as in `Feed`."""
+    feed = Feed(endpoint, keys)
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        running = asyncio.create_task(feed.run())
-        yield
-        running.cancel()
-        with suppress(asyncio.CancelledError):
-            await running
+        async with feed.running():
+            yield
 
+    return Site(pipeline_app(feed, lifespan), feed.close)
+
+
+def pipeline_app(feed: Feed, lifespan: Lifespan[Starlette] | None = None) -> Starlette:
+    """Return the application of the page that a feed keeps up to date; its URLs are relative, so it can be mounted."""
+    pages = _Pages(feed)
     return Starlette(
         lifespan=lifespan,
         routes=[

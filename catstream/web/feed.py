@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from time import monotonic
 
 from catstream.errors import CatstreamError
@@ -61,6 +61,21 @@ class Feed:
             self.viewers -= 1
             if not self.viewers:
                 self._has_viewers.clear()
+
+    def close(self) -> None:
+        """Let open pages end."""
+        self.closed = True
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Run inside an `async with`."""
+        task = asyncio.create_task(self.run())
+        try:
+            yield
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
 
     async def run(self) -> None:
         """Connect, and reconnect after each loss, until cancelled."""

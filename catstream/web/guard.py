@@ -124,7 +124,7 @@ class Guard:
         shown = _credential(request.headers)
         if shown is not None:
             return self._reject_wrong_token(shown, request)
-        if request.scope["path"] == "/":
+        if request.scope["path"].endswith("/"):  # a page
             return FileResponse(_LOGIN_PAGE, 401)
         return PlainTextResponse("a token is needed: Authorization: Bearer TOKEN\n", 401)
 

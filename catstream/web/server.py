@@ -1,4 +1,4 @@
-"""The web server of the page; it runs in this thread or in one of its own."""
+"""The web server of a page; it runs in this thread or in one of its own."""
 
 from __future__ import annotations
 
@@ -7,29 +7,41 @@ import fcntl
 import socket
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import uvicorn
+from starlette.types import ASGIApp
 
 from catstream.errors import ServiceError
-from catstream.web.app import create
 from catstream.web.connections import MAX_CONNECTIONS, Connection
-from catstream.web.feed import Feed
 from catstream.web.guard import Guard, is_loopback
 
-__all__ = ["Server"]
+__all__ = ["Server", "Site"]
 
 _SHUTDOWN_SECONDS = 2
 _ALL_ADDRESSES = ("0.0.0.0", "::")  # bind addresses that include all interfaces
 _GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
 
 
+@dataclass(frozen=True, slots=True)
+class Site:
+    """A web application, without access control.
+
+    app    the application
+    close  ends the streams of open pages; called before the shutdown of the server, which waits for all connections
+    """
+
+    app: ASGIApp
+    close: Callable[[], None]
+
+
 class Server:
-    """The web server. Its constructor begins to listen.
+    """The web server of a site, with access control. Its constructor begins to listen.
 
     Parameters
     ----------
-    endpoint, keys : endpoint and client keys of the pipeline, as in `Feed`
+    site : what is served
     host, port : address to listen on; port 0 for a free port
     token : token that clients must have; required unless the host is a loopback address
 
@@ -44,16 +56,13 @@ class Server:
         If the page would be public without a token, the token is too short, or the port is in use.
     """
 
-    def __init__(
-        self, endpoint: str = "", keys: str = "", *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None
-    ) -> None:
+    def __init__(self, site: Site, *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None) -> None:
         if token is None and not is_loopback(host):
             raise ServiceError(
                 f"{host} can be reached from other machines, and anyone who sees the page may steer: give a token "
                 "(VIEW_TOKEN=$(openssl rand -hex 16)), or listen on 127.0.0.1"
             )
-        self._feed = Feed(endpoint, keys)
-        guard = Guard(create(self._feed), token)
+        guard = Guard(site.app, token)
         self._socket = _listen(host, port)
         bound = self._socket.getsockname()[1]
         end = f":{bound}/" + (f"#{token}" if token else "")
@@ -75,7 +84,7 @@ class Server:
             backlog=MAX_CONNECTIONS // 2,
             timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
         )
-        self._server = _Uvicorn(config, self._feed)
+        self._server = _Uvicorn(config, site.close)
 
     def run(self) -> None:
         """Serve until Ctrl-C or SIGTERM."""
@@ -97,12 +106,12 @@ class Server:
 class _Uvicorn(uvicorn.Server):
     """Closes the streams of open pages before the shutdown, which waits for all connections."""
 
-    def __init__(self, config: uvicorn.Config, feed: Feed) -> None:
+    def __init__(self, config: uvicorn.Config, close: Callable[[], None]) -> None:
         super().__init__(config)
-        self._feed = feed
+        self._close = close
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        self._feed.closed = True
+        self._close()
         await super().shutdown(sockets)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from catstream.box import Box
 from catstream.messages import Features, Health, Model, ObjectFeatures, Preview, Track, TrainingRows
+from catstream.web.app import pipeline_site
 from catstream.web.server import Server
 
 JPEG = b"\xff\xd8\xff\xe0 a picture"
@@ -57,7 +58,7 @@ def serve(folder):
     with ExitStack() as stack:
 
         def start(**options):
-            server = Server(str(folder), port=0, **options)
+            server = Server(pipeline_site(str(folder)), port=0, **options)
             stack.enter_context(server.in_background())
             return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
 

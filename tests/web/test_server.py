@@ -24,6 +24,7 @@ from catstream.services.commands import CommandHandler
 from catstream.services.control import CommandChannel
 from catstream.services.desired import DesiredState
 from catstream.settings import Settings
+from catstream.web.app import pipeline_site
 from catstream.web.dashboard import Dashboard
 from catstream.web.guard import Guard, TokenBucket
 from catstream.web.server import Server
@@ -388,12 +389,12 @@ def test_a_token_bucket_allows_its_burst_and_its_rate():
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::"])
 def test_a_public_address_requires_a_token(host):
     with pytest.raises(ServiceError, match="VIEW_TOKEN"):
-        Server(host=host, port=0)
+        Server(pipeline_site(), host=host, port=0)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_a_server_on_all_interfaces_lists_the_addresses_for_other_machines(host):
-    server = Server(host=host, port=0, token=TOKEN)
+    server = Server(pipeline_site(), host=host, port=0, token=TOKEN)
     with server.in_background():
         urls = [urlsplit(url) for url in server.urls]
     assert {url.fragment for url in urls} == {TOKEN}
@@ -406,10 +407,10 @@ def test_a_server_on_all_interfaces_lists_the_addresses_for_other_machines(host)
 
 def test_a_short_token_is_an_error():
     with pytest.raises(ServiceError, match="can be guessed"):
-        Server(port=0, token="secret")
+        Server(pipeline_site(), port=0, token="secret")
 
 
 def test_a_port_in_use_is_an_error(page):
     port = urlsplit(str(page.base_url)).port
     with pytest.raises(ServiceError, match=rf"127.0.0.1:{port} .* another port"):
-        Server(port=port)
+        Server(pipeline_site(), port=port)

@@ -19,12 +19,13 @@ let frame = null; // number and time of the newest frame
 let paused = false;
 let closed = false; // whether the server has announced its shutdown
 let silent = false; // whether the server does not answer
+const stream = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // its name, on the page of a fleet
 
 /** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
 async function sendCommand(verb, more = {}) {
   let answer;
   try {
-    const response = await fetch("/control", {
+    const response = await fetch("control", {
       method: "POST",
       headers: { "Content-Type": "application/json" },
       body: JSON.stringify({ verb, ...more }),
@@ -144,11 +145,11 @@ function stateOfAll() {
 function showSource() {
   const source = status.source || "";
   const name = source.includes("://") ? source : source.split("/").filter(Boolean).at(-1) || source;
-  const shown = /^\d+$/.test(name) ? `camera ${name}` : name || status.endpoint || "";
+  const shown = [stream, /^\d+$/.test(name) ? `camera ${name}` : name || status.endpoint].filter(Boolean).join(", ");
   const skipped = status.skipped === null || status.skipped === undefined ? "" : `, ${status.skipped} frames skipped`;
   $("#source").textContent = shown ? `${shown}${skipped}` : "";
   $("#source").title = source && status.endpoint ? `${source}, followed by the pipeline at ${status.endpoint}` : "";
-  document.title = shown ? `${shown} – catstream` : "catstream";
+  document.title = shown ? `${stream || shown} – catstream` : "catstream";
 }
 
 /** Text over the picture: the reason why it does not change. */
@@ -200,7 +201,7 @@ const show = {
 };
 
 function listen() {
-  const events = new EventSource("/events");
+  const events = new EventSource("events");
   events.onopen = () => {
     closed = silent = false;
     showState();
@@ -215,7 +216,7 @@ function listen() {
     if (events.readyState !== EventSource.CLOSED) return;
     events.close();
     setTimeout(async () => {
-      const page = await fetch("/").catch(() => null);
+      const page = await fetch(".").catch(() => null);
       if (page && page.status === 401) location.reload();
       else listen();
     }, 2000);
@@ -241,5 +242,6 @@ $("#stop-dialog").onclose = (event) => {
 };
 addEventListener("resize", () => { stage.draw(); trees.redraw(); });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { stage.draw(); surprising.draw(); });
+$("#fleet").hidden = !stream;
 showState();
 listen();

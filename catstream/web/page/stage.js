@@ -42,7 +42,7 @@ export class Stage {
     while (this.next) {
       const [wanted, turn] = [this.next, this.turn];
       this.next = null;
-      const response = await fetch(`/pictures/${wanted.frame}.jpg`).catch(() => null);
+      const response = await fetch(`pictures/${wanted.frame}.jpg`).catch(() => null);
       if (!response?.ok || (this.still && this.still.frame < wanted.frame)) continue; // the picture is frozen for drawing
       const bitmap = await createImageBitmap(await response.blob()).catch(() => null);
       if (!bitmap) continue;

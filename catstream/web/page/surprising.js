@@ -55,7 +55,7 @@ export class SurprisingFrames {
   }
 
   async load(item) {
-    const response = await fetch(`/pictures/${item.frame.frame}.jpg`).catch(() => null);
+    const response = await fetch(`pictures/${item.frame.frame}.jpg`).catch(() => null);
     item.bitmap = response?.ok ? await createImageBitmap(await response.blob()).catch(() => null) : null;
     this.paint(item);
   }
