@@ -107,7 +107,26 @@ class Registry:
         if stream not in listing.streams:
             names = ", ".join(self.streams().streams) or "none"
             raise ServiceError(f"the fleet {listing.fleet} has no stream {stream!r}: its streams are {names}")
-        return self._place(listing.streams[stream])
+        return self.place_of(listing.streams[stream])
+
+    def place_of(self, status: StreamStatus) -> Place:
+        """The place of a stream whose state is known, without a question.
+
+        Raises
+        ------
+        ServiceError
+            If its pipeline requires keys and there are none.
+        """
+        if not status.endpoint:
+            return Place(status)
+        keys = self._endpoint.keys
+        if status.server and keys is None:
+            raise ServiceError(
+                f"the stream {status.name} asks for keys, and none were given: give a folder of keys that its fleet "
+                "lets in (--keys DIR, see catstream keys)"
+            )
+        known = keys.for_server(status.server) if status.server and keys is not None else ""
+        return Place(status, replace(Endpoint.parse(status.endpoint, known), source=status.source))
 
     def request(self, stream: str) -> None:
         """Ask for one stream without waiting; `receive` returns the answer. A new request replaces the last one."""
@@ -121,7 +140,7 @@ class Registry:
         if listing is None:
             return None
         status = listing.streams.get(stream)
-        return listing.fleet, None if status is None else self._place(status)
+        return listing.fleet, None if status is None else self.place_of(status)
 
     def fileno(self) -> int:
         """Readable if an answer may have arrived."""
@@ -174,19 +193,6 @@ class Registry:
 
     def _with_keys(self, endpoint: Endpoint) -> Endpoint:
         return endpoint if self._keys is None else replace(endpoint, keys=self._keys)
-
-    def _place(self, status: StreamStatus) -> Place:
-        """The place of a stream, with the keys to connect to it."""
-        if not status.endpoint:
-            return Place(status)
-        keys = self._endpoint.keys
-        if status.server and keys is None:
-            raise ServiceError(
-                f"the stream {status.name} asks for keys, and none were given: give a folder of keys that its fleet "
-                "lets in (--keys DIR, see catstream keys)"
-            )
-        known = keys.for_server(status.server) if status.server and keys is not None else ""
-        return Place(status, replace(Endpoint.parse(status.endpoint, known), source=status.source))
 
 
 class RegistryServer:

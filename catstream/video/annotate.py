@@ -17,7 +17,7 @@ from catstream.messages import Preview, Track
 from catstream.names import UNNAMED
 from catstream.video.writer import VideoWriter
 
-__all__ = ["AnnotatedVideo", "draw", "draw_preview", "thumbnail"]
+__all__ = ["AnnotatedVideo", "draw", "draw_boxes", "draw_preview", "thumbnail"]
 
 #: Blue, green, red.
 _Point = tuple[float, float]
@@ -100,14 +100,39 @@ def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int)
     -------
     JPEG file
     """
+    boxes = [(one, colour) for one, colour in ((truth, _WHITE), (box, _ORANGE)) if np.isfinite(one).all()]
+    return _small(image, boxes, width)
+
+
+def draw_boxes(preview: Preview, colours: Colours, width: int) -> bytes:
+    """Return a small version of a preview with the box of each object, without text.
+
+    Parameters
+    ----------
+    colours : the colours of the objects
+    width : width of the small image in pixels
+
+    Returns
+    -------
+    JPEG file
+    """
+    image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return preview.jpeg
+    scale = image.shape[1] / preview.width
+    boxes = [(np.array(box) * scale, _bgr(colours.of(name))) for name, box in preview.boxes.items()]
+    return _small(image, boxes, width)
+
+
+def _small(image: np.ndarray, boxes: Sequence[tuple[np.ndarray, _Colour]], width: int) -> bytes:
+    """Return a JPEG file of an image at this width, with boxes x, y, w, h in pixels of the image and their colours."""
     scale = width / image.shape[1]
     small = cv2.resize(image, (width, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
-    for rectangle, colour in ((truth, _WHITE), (box, _ORANGE)):
-        if np.isfinite(rectangle).all():
-            x, y, w, h = (float(value) * scale for value in rectangle)
-            corners = (round(x), round(y)), (round(x + w), round(y + h))
-            cv2.rectangle(small, *corners, (0, 0, 0), 3, cv2.LINE_AA)
-            cv2.rectangle(small, *corners, colour, 1, cv2.LINE_AA)
+    for box, colour in boxes:
+        x, y, w, h = (float(value) * scale for value in box)
+        corners = (round(x), round(y)), (round(x + w), round(y + h))
+        cv2.rectangle(small, *corners, (0, 0, 0), 3, cv2.LINE_AA)
+        cv2.rectangle(small, *corners, colour, 1, cv2.LINE_AA)
     return cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
 
 

@@ -37,14 +37,12 @@ from catstream.web import metrics
 from catstream.web.feed import Feed
 from catstream.web.guard import TokenBucket, body_of, too_many
 from catstream.web.server import Site
+from catstream.web.viewers import UPDATE_SECONDS
 from catstream.wire.channels import CHANNELS
 
 __all__ = ["pipeline_app", "pipeline_site"]
 
 _PAGE = Path(__file__).with_name("page")
-_UPDATE_SECONDS = 0.1
-_KEEP_ALIVE_SECONDS = 5.0  # an idle stream sends a comment after this time, which detects closed connections
-_MAX_VIEWERS = 64
 _COMMANDS, _COMMANDS_PER_SECOND = 20, 5
 _VERBS = ("set-box", "forget", "pause", "resume", "stop")
 _DEFAULTS: dict[str, object] = {"verb": "", "object": "", "box": None, "keep": False}  # of the fields of a command
@@ -59,7 +57,7 @@ def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
         async with feed.running():
             yield
 
-    return Site(pipeline_app(feed, lifespan), feed.close)
+    return Site(pipeline_app(feed, lifespan), feed.viewers.close)
 
 
 def pipeline_app(feed: Feed, lifespan: Lifespan[Starlette] | None = None) -> Starlette:
@@ -92,24 +90,18 @@ class _Pages:
         return FileResponse(_PAGE / "index.html")
 
     async def events(self, _: Request) -> Response:
-        return self._reject_too_many() or StreamingResponse(self._event_stream(), media_type="text/event-stream")
+        return self._feed.viewers.events(self._feed.dashboard.updates)
 
     async def live(self, _: Request) -> Response:
-        return self._reject_too_many() or StreamingResponse(
+        return self._feed.viewers.too_many() or StreamingResponse(
             self._annotated_stream(), media_type="multipart/x-mixed-replace; boundary=picture"
         )
 
-    def _reject_too_many(self) -> Response | None:
-        """Return an error if too many streams are open."""
-        if self._feed.viewers < _MAX_VIEWERS:
-            return None
-        return PlainTextResponse(f"{_MAX_VIEWERS} pages or live pictures are open already\n", 503)
-
     async def _annotated_stream(self) -> AsyncIterator[bytes]:
         shown = None
-        with self._feed.viewer():
+        with self._feed.viewers.counted():
             yield b"--picture\r\n"
-            while not self._feed.closed:
+            while not self._feed.viewers.closed:
                 newest = self._feed.dashboard.newest
                 if newest is not None and newest != shown:
                     shown = newest
@@ -119,23 +111,7 @@ class _Pages:
                         len(jpeg),
                         jpeg,
                     )
-                await asyncio.sleep(_UPDATE_SECONDS)
-
-    async def _event_stream(self) -> AsyncIterator[str]:
-        known: dict[str, int] = {}
-        last_sent = monotonic()
-        with self._feed.viewer():
-            yield "retry: 1000\n\n"
-            while not self._feed.closed:
-                if parts := self._feed.dashboard.updates(known):
-                    last_sent = monotonic()
-                    yield f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"
-                elif monotonic() - last_sent > _KEEP_ALIVE_SECONDS:
-                    last_sent = monotonic()
-                    yield ":\n\n"
-                await asyncio.sleep(_UPDATE_SECONDS)
-            last = self._feed.dashboard.updates(known) | {"closed": True}
-            yield f"data: {json.dumps(last, separators=(',', ':'))}\n\n"
+                await asyncio.sleep(UPDATE_SECONDS)
 
     async def picture(self, request: Request) -> Response:
         preview = self._feed.dashboard.picture(request.path_params["frame"])

@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from time import monotonic
 
 from catstream.errors import CatstreamError
 from catstream.messages import End
+from catstream.registry import locate
 from catstream.subscription import AnyMessage, Subscription
 from catstream.web.dashboard import SILENCE_SECONDS, Dashboard
-from catstream.wire.endpoint import find
+from catstream.web.viewers import Viewers
 
 __all__ = ["Feed"]
 
@@ -31,40 +32,23 @@ class Feed:
 
     Parameters
     ----------
-    endpoint : endpoint of the pipeline; empty for the only running one of this user, looked up at each connection
+    endpoint : endpoint of the pipeline, or address of a stream of a fleet; empty for the only running pipeline of this
+        user. It is looked up at each connection
     keys : folder of the keys of this client, if the pipeline requires keys
 
     Attributes
     ----------
     dashboard : the dashboard
     attached_endpoint, keys : endpoint and keys of the current connection; empty if there is none
-    viewers : number of open pages
-    closed : whether open pages are to be closed
+    viewers : the open pages; pictures and features are received while there is one
     """
 
     def __init__(self, endpoint: str = "", keys: str = "") -> None:
         self._endpoint, self._keys = endpoint, keys
         self.dashboard = Dashboard()
         self.attached_endpoint = self.keys = ""
-        self.viewers = 0
-        self.closed = False
-        self._has_viewers, self._is_running = asyncio.Event(), asyncio.Event()
-
-    @contextlib.contextmanager
-    def viewer(self) -> Iterator[None]:
-        """Count a viewer inside a `with`: pictures and features are received while there is one."""
-        self.viewers += 1
-        self._has_viewers.set()
-        try:
-            yield
-        finally:
-            self.viewers -= 1
-            if not self.viewers:
-                self._has_viewers.clear()
-
-    def close(self) -> None:
-        """Let open pages end."""
-        self.closed = True
+        self.viewers = Viewers()
+        self._is_running = asyncio.Event()
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -81,7 +65,7 @@ class Feed:
         """Connect, and reconnect after each loss, until cancelled."""
         while True:
             try:
-                attached_endpoint = find(self._endpoint, self._keys)
+                attached_endpoint = await asyncio.to_thread(locate, self._endpoint, self._keys)
                 self.attached_endpoint = str(attached_endpoint)
                 self.dashboard.attach(self.attached_endpoint)
                 self.keys = (
@@ -122,13 +106,13 @@ class Feed:
             if channel not in _LIVENESS:
                 await self._is_running.wait()
             if channel in _FOR_VIEWERS:
-                await self._has_viewers.wait()
+                await self.viewers.wait()
             with Subscription[AnyMessage](self.attached_endpoint, channel, timeout=timeout, keys=self.keys) as messages:
                 async for message in messages:
                     self.dashboard.take(message, monotonic())
                     if self.dashboard.phase == "running":
                         self._is_running.set()
-                    if channel in _FOR_VIEWERS and not self.viewers:
+                    if channel in _FOR_VIEWERS and not self.viewers.count:
                         break
                 else:
                     return messages.end

@@ -56,7 +56,7 @@ class _Collector:
     def collect(self) -> Iterator[Metric]:
         dashboard = self._feed.dashboard
         yield _gauge("up", "Whether the pipeline sends messages.", dashboard.phase == "running")
-        yield _gauge("viewers", "Open pages.", self._feed.viewers)
+        yield _gauge("viewers", "Open pages.", self._feed.viewers.count)
         for name, process, counter, meaning in _COUNTED:
             if (value := dashboard.counter(process, counter)) is not None:
                 yield CounterMetricFamily(f"catstream_{name}", meaning, value=value)

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from threading import Event
+from uuid import uuid4
 
 import httpx
 import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.messages import Features, Health, Model, ObjectFeatures, Preview, Track, TrainingRows
+from catstream.messages import (
+    Features,
+    FleetStatus,
+    Health,
+    Model,
+    NodeStatus,
+    ObjectFeatures,
+    Preview,
+    StreamStatus,
+    Track,
+    TrainingRows,
+)
+from catstream.registry import RegistryServer
 from catstream.web.app import pipeline_site
+from catstream.web.fleet_app import fleet_site
 from catstream.web.server import Server
 
 JPEG = b"\xff\xd8\xff\xe0 a picture"
@@ -59,6 +76,61 @@ def serve(folder):
 
         def start(**options):
             server = Server(pipeline_site(str(folder)), port=0, **options)
+            stack.enter_context(server.in_background())
+            return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
+
+        yield start
+
+
+class Fleet:
+    """A fleet of made-up streams and nodes, which a test changes by their names."""
+
+    def __init__(self):
+        self.name = f"fleet-{uuid4().hex[:12]}"
+        self.streams, self.nodes = {}, {}
+
+    def stream(self, name, state="running", **more):
+        self.streams[name] = StreamStatus(name, state, **more)
+
+    def node(self, name, state="alive", **more):
+        self.nodes[name] = NodeStatus(name, state, **more)
+
+    def status(self):
+        return FleetStatus(self.name, time.time(), dict(self.streams), dict(self.nodes))
+
+
+@pytest.fixture
+def fleet():
+    return Fleet()
+
+
+@pytest.fixture
+def manager(fleet):
+    """The registry of the fleet, in a thread; it ends once this event is set."""
+    over = Event()
+
+    def serve():
+        with RegistryServer("", "", fleet.status) as server:
+            begun.set()
+            while not over.is_set():
+                server.turn(0.01)
+
+    begun = Event()
+    with ThreadPoolExecutor(1) as pool:
+        serving = pool.submit(serve)
+        assert begun.wait(20)
+        yield over
+        over.set()
+        serving.result(20)
+
+
+@pytest.fixture
+def serve_fleet(fleet, manager):  # noqa: ARG001  # it answers
+    """Starts pages of the fleet: what asks them."""
+    with ExitStack() as stack:
+
+        def start(**options):
+            server = Server(fleet_site(fleet.name), port=0, **options)
             stack.enter_context(server.in_background())
             return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
 

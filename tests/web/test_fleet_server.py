@@ -1,0 +1,202 @@
+"""The server of a fleet's page: what it shows of a fleet whose registry answers, and who may see it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from catstream.box import Box
+from catstream.cli.fleet_view import view
+from catstream.messages import Health, Preview
+from catstream.web import fleet_feed, fleet_pictures, fleet_streams
+from catstream.web.feed import Feed
+from catstream.web.fleet_streams import StreamPages
+from catstream.wire.channels import HEALTH, PREVIEWS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import Publisher
+
+TOKEN = "correct-horse-battery"
+PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events", "/streams/cam-7/picture.jpg"]
+METRICS = Path(__file__).parents[2] / "docs" / "how-to" / "fleet-view.md"
+
+
+@pytest.fixture
+def page(serve_fleet):
+    return serve_fleet()
+
+
+def first_update(page, path="/events"):
+    with page.stream("GET", path) as events:
+        for line in events.iter_lines():
+            if line.startswith("data: "):
+                return json.loads(line.removeprefix("data: "))
+    raise AssertionError("the stream ended")
+
+
+def shown(page, until):
+    """The first update of a page once the registry has answered."""
+    return until(lambda: (told := first_update(page)).get("order") and told)
+
+
+@pytest.fixture
+def camera(folder, rng):
+    """A pipeline that sends the pictures of its frames; one turn of it."""
+    image = cv2.imencode(".jpg", rng.integers(0, 255, (360, 640, 3), np.uint8))[1].tobytes()
+    boxes, frame = {"anna": Box(4.0, 3.0, 200.0, 100.0)}, iter(range(1 << 30))
+    with ExitStack() as stack:
+        publishers = [
+            stack.enter_context(Publisher(PREVIEWS, Endpoint.parse(str(folder)))),
+            stack.enter_context(Publisher(HEALTH, Endpoint.parse(str(folder)), "detector")),
+        ]
+
+        def turn():
+            number = next(frame)
+            publishers[0].send(Preview(number, 1280, 720, boxes, image))
+            publishers[1].send(Health("detector", 1.0, {"sent": float(number)}, source="walk.mp4"))
+            for publisher in publishers:
+                publisher.serve_late_joiners()
+
+        yield turn
+
+
+def asked(page, path, turn):
+    """The answer to a request, while a pipeline turns."""
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(page.get, path)
+        while not answer.done():
+            turn()
+        return answer.result()
+
+
+def test_the_page_loads_nothing_from_other_hosts_and_has_no_inline_script(page):
+    answer = page.get("/")
+    assert answer.status_code == 200
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+    assert not re.search(r"https?://|style=|<script>", answer.text)
+    for file in re.findall(r'(?:src|href)="(page/[^"]+)"', answer.text):
+        assert page.get(f"/{file}").status_code == 200
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_without_the_token_nothing_of_the_fleet_is_shown(fleet, serve_fleet, path):
+    fleet.stream("cam-7")
+    locked = serve_fleet(token=TOKEN)
+    answer = locked.get(path)
+    assert answer.status_code == 401
+    assert ("<form" in answer.text) == path.endswith("/"), "each page asks for the token"
+    assert locked.get("/page/login.js").status_code == 200
+
+
+def test_a_new_page_is_told_of_all_streams_and_nodes(fleet, page, until):
+    for number in range(500):
+        fleet.stream(f"cam-{number}", node="north", trouble="it is late" if number == 400 else "")
+    fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"})
+    told = shown(page, until)
+    assert (len(told["streams"]), told["order"][:3]) == (500, ["cam-400", "cam-0", "cam-1"])
+    assert told["nodes"]["north"]["labels"] == ["site=north"]
+
+
+def test_the_picture_of_a_stream_is_small_and_has_the_boxes_of_its_objects(fleet, page, camera, folder, until):
+    fleet.stream("cam-7", endpoint=str(folder), models={"anna": 3})
+    fleet.stream("cam-8", "unplaced")
+    shown(page, until)
+    answer = asked(page, "/streams/cam-7/picture.jpg", camera)
+    assert answer.headers["content-type"] == "image/jpeg"
+    assert cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR).shape == (180, 320, 3)
+    assert page.get("/streams/cam-8/picture.jpg").status_code == 404
+    assert page.get("/streams/cam-9/picture.jpg").status_code == 404
+
+
+def test_no_more_pictures_are_made_than_the_limit_allows(fleet, serve_fleet, camera, folder, until, monkeypatch):
+    made = []
+    monkeypatch.setattr(fleet_pictures, "draw_boxes", lambda *_: made.append(1) or b"picture %d" % len(made))
+    monkeypatch.setattr(fleet_pictures, "_FRESH_SECONDS", 0.0)
+    monkeypatch.setattr(fleet_pictures, "_BURST", 2)
+    monkeypatch.setattr(fleet_pictures, "_PER_SECOND", 1e-6)
+    fleet.stream("cam-7", endpoint=str(folder))
+    page = serve_fleet()
+    shown(page, until)
+    pictures = [asked(page, "/streams/cam-7/picture.jpg", camera).content for _ in range(4)]
+    assert pictures == [b"picture 1", b"picture 2", b"picture 2", b"picture 2"]
+
+
+def test_the_page_of_a_stream_is_below_that_of_the_fleet(fleet, page, camera, folder, until):
+    fleet.stream("cam-7", endpoint=str(folder))
+    shown(page, until)
+    index = page.get("/streams/cam-7", follow_redirects=True)
+    assert index.url.path == "/streams/cam-7/"
+    for file in re.findall(r'(?:src|href)="(page/[^"]+)"', index.text):
+        assert page.get(f"/streams/cam-7/{file}").status_code == 200
+    until(lambda: first_update(page, "/streams/cam-7/events").get("status", {}).get("source") == "walk.mp4", camera)
+    assert page.get("/streams/cam-8/").status_code == 404
+
+
+def test_metrics_are_documented_with_their_labels(fleet, page, until):
+    fleet.stream("cam-7", node="north", models={"anna": 3}, stored_seconds=2.0)
+    fleet.node("north", cores=4.0)
+    shown(page, until)
+    samples = re.findall(r"^(catstream_\w+)(?:\{(.*)\})? (.*)", page.get("/metrics").text, re.MULTILINE)
+    labels = {name: set(re.findall(r"(\w+)=", text)) for name, text, _ in samples}
+    documented = re.findall(r"`(catstream_\w+)(?:\{([\w,]+)\})?`", METRICS.read_text())
+    assert {name: set(filter(None, text.split(","))) for name, text in documented} == labels
+    assert ("catstream_model_version", 'node="north",object="anna",stream="cam-7"', "3.0") in samples
+
+
+def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams(
+    fleet, manager, serve_fleet, until, monkeypatch
+):
+    monkeypatch.setattr(fleet_feed, "_TIMEOUT_SECONDS", 0.2)
+    fleet.stream("cam-7")
+    page = serve_fleet()
+    shown(page, until)
+    assert page.get("/readyz").status_code == 200
+    manager.set()
+    until(lambda: page.get("/readyz").status_code == 503)
+    assert page.get("/healthz").status_code == 200
+    metrics = page.get("/metrics").text
+    assert "\ncatstream_fleet_up 0.0\n" in metrics
+    assert "cam-7" not in metrics
+    told = first_update(page)
+    assert (told["fleet"]["phase"], list(told["streams"])) == ("silent", ["cam-7"])
+
+
+def test_pages_of_streams_are_closed_when_nobody_looks_at_them(folder, monkeypatch):
+    monkeypatch.setattr(fleet_streams, "_MAX_PAGES", 2)
+    monkeypatch.setattr(fleet_streams, "_IDLE_SECONDS", 0.0)
+    monkeypatch.setattr(fleet_streams, "_CHECK_SECONDS", 0.01)
+    feeds = {}
+
+    def make_feed(name):
+        feeds[name] = Feed(str(folder))
+        return feeds[name]
+
+    async def use():
+        pages = StreamPages(make_feed)
+        first = pages.open("cam-1")
+        with feeds["cam-1"].viewers.counted():
+            assert pages.open("cam-2") is not None
+            assert pages.open("cam-3") is not None, "in place of one that nobody looks at"
+            assert pages.open("cam-1") is first
+            with feeds["cam-3"].viewers.counted():
+                assert pages.open("cam-4") is None
+        while len(pages):
+            await asyncio.sleep(0.01)
+        pages.open("cam-1")
+        await pages.stop()
+        assert not len(pages)
+
+    asyncio.run(use())
+
+
+def test_a_public_address_requires_a_token():
+    result = CliRunner().invoke(view, ["--listen", "0.0.0.0:0"])
+    assert "VIEW_TOKEN" in str(result.exception)
