@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from threading import Event
 from uuid import uuid4
 
+import cv2
 import httpx
 import numpy as np
 import pytest
@@ -29,6 +30,9 @@ from catstream.registry import RegistryServer
 from catstream.web.app import pipeline_site
 from catstream.web.fleet_app import fleet_site
 from catstream.web.server import Server
+from catstream.wire.channels import HEALTH, PREVIEWS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import Publisher
 
 JPEG = b"\xff\xd8\xff\xe0 a picture"
 
@@ -135,3 +139,24 @@ def serve_fleet(fleet, manager):  # noqa: ARG001  # it answers
             return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
 
         yield start
+
+
+@pytest.fixture
+def camera(folder, rng):
+    """A pipeline that sends the pictures of its frames; one turn of it."""
+    image = cv2.imencode(".jpg", rng.integers(0, 255, (360, 640, 3), np.uint8))[1].tobytes()
+    boxes, frame = {"anna": Box(4.0, 3.0, 200.0, 100.0)}, iter(range(1 << 30))
+    with ExitStack() as stack:
+        publishers = [
+            stack.enter_context(Publisher(PREVIEWS, Endpoint.parse(str(folder)))),
+            stack.enter_context(Publisher(HEALTH, Endpoint.parse(str(folder)), "detector")),
+        ]
+
+        def turn():
+            number = next(frame)
+            publishers[0].send(Preview(number, 1280, 720, boxes, image))
+            publishers[1].send(Health("detector", 1.0, {"sent": float(number)}, source="walk.mp4"))
+            for publisher in publishers:
+                publisher.serve_late_joiners()
+
+        yield turn

@@ -6,7 +6,6 @@ import asyncio
 import json
 import re
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -14,15 +13,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from catstream.box import Box
 from catstream.cli.fleet_view import view
-from catstream.messages import Health, Preview
 from catstream.web import fleet_feed, fleet_pictures, fleet_streams
 from catstream.web.feed import Feed
 from catstream.web.fleet_streams import StreamPages
-from catstream.wire.channels import HEALTH, PREVIEWS
-from catstream.wire.endpoint import Endpoint
-from catstream.wire.newest import Publisher
 
 TOKEN = "correct-horse-battery"
 PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events", "/streams/cam-7/picture.jpg"]
@@ -45,27 +39,6 @@ def first_update(page, path="/events"):
 def shown(page, until):
     """The first update of a page once the registry has answered."""
     return until(lambda: (told := first_update(page)).get("order") and told)
-
-
-@pytest.fixture
-def camera(folder, rng):
-    """A pipeline that sends the pictures of its frames; one turn of it."""
-    image = cv2.imencode(".jpg", rng.integers(0, 255, (360, 640, 3), np.uint8))[1].tobytes()
-    boxes, frame = {"anna": Box(4.0, 3.0, 200.0, 100.0)}, iter(range(1 << 30))
-    with ExitStack() as stack:
-        publishers = [
-            stack.enter_context(Publisher(PREVIEWS, Endpoint.parse(str(folder)))),
-            stack.enter_context(Publisher(HEALTH, Endpoint.parse(str(folder)), "detector")),
-        ]
-
-        def turn():
-            number = next(frame)
-            publishers[0].send(Preview(number, 1280, 720, boxes, image))
-            publishers[1].send(Health("detector", 1.0, {"sent": float(number)}, source="walk.mp4"))
-            for publisher in publishers:
-                publisher.serve_late_joiners()
-
-        yield turn
 
 
 def asked(page, path, turn):

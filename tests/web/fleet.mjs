@@ -1,0 +1,75 @@
+// What a person does on the page of a fleet, in a real browser; says what was seen, as JSON, a line each.
+//   node fleet.mjs URL CHROMIUM PROFILE; after the line "silence" the fleet stops to answer
+
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+import { chromium } from "playwright-core";
+
+const [url, executablePath, profile] = process.argv.slice(2);
+const axe = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
+const options = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+  "--disable-component-update", "--disable-sync"];
+const patience = { timeout: 60_000 };
+const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args: options });
+const say = (name, value) => console.log(JSON.stringify([name, value]));
+
+try {
+  const page = browser.pages()[0] ?? (await browser.newPage());
+  const wrong = [];
+  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
+  page.on("pageerror", (error) => wrong.push(error.message));
+  const shown = () => page.locator(".cards li:not([hidden]) h3").allInnerTexts();
+  const until = (condition, value) => page.waitForFunction(condition, value, patience);
+  const check = async (state) => {
+    for (const [colorScheme, width, height] of [["light", 1440, 900], ["dark", 390, 844]]) {
+      await page.setViewportSize({ width, height });
+      await page.emulateMedia({ colorScheme });
+      const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));
+      const found = violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html, any }) => `${html} ${any[0]?.message ?? ""}`).join("; ")}`);
+      say("violations", found.map((text) => `${state}, ${colorScheme}: ${text}`));
+      say("too wide", await page.evaluate(() => Math.max(0, document.documentElement.scrollWidth - innerWidth)));
+    }
+    await page.setViewportSize({ width: 1440, height: 900 });
+  };
+
+  await page.goto(url);
+  await page.waitForSelector(".cards li", patience);
+  await page.waitForSelector(".picture.loaded", patience);
+  await page.evaluate(axe);
+  say("all", await shown());
+  say("state", await page.locator("#state").innerText());
+  say("nodes", await page.locator("#nodes tbody button").allInnerTexts());
+  await check("all");
+  await page.keyboard.press("/");
+  await page.keyboard.type("NORTH ann");
+  say("search", await shown());
+  await page.keyboard.press("Escape");
+  await page.click('#nodes button:text-is("south")');
+  say("node", await shown());
+  await page.fill("#search", "nowhere");
+  say("none", await page.locator(".none").innerText());
+  await page.fill("#search", "cam");
+  await page.click('.states [data-state="trouble"]');
+  say("trouble", await shown());
+  await page.click('.states [data-state="running"]');
+  await page.focus('.cards a:text-is("cam-7")');
+  await page.keyboard.press("Enter");
+  await until(() => document.querySelector("#source")?.textContent.startsWith("cam-7, walk.mp4"));
+  say("page", [new URL(page.url()).pathname, await page.title()]);
+  await page.goBack();
+  await until(() => document.querySelector(".cards li:not([hidden])"));
+  say("back", [await page.inputValue("#search"), ...(await shown())]);
+  await page.goto(new URL("streams/cam-7/", url).href);
+  await page.click("#fleet");
+  await until(() => document.querySelector(".cards li:not([hidden])"));
+  say("fleet", await shown());
+  console.log('["silence"]');
+  await page.waitForSelector("main.old", patience);
+  await page.evaluate(axe);
+  say("silent", await page.locator("#message").innerText());
+  await check("silent");
+  say("errors", wrong);
+} finally {
+  await browser.close();
+}
+process.exit(0);

@@ -1,0 +1,54 @@
+"""The page of a fleet in a real browser: search, trouble first, the page of a stream and back, and a silent fleet."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import threading
+from pathlib import Path
+
+import pytest
+
+from catstream.web import fleet_feed
+
+HERE = Path(__file__).parent
+
+
+def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_silent(
+    fleet, manager, serve_fleet, camera, folder, tmp_path, monkeypatch
+):
+    node, chromium = shutil.which("node"), shutil.which("chromium")
+    if node is None or chromium is None or not (HERE / "node_modules" / "axe-core").exists():
+        pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
+    monkeypatch.setattr(fleet_feed, "_TIMEOUT_SECONDS", 0.2)
+    fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
+    fleet.node("south", "dead", cores=4.0, trouble="no answer since 02:14:07")
+    fleet.stream("cam-7", node="north", endpoint=str(folder), models={"anna": 3}, rate=25.0, stored_seconds=2.0)
+    fleet.stream("cam-10", "moving", node="south", restarts=1)
+    fleet.stream("cam-9", "unplaced", trouble="cam-9 needs a node with site=west, there is none")
+    fleet.stream("dock", "waiting", node="north")
+    words = [node, HERE / "fleet.mjs", str(serve_fleet().base_url), chromium, tmp_path / "profile"]
+    said = {}
+    over = threading.Event()
+    turning = threading.Thread(target=lambda: [camera() for _ in iter(lambda: over.wait(0.02), True)])
+    turning.start()
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as browser:
+        for line in browser.stdout:
+            name, *values = json.loads(line)
+            said.setdefault(name, []).extend(values)
+            if name == "silence":
+                manager.set()
+    over.set()
+    turning.join()
+    assert said["all"] == [["cam-9", "cam-7", "cam-10", "dock"]]
+    assert (said["state"], said["nodes"]) == (["1 in trouble"], [["south", "north"]])
+    assert (said["search"], said["node"], said["trouble"]) == ([["cam-7"]], [["cam-10"]], [["cam-9"]])
+    assert said["none"] == ["No stream matches “nowhere”."]
+    assert said["page"] == [["/streams/cam-7/", "cam-7 – catstream"]]
+    assert said["back"] == [["cam", "cam-7"]]
+    assert said["fleet"] == said["all"]
+    assert said["silent"][0].startswith("The fleet does not answer. This is its state of ")
+    assert [each for each in said["violations"] if each] == [], "found by axe"
+    assert set(said["too wide"]) == {0}
+    assert said["errors"] == [[]]
