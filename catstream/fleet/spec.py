@@ -40,6 +40,7 @@ from catstream.video.source import is_live
 __all__ = ["FleetSpec", "StreamSpec"]
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
+_STREAM_HEADER = re.compile(r"\s*\[\s*streams\s*\.\s*[\"']?([\w.-]+)")
 _EVERY = 5.0
 _LONGEST_EVERY = 3600.0
 
@@ -268,7 +269,7 @@ def _models(key: str, value: object, folder: Path) -> dict[str, Path]:
 
 
 def _settings(key: str, value: object, folder: Path) -> dict[str, object]:
-    """Settings by full name: `{ search = { budget = 1 } }` is `{ "coreset.size" = 128 }`."""
+    """Settings by full name: `{ coreset = { size = 128 } }` is `{ "coreset.size" = 128 }`."""
     flat: dict[str, object] = {}
     for name, each in _table(key, value, folder).items():
         flat |= {f"{name}.{short}": one for short, one in each.items()} if isinstance(each, Mapping) else {name: each}
@@ -338,11 +339,12 @@ def _toml_problem(error: str, text: str) -> str:
     """A message of the TOML parser with the name of the stream that it is about."""
     if twice := re.search(r"Cannot declare \('streams', '([^']*)'\) twice", error):
         return f"two streams have the name {twice[1]}: give each a name of its own"
-    line = re.search(r"line (\d+)", error)
-    above = text.splitlines()[: int(line[1])] if line else text.splitlines()
-    headers = [match[1] for each in above if (match := re.match(r"\s*\[\s*streams\s*\.\s*[\"']?([\w.-]+)", each))]
+    lines = text.splitlines()
+    place = re.search(r"line (\d+)", error)
+    number = int(place[1]) if place else len(lines)
+    headers = [match[1] for line in lines[:number] if (match := _STREAM_HEADER.match(line))]
     stream = f"the stream {headers[-1]}: " if headers else ""
     if "Cannot overwrite a value" in error:
-        key = above[-1].partition("=")[0].strip()
-        return f"{stream}{key} is given twice, in line {line[1] if line else '?'}: remove one of them"
+        key = lines[number - 1].partition("=")[0].strip()
+        return f"{stream}{key} is given twice, in line {number}: remove one of them"
     return f"{stream}this is not TOML: {error}"

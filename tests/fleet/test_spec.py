@@ -1,0 +1,185 @@
+"""The file of a fleet: what it means, and a line for everything that is wrong with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from catstream.box import Box
+from catstream.errors import FleetError
+from catstream.fleet.spec import FleetSpec, StreamSpec
+
+WHOLE = """
+name = "site"
+store = "state"
+every = 2
+
+[streams.cam-7]
+source = "rtsp://me:secret@camera/1"
+box = [120, 80, 64, 48]
+settings = { coreset = { size = 128 }, "run.seed" = 3 }
+cores = 0.5
+labels = { site = "north" }
+follow = "anna"
+
+[streams."cam.8"]
+source = "walk.mp4"
+boxes = { anna = [1, 2, 30, 40] }
+models = { ben = "ben.safetensors" }
+
+[streams.cam_9]
+source = "0"
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load(text):
+        (tmp_path / "site.toml").write_text(text, encoding="utf-8")
+        return FleetSpec.load(tmp_path / "site.toml")
+
+    return load
+
+
+def test_a_file_is_read_with_paths_from_its_folder(load, tmp_path):
+    fleet = load(WHOLE)
+    assert (fleet.name, fleet.store, fleet.every) == ("site", str(tmp_path / "state"), 2.0)
+    first, second, third = fleet.streams.values()
+    assert first == StreamSpec(
+        "cam-7",
+        "rtsp://me:secret@camera/1",
+        {"": Box(120, 80, 64, 48)},
+        settings={"coreset.size": 128, "run.seed": 3},
+        cores=0.5,
+        labels={"site": "north"},
+        follow=("anna",),
+    )
+    assert second.source == str(tmp_path / "walk.mp4")
+    assert (second.boxes, second.models) == ({"anna": Box(1, 2, 30, 40)}, {"ben": tmp_path / "ben.safetensors"})
+    assert third == StreamSpec("cam_9", "0")
+
+
+def test_the_password_of_a_source_is_not_in_the_repr(load):
+    assert "secret" not in repr(load(WHOLE))
+
+
+def test_json_gives_the_same_fleet(load):
+    fleet = load(WHOLE)
+    assert FleetSpec.from_json(fleet.to_json()) == fleet
+    assert FleetSpec.from_json(replace(fleet, streams={}).to_json()).streams == {}
+
+
+names = st.sampled_from(["anna", "b-2", "cam.7", "_"])
+numbers = st.sampled_from([2.0, 30.0, 47.25])
+made = st.builds(
+    StreamSpec,
+    names,
+    st.sampled_from(["0", "rtsp://camera/1", "/videos/walk.mp4"]),
+    st.dictionaries(names, st.builds(Box, numbers, numbers, numbers, numbers), max_size=2),
+    st.dictionaries(names.map("m-{}".format), names.map(lambda name: Path("/", name)), max_size=2),
+    st.fixed_dictionaries({}, optional={"coreset.size": st.integers(2, 200), "run.lockstep": st.booleans()}),
+    st.none() | st.floats(0.01, 64),
+    st.dictionaries(names, names, max_size=2),
+    st.lists(names, max_size=2, unique=True).map(tuple),
+)
+
+
+@settings(max_examples=30)
+@given(st.lists(made, max_size=3))
+def test_each_fleet_comes_back_from_json(streams):
+    fleet = FleetSpec("site", streams={stream.name: stream for stream in streams})
+    assert FleetSpec.from_json(fleet.to_json()) == fleet
+
+
+@pytest.mark.parametrize(
+    ("change", "restarts"),
+    [
+        ({"source": "1"}, True),
+        ({"boxes": {"": Box(1, 2, 30, 41)}}, True),
+        ({"boxes": {}, "models": {"": Path("/a")}}, True),
+        ({"settings": {"coreset.size": 128}}, True),
+        ({"settings": {"run.lag_frames": 25}}, False),
+        ({"boxes": {"": Box(1.0, 2.0, 30.0, 40.0)}}, False),
+        ({"cores": 2.0}, False),
+        ({"labels": {"site": "north"}}, False),
+        ({"follow": ("anna",)}, False),
+    ],
+)
+def test_the_digest_changes_exactly_if_the_stream_must_be_started_anew(change, restarts):
+    stream = StreamSpec("cam-7", "0", {"": Box(1, 2, 30, 40)})
+    assert (replace(stream, **change).digest != stream.digest) is restarts
+
+
+@pytest.mark.parametrize(
+    ("lines", "error"),
+    [
+        ('[streams.cam-7]\nsource="0"\n[streams.cam-7]\nsource="1"', "two streams have the name cam-7: give each a"),
+        ('[streams]\ncam-7={source="0"}\ncam-7={source="1"}', "cam-7 is given twice, in line 3: remove one of them"),
+        ('[streams.cam-7]\nsource="0"\nsource="1"', "the stream cam-7: source is given twice, in line 3: remove one"),
+        ('[streams.cam-7]\nsource=', "the stream cam-7: this is not TOML: Invalid value"),
+        ("", "it has no streams: add a table for each, for example [streams.cam-1]"),
+        ("streams = 3", "streams must be tables [streams.NAME], got 3"),
+        ("[streams]\ncam-7 = 3", "the stream cam-7: expected a table with a source, got 3: write [streams.cam-7]"),
+        ('[streams."cam 7"]\nsource="0"', "'cam 7' is no name of a stream: expected 1 to 64 letters"),
+        ('[streams.".."]\nsource="0"', "'..' is no name of a stream"),
+        ('naem="a"\n[streams.a]\nsource="0"', "there is no key 'naem', did you mean 'name'? there are name, store"),
+        ('every=0\n[streams.a]\nsource="0"', "the fleet site: every must be above 0 and at most 3600 s, got 0"),
+        ('every="5"\n[streams.a]\nsource="0"', "every must be a number, got '5'"),
+    ],
+)  # fmt: skip
+def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
+    with pytest.raises(FleetError) as caught:
+        load(lines)
+    assert str(caught.value).startswith(f"{tmp_path / 'site.toml'}: {error}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "error"),
+    [
+        ("", "it has no source: give a text as `catstream track` takes it, for example source ="),
+        ("source = ' '", "it has no source"),
+        ("source = 7", "source must be a text, got 7"),
+        ("sorce = '0'", "there is no key 'sorce', did you mean 'source'? there are source, box"),
+        ("source = '0'\nbox = [1, 2, 3]", "a box is four numbers x,y,w,h in pixels, got [1, 2, 3]"),
+        ("source = '0'\nbox = [1, 2, 30, 0]", "the box of the object without a name: a box needs a width and a height"),
+        ("source = '0'\nboxes = { anna = [1, 2, nan, 4] }", "the box of anna: a box needs four finite numbers"),
+        ("source = '0'\nboxes = { 'a b' = [1, 2, 3, 4] }", "'a b' is not a name: expected 1 to 64 letters"),
+        ("source = '0'\nboxes = [1, 2, 3, 4]", "boxes must be a table, for example { anna = [120, 80, 64, 48] }, got"),
+        ("source = '0'\nbox = [1, 2, 3, 4]\nboxes = {}", "it has both box and boxes: write all objects in boxes"),
+        ("source = '0'\nbox = [1, 2, 3, 4]\nmodel = 'a'", "the object without a name: a box gives the position of an "
+         "object, and a model searches for it: give one of them"),
+        ("source = '0'\nmodel = 3", "model must be a text, got 3"),
+        ("source = '0'\nsettings = { 'coreset.sise' = 1 }", "there is no setting 'coreset.sise', did you mean 'core"),
+        ("source = '0'\nsettings = { 'coreset.size' = 0 }", "setting coreset.size cannot be 0: it takes int"),
+        ("source = '0'\nsettings = { 'run.keys' = 'k' }", "the fleet sets run.keys itself: remove it from the"),
+        ("source = '0'\ncores = 0", "cores must be a number above 0, got 0: leave it out, and they are measured"),
+        ("source = '0'\ncores = nan", "cores must be a number above 0, got nan"),
+        ("source = '0'\ncores = true", "cores must be a number, got True"),
+        ("source = '0'\nlabels = { site = 1 }", "labels.site must be a text, got 1"),
+        ("source = '0'\nfollow = [1]", 'follow must be names of objects, for example ["anna"], got [1]'),
+    ],
+)  # fmt: skip
+def test_an_error_of_a_stream_names_the_stream_and_is_one_line(load, line, error):
+    with pytest.raises(FleetError) as caught:
+        load(f"[streams.good]\nsource = '0'\n[streams.cam-7]\n{line}")
+    assert f"site.toml: the stream cam-7: {error}" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(FleetError, match=r"cannot read the fleet file .*none\.toml: No such file"):
+        FleetSpec.load(tmp_path / "none.toml")
+    (tmp_path / "a.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(FleetError, match=r"a\.toml is not UTF-8 text"):
+        FleetSpec.load(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", "[" * 100_000])
+def test_a_stored_spec_that_is_damaged_is_an_error(text):
+    with pytest.raises(FleetError, match="is damaged: apply the fleet file again"):
+        FleetSpec.from_json(text)
