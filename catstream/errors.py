@@ -21,6 +21,7 @@ __all__ = [
     "SilenceError",
     "StoreError",
     "StreamRewoundError",
+    "UnreachableError",
     "VideoError",
 ]
 
@@ -86,6 +87,10 @@ class CommandRejectedError(ServiceError):
 
 class FleetError(ServiceError):
     """A fleet cannot do what was asked for; the message names the stream or the node."""
+
+
+class UnreachableError(FleetError):
+    """The head of a fleet does not answer. It may be starting again, so the call may be repeated later."""
 
 
 class FencedError(FleetError):

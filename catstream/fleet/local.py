@@ -1,0 +1,184 @@
+"""LocalFleet: a cluster on this machine, as background processes that go on when this process ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from catstream.errors import FleetError
+from catstream.extras import require_extra
+from catstream.fleet.keeper import holder
+from catstream.services import start
+from catstream.storage import write_atomically
+
+__all__ = ["LocalFleet"]
+
+_HOST = "127.0.0.1"
+_START_SECONDS = 90.0
+_END_SECONDS = 20.0
+_LOOK_SECONDS = 0.05
+_MAIN = "from catstream.cli import main; main()"
+
+
+class LocalFleet:
+    """The head and the nodes of a cluster that runs on this machine alone; its ports are on the loopback interface.
+
+    Any process of this user can use it. Each node is a background process (`catstream fleet node`), which starts Ray
+    again after its death.
+
+    Parameters
+    ----------
+    folder : for the token, the state of the cluster, logs and process ids; made if there is none
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.absolute()
+
+    @property
+    def token_file(self) -> Path:
+        """File with the token of the fleet."""
+        return self.folder / "token"
+
+    @property
+    def running(self) -> bool:
+        """Whether the head's background process runs."""
+        return holder("head", self.folder) is not None
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the nodes whose background processes run, without the head."""
+        names = (path.stem for path in sorted(self.folder.glob("*.pid")))
+        return [name for name in names if name != "head" and holder(name, self.folder) is not None]
+
+    @property
+    def address(self) -> str:
+        """HOST:PORT of the head.
+
+        Raises
+        ------
+        FleetError
+            If it does not run.
+        """
+        with contextlib.suppress(OSError):
+            if self.running:
+                return (self.folder / "address").read_text()
+        raise FleetError(f"no fleet of yours runs in {self.folder}: start one (catstream fleet up)")
+
+    def start(self, nodes: int = 1, cores: float | None = None) -> None:
+        """Start the head and the nodes node-1, node-2 ... that do not run, and wait until all have started.
+
+        Parameters
+        ----------
+        nodes : number of nodes
+        cores : of each node, for streams; None divides the cores of this machine among them
+
+        Raises
+        ------
+        FleetError
+            If one of them does not start; those that were started by this call are stopped.
+        """
+        require_extra("fleet")
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.folder.chmod(0o700)
+        (self.folder / "logs").mkdir(exist_ok=True)
+        cores = round(len(os.sched_getaffinity(0)) / nodes, 2) if cores is None and nodes else cores
+        began: dict[str, subprocess.Popen[bytes]] = {}
+        try:
+            if not self.running:
+                address = self._remembered_address()
+                self._keep(began, {"head": ["head", "--listen", address, "--folder", str(self.folder)]})
+            node = ["node", "--head", self.address, "--token-file", str(self.token_file)]
+            wanted = [f"node-{number}" for number in range(1, nodes + 1)]
+            missing = [name for name in wanted if holder(name, self.folder) is None]
+            self._keep(began, {name: [*node, "--name", name, "--cores", f"{cores:g}"] for name in missing})
+        except BaseException:
+            self._stop(began)
+            raise
+
+    def stop(self) -> None:
+        """Stop all nodes, then the head. The token, the state of the cluster and the logs stay."""
+        self._stop(self.names)
+        self._stop(["head"])
+
+    def _remembered_address(self) -> str:
+        """The address of the last start, so that nodes and drivers find the head again; a free port at first."""
+        path = self.folder / "address"
+        with contextlib.suppress(OSError):
+            return path.read_text()
+        with socket.create_server((_HOST, 0)) as server:
+            address = f"{_HOST}:{server.getsockname()[1]}"
+        write_atomically(path, address.encode())
+        return address
+
+    def _keep(self, began: dict[str, subprocess.Popen[bytes]], commands: dict[str, list[str]]) -> None:
+        """Start background processes by name, and wait until each has reported that Ray runs."""
+        waited = set(commands)
+        with tempfile.TemporaryDirectory(prefix="catstream-") as folder, contextlib.ExitStack() as stack:
+            receivers = {}
+            for name, command in commands.items():
+                receiver = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+                receiver.bind(f"{folder}/{name}")
+                receiver.setblocking(False)
+                receivers[name] = receiver
+                began[name] = self._spawn(name, command, f"{folder}/{name}")
+
+            def settled() -> bool:
+                for name in sorted(waited):
+                    with contextlib.suppress(BlockingIOError):
+                        receivers[name].recv(100)
+                        waited.discard(name)
+                return not waited or any(began[name].poll() is not None for name in waited)
+
+            if not _wait(settled, _START_SECONDS) or waited:
+                name = min(waited, key=lambda name: began[name].poll() is None)
+                raise FleetError(f"{name} does not start: {self._last_line(name)}")
+
+    def _spawn(self, name: str, command: list[str], notified: str) -> subprocess.Popen[bytes]:
+        with (self.folder / "logs" / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-P", "-c", _MAIN, "fleet", *command, "--ports", "0"],
+                env=start.environment() | {"NOTIFY_SOCKET": notified},
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+
+    def _stop(self, names: Iterable[str]) -> None:
+        """End the background processes of these names, and wait for them."""
+        pids = {name: pid for name in names if (pid := holder(name, self.folder)) is not None}
+        for pid in pids.values():
+            _signal(pid, signal.SIGTERM)
+            _signal(pid, signal.SIGCONT)  # one that was frozen ends, too
+        if not _wait(lambda: all(holder(name, self.folder) is None for name in pids), _END_SECONDS):
+            for name, pid in pids.items():
+                if holder(name, self.folder) == pid:
+                    _signal(pid, signal.SIGKILL)  # Ray ends with its keeper
+
+    def _last_line(self, name: str) -> str:
+        lines = (self.folder / "logs" / f"{name}.log").read_text(errors="replace").strip().splitlines()
+        return lines[-1].removeprefix("catstream: ") if lines else "it printed nothing"
+
+
+def _signal(pid: int, number: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, number)
+
+
+def _wait(condition: Callable[[], bool], seconds: float) -> bool:
+    """Wait until a condition holds; False if it does not within so many seconds."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(_LOOK_SECONDS)
+    return True
