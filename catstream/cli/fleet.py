@@ -12,6 +12,7 @@ __all__ = ["fleet"]
 COMMANDS = {
     "head": ("fleet_nodes", "Run the head of a fleet."),
     "node": ("fleet_nodes", "Run a node of a fleet."),
+    "view": ("fleet_view", "Watch all streams of a fleet in a browser."),
 }
 
 
