@@ -19,6 +19,7 @@ let frame = null; // number and time of the newest frame
 let paused = false;
 let closed = false; // whether the server has announced its shutdown
 let silent = false; // whether the server does not answer
+let events = null; // the connection to the server, null while the page is hidden
 const stream = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // its name, on the page of a fleet
 
 /** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
@@ -201,7 +202,7 @@ const show = {
 };
 
 function listen() {
-  const events = new EventSource("events");
+  events = new EventSource("events");
   events.onopen = () => {
     closed = silent = false;
     showState();
@@ -213,14 +214,19 @@ function listen() {
     silent = true;
     stage.cancel(false);
     showState();
-    if (events.readyState !== EventSource.CLOSED) return;
-    events.close();
+    if (events?.readyState !== EventSource.CLOSED) return;
+    stop();
     setTimeout(async () => {
       const page = await fetch(".").catch(() => null);
       if (page && page.status === 401) location.reload();
-      else listen();
+      else if (!events && !document.hidden) listen();
     }, 2000);
   };
+}
+
+function stop() {
+  events?.close();
+  events = null;
 }
 
 $("#draw").onclick = () => { $("#stage").focus(); stage.begin(); };
@@ -243,5 +249,9 @@ $("#stop-dialog").onclose = (event) => {
 addEventListener("resize", () => { stage.draw(); trees.redraw(); });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { stage.draw(); surprising.draw(); });
 $("#fleet").hidden = !stream;
+document.addEventListener("visibilitychange", () => { // a browser opens few connections to a server, over all its tabs
+  if (document.hidden && !stage.drawing) stop();
+  else if (!document.hidden && !events) listen();
+});
 showState();
 listen();
