@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from catstream.errors import CatstreamError
     from catstream.finding.search import find
     from catstream.finding.sightings import Sighting
+    from catstream.fleet.fleet import Fleet
     from catstream.learned import Learned, merge
     from catstream.messages import Track
     from catstream.multi import MultiTracker
@@ -36,6 +37,7 @@ __all__ = [
     "Box",
     "CatstreamError",
     "Control",
+    "Fleet",
     "ImageSummary",
     "Learned",
     "MultiTracker",
@@ -60,6 +62,7 @@ _HOMES = {
     "Box": "box",
     "CatstreamError": "errors",
     "Control": "steering",
+    "Fleet": "fleet.fleet",
     "ImageSummary": "summaries.images",
     "Learned": "learned",
     "MultiTracker": "multi",

@@ -104,13 +104,20 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
             raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
 
 
-def skip(folder: Path, settings: Settings, frames: int) -> None:
-    """Count frames of a live source that were lost while no pipeline was running: the numbers go on after them."""
+def skip(folder: Path, settings: Settings, seq: int) -> int:
+    """Count the frames of a live source up to a number as lost: the numbers go on after it.
+
+    Returns
+    -------
+    how many there are after the newest checkpoint
+    """
     store = CheckpointStore(folder / TREES)
     forest = store.load(settings)
-    forest.skip(frames)
+    lost = max(0, seq - forest.seq)
+    forest.skip(lost)
     if not store.save(forest):
         raise ServiceError(f"cannot keep the state in {str(folder)!r}: {store.trouble}")
+    return lost
 
 
 @contextlib.contextmanager

@@ -38,6 +38,7 @@ VERBS = {
     "save": "Save what a pipeline has learned to a file.",
     "merge": "Merge saved models of one object.",
     "stop": "Stop a running pipeline as if its source had ended.",
+    "fleet": "Run many streams on one machine or many.",
     "keys": "Manage the keys of a pipeline and its clients.",
     "summary": "Choose the images that represent a collection, or the frames that taught most.",
     "settings": "List all settings with their defaults and descriptions.",

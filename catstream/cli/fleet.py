@@ -1,36 +1,326 @@
-"""`catstream fleet`: the commands of a fleet, each in a module of its own."""
+"""`catstream fleet`: run many streams on one machine or on many, and change them while they run."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable
+from functools import wraps
 from importlib import import_module
+from pathlib import Path
 
 import click
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from catstream.messages import FleetStatus, StreamStatus
+from catstream.names import split_name
+from catstream.registry import Registry
 
 __all__ = ["fleet"]
 
-#: Command -> its module and summary; the module is imported when the command is called.
-COMMANDS = {
-    "head": ("fleet_nodes", "Run the head of a fleet."),
-    "node": ("fleet_nodes", "Run a node of a fleet."),
-    "view": ("fleet_view", "Watch all streams of a fleet in a browser."),
+#: Subcommand -> module that holds it, where it is not this one; the module is imported when it is called.
+_ELSEWHERE = {"head": "fleet_nodes", "node": "fleet_nodes", "view": "fleet_view", "merge": "fleet_merge"}
+
+_SUMMARIES = {
+    "up": "Start the streams of a file, or apply its changes.",
+    "status": "Show all streams and nodes.",
+    "view": "Watch all streams in a browser.",
+    "add": "Add a stream.",
+    "remove": "Remove streams.",
+    "move": "Move a stream to a node.",
+    "drain": "Give all streams of a node away.",
+    "logs": "Print what a stream has logged.",
+    "merge": "Merge what several streams have learned of an object.",
+    "down": "Stop all streams, and end the fleet.",
+    "head": "Keep the head of a cluster running on this machine.",
+    "node": "Keep a node of a cluster running on this machine.",
 }
 
+_STARTED = ("running", "waiting", "paused", "ended", "failed", "unplaced")
+_UP_SECONDS = 120.0  # limit for the streams to start
 
-class _Commands(click.Group):
+
+class _Fleet(click.Group):
     def list_commands(self, _: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return list(_SUMMARIES)
 
-    def get_command(self, _: click.Context, name: str) -> click.Command | None:
-        if name not in COMMANDS:
-            return None
-        command: click.Command = getattr(import_module(f"catstream.cli.{COMMANDS[name][0]}"), name.replace("-", "_"))
-        return command
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        if name in _ELSEWHERE:
+            command: click.Command = getattr(import_module(f"catstream.cli.{_ELSEWHERE[name]}"), name)
+            return command
+        return super().get_command(context, name)
 
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+            formatter.write_dl(list(_SUMMARIES.items()))
 
 
-@click.command(cls=_Commands)
+@click.group(cls=_Fleet)
 def fleet() -> None:
-    """Run many streams on many machines, found by name."""
+    """Run many streams on one machine or on many, and change them while they run.
+
+    A fleet keeps each stream running on some node, continues it elsewhere from
+    its last state if the node dies, and is found by the names of its streams.
+    Ray starts and watches the processes: pip install "catstream[fleet]".
+
+    \b
+    EXAMPLES
+      catstream fleet up examples/fleet.toml
+      catstream fleet status
+      catstream watch tracks --endpoint fleet://cam-1
+      catstream fleet move cam-1 node-2
+      catstream fleet down
+    """
+
+
+def with_manager(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that select a fleet by its manager; the command gets them as keywords of `Fleet`."""
+
+    @click.option("--name", default="", metavar="NAME", help="Name of the fleet; not needed if only one runs here.")
+    @click.option("--address", default="", metavar="HOST:PORT", help="Head of a cluster; default: this machine alone.")
+    @click.option(
+        "--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Token of the cluster, with --address."
+    )
+    @wraps(command)
+    def wrapped(name: str, address: str, token_file: Path | None, **options: object) -> None:
+        command(of={"name": name, "address": address, "token_file": token_file}, **options)
+
+    return wrapped
+
+
+@fleet.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--nodes", type=click.IntRange(1, 64), help="Nodes to start on this machine; default: as the file says.")
+@click.option("--cores", type=click.FloatRange(0, min_open=True), help="Cores of each of them; default: equal shares.")
+@with_manager
+def up(file: Path, nodes: int | None, cores: float | None, of: dict[str, object]) -> None:
+    """Start the streams of FILE, or apply its changes to a fleet that runs.
+
+    A stream that runs and is unchanged is not touched. Nothing is changed if a
+    stream fits on no node. The fleet goes on in the background; `catstream
+    fleet down` ends it, and `up` continues it from its last states.
+
+    \b
+    EXAMPLES
+      catstream fleet up examples/fleet.toml
+      catstream fleet up fleet.toml --address 10.0.0.1:6379 --token-file token
+    """
+    from catstream.fleet.fleet import Fleet
+
+    console = Console()
+    with Fleet(file, **of) as running:  # type: ignore[arg-type]  # the options of `with_manager`
+        with Console(stderr=True).status("starting the nodes"):
+            lines = running.up(nodes=nodes, cores=cores)
+        for line in lines:
+            click.echo(line)
+        status = running.status()
+        deadline = time.monotonic() + _UP_SECONDS
+        with Live(console=console, transient=True) as live:
+            while not all(each.state in _STARTED for each in status.streams.values()) and time.monotonic() < deadline:
+                live.update(_streams(status))
+                time.sleep(0.5)
+                status = running.status()
+    _show(console, status)
+
+
+@fleet.command()
+@click.option(
+    "--fleet", "place", default="", metavar="ADDRESS", help="Registry; not needed for a fleet of this machine."
+)
+@click.option("--keys", default="", metavar="DIR", help="Folder of your keys, for a fleet on other machines.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def status(place: str, keys: str, as_json: bool) -> None:
+    """Show all streams and nodes of a fleet.
+
+    Exit code 1 if a stream has failed or fits on no node.
+
+    \b
+    EXAMPLES
+      catstream fleet status
+      catstream fleet status --fleet tcp://10.0.0.1:5800 --keys my-keys --json | jq .streams
+    """
+    with Registry(place, keys=keys) as registry:
+        found = registry.streams()
+    if as_json:
+        click.echo(json.dumps(dataclasses.asdict(found)))
+    else:
+        _show(Console(), found)
+    if any(each.state in ("failed", "unplaced") for each in found.streams.values()):
+        sys.exit(1)
+
+
+@fleet.command()
+@click.argument("name")
+@click.option("--source", required=True, metavar="SOURCE", help="Video, folder, camera or stream.")
+@click.option("--box", "boxes", multiple=True, metavar="[NAME=]X,Y,W,H", help="Box of an object in the first frame.")
+@click.option("--model", "models", multiple=True, metavar="[NAME=]FILE", help="Saved model of an object to search for.")
+@click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A setting.")
+@click.option("--cores", type=float, metavar="N", help="Processor cores that it needs; default: as measured.")
+@click.option("--label", "labels", multiple=True, metavar="NAME=VALUE", help="Label that its node must have.")
+@click.option("--follow", multiple=True, metavar="OBJECT", help="Search for an object by its merged model.")
+@with_manager
+def add(
+    name: str,
+    source: str,
+    boxes: tuple[str, ...],
+    models: tuple[str, ...],
+    settings: tuple[str, ...],
+    cores: float | None,
+    labels: tuple[str, ...],
+    follow: tuple[str, ...],
+    of: dict[str, object],
+) -> None:
+    """Add a stream, or change the one of that name.
+
+    To keep the change, put it into the file of the fleet too.
+
+    \b
+    EXAMPLE
+      catstream fleet add cam-7 --source rtsp://10.0.0.7/1 --box 120,80,64,48 --label site=north
+    """
+    from catstream.fleet.fleet import Fleet
+    from catstream.fleet.spec import StreamSpec
+
+    table = {
+        "source": source,
+        "boxes": dict(map(split_name, boxes)),
+        "models": dict(map(split_name, models)),
+        "settings": dict(setting.partition("=")[::2] for setting in settings),
+        "labels": dict(label.partition("=")[::2] for label in labels),
+        "follow": list(follow),
+    }
+    spec = StreamSpec.parse(name, table | ({} if cores is None else {"cores": cores}), Path.cwd())
+    with Fleet(**of) as running:  # type: ignore[arg-type]
+        for line in running.add(spec):
+            click.echo(line)
+
+
+@fleet.command()
+@click.argument("names", nargs=-1, required=True)
+@click.option("--forget", is_flag=True, help="Remove what they have learned, too.")
+@with_manager
+def remove(names: tuple[str, ...], forget: bool, of: dict[str, object]) -> None:
+    """Remove streams; what they have learned stays in the store.
+
+    \b
+    EXAMPLE
+      catstream fleet remove cam-7
+    """
+    from catstream.fleet.fleet import Fleet
+
+    with Fleet(**of) as running:  # type: ignore[arg-type]
+        for line in running.remove(*names, forget=forget):
+            click.echo(line)
+
+
+@fleet.command()
+@click.argument("name")
+@click.argument("node")
+@with_manager
+def move(name: str, node: str, of: dict[str, object]) -> None:
+    """Move the stream NAME to a NODE, where it stays as long as that can have it.
+
+    The stream stores its state, ends, and continues on the other node; a live
+    stream loses the frames of about three seconds.
+
+    \b
+    EXAMPLE
+      catstream fleet move cam-7 node-2
+    """
+    from catstream.fleet.fleet import Fleet
+
+    with Fleet(**of) as running:  # type: ignore[arg-type]
+        click.echo(running.move(name, node))
+
+
+@fleet.command()
+@click.argument("node")
+@click.option("--undo", is_flag=True, help="Let the node take streams again.")
+@with_manager
+def drain(node: str, undo: bool, of: dict[str, object]) -> None:
+    """Give all streams of a NODE away and place none there, before it is switched off.
+
+    \b
+    EXAMPLE
+      catstream fleet drain node-2
+    """
+    from catstream.fleet.fleet import Fleet
+
+    with Fleet(**of) as running:  # type: ignore[arg-type]
+        click.echo(running.drain(node, undo=undo))
+
+
+@fleet.command()
+@click.argument("name")
+@click.option("--lines", default=100, show_default=True, help="How many of the last lines.")
+@with_manager
+def logs(name: str, lines: int, of: dict[str, object]) -> None:
+    """Print what the stream NAME has logged on its node since it started there."""
+    from catstream.fleet.fleet import Fleet
+
+    with Fleet(**of) as running:  # type: ignore[arg-type]
+        for line in running.logs(name, lines):
+            click.echo(line)
+
+
+@fleet.command()
+@with_manager
+def down(of: dict[str, object]) -> None:
+    """Stop all streams after their state was stored, and end the fleet.
+
+    A fleet on this machine ends with its nodes. On a cluster, the nodes stay.
+    `catstream fleet up` continues from the last states.
+    """
+    from catstream.fleet.fleet import Fleet
+
+    with Fleet(**of) as running, Console(stderr=True).status("storing the states of all streams"):  # type: ignore[arg-type]
+        running.down()
+    click.echo(f"the fleet {running.name} is down")
+
+
+def _show(console: Console, status: FleetStatus) -> None:
+    console.print(_streams(status))
+    console.print(_nodes(status))
+
+
+def _streams(status: FleetStatus) -> Table:
+    """A row for each stream, those with trouble first."""
+    table = Table("stream", "node", "state", box=None, pad_edge=False, header_style="bold")
+    for name in ("frames/s", "model", "restarts"):
+        table.add_column(name, justify="right")
+    table.add_column("trouble", overflow="fold")
+    for each in sorted(status.streams.values(), key=lambda each: (not each.trouble, each.name)):
+        model = max(each.models.values(), default=0)
+        restarts = str(each.restarts) if each.restarts else "-"
+        table.add_row(
+            each.name,
+            each.node or "-",
+            each.state,
+            f"{each.rate:.1f}" if each.rate else "-",
+            str(model or "-"),
+            restarts,
+            _trouble(each),
+        )
+    return table
+
+
+def _trouble(stream: StreamStatus) -> str:
+    lost = f"{stream.lost_frames} frames in {stream.lost_seconds:.1f} s were lost" if stream.lost_frames else ""
+    return "; ".join(filter(None, (stream.trouble, lost)))
+
+
+def _nodes(status: FleetStatus) -> Table:
+    table = Table("\nnode", "\nstate", "\naddress", box=None, pad_edge=False, header_style="bold")
+    for name in ("\ncores used", "\nof", "\nstreams"):
+        table.add_column(name, justify="right")
+    table.add_column("\nlabels")
+    for each in status.nodes.values():
+        labels = ", ".join(f"{key}={value}" for key, value in each.labels.items())
+        table.add_row(
+            each.name, each.state, each.address, f"{each.used:.2g}", f"{each.cores:.3g}", str(each.streams), labels
+        )
+    return table

@@ -41,6 +41,7 @@ __all__ = ["FleetSpec", "StreamSpec"]
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _STREAM_HEADER = re.compile(r"\s*\[\s*streams\s*\.\s*[\"']?([\w.-]+)")
+_MOST_NODES = 64  # on one machine
 _EVERY = 5.0
 _LONGEST_EVERY = 3600.0
 
@@ -147,18 +148,22 @@ class FleetSpec:
     name     name of the fleet, with the rules of a stream's name
     store    folder or URL of the states; "" for a folder that belongs to the fleet
     every    seconds between two states of a stream in the store
+    nodes    how many nodes are started for a fleet on one machine alone
     streams  the streams by name
     """
 
     name: str
     store: str = ""
     every: float = _EVERY
+    nodes: int = 1
     streams: dict[str, StreamSpec] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_fleet_name(self.name, "fleet")
         if not 0 < self.every <= _LONGEST_EVERY:
             raise FleetError(f"the fleet {self.name}: every must be above 0 and at most 3600 s, got {self.every:g}")
+        if not 1 <= self.nodes <= _MOST_NODES:
+            raise FleetError(f"the fleet {self.name}: nodes must be from 1 to {_MOST_NODES}, got {self.nodes}")
 
     @classmethod
     def load(cls, path: Path) -> FleetSpec:
@@ -189,7 +194,21 @@ class FleetSpec:
     def to_json(self) -> str:
         """The spec as JSON text with absolute paths. It contains the sources with their passwords."""
         streams = {name: stream.table() for name, stream in self.streams.items()}
-        return json.dumps({"name": self.name, "store": self.store, "every": self.every, "streams": streams})
+        own = {"name": self.name, "store": self.store, "every": self.every, "nodes": self.nodes}
+        return json.dumps(own | {"streams": streams})
+
+    def changes(self, new: FleetSpec) -> list[str]:
+        """What becomes of each stream if another spec takes the place of this one, a line for each."""
+        lines = []
+        for name in sorted(self.streams.keys() | new.streams.keys()):
+            before, after = self.streams.get(name), new.streams.get(name)
+            if before is None or after is None:
+                lines.append(f"{name}: is {'added' if before is None else 'removed'}")
+            elif before.digest != after.digest:
+                lines.append(f"{name}: starts again with its changes")
+            else:
+                lines.append(f"{name}: {'is unchanged' if before == after else 'goes on with its changes'}")
+        return lines
 
     @classmethod
     def from_json(cls, text: str) -> FleetSpec:
@@ -204,7 +223,7 @@ class FleetSpec:
 
     @classmethod
     def _of(cls, tables: Mapping[str, Any], folder: Path) -> FleetSpec:
-        _check_keys(tables, ("name", "store", "every", "streams"))
+        _check_keys(tables, ("name", "store", "every", "nodes", "streams"))
         store, streams = _text("store", tables.get("store", ""), folder), tables.get("streams", {})
         if not isinstance(streams, Mapping):
             raise FleetError(f"streams must be tables [streams.NAME], got {reprlib.repr(streams)}")
@@ -212,6 +231,7 @@ class FleetSpec:
             _text("name", tables["name"], folder),
             store if not store or "://" in store else str(folder / store),
             _number("every", tables.get("every", _EVERY), folder),
+            int(_number("nodes", tables.get("nodes", 1), folder)),
             {name: StreamSpec.parse(name, table, folder) for name, table in streams.items()},
         )
 

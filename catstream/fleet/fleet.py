@@ -1,0 +1,230 @@
+"""The streams of a fleet, from a program: start them, change them, and see how they are.
+
+    import catstream
+
+    with catstream.Fleet("fleet.toml") as fleet:
+        fleet.up()
+        print(fleet.status().streams["cam-7"].state)
+
+The fleet goes on after the program ends; `down` ends it. It changes nothing for who only watches: they need neither Ray
+nor the token, see `catstream.subscribe`.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+from catstream.errors import CatstreamError, FleetError
+from catstream.extras import require_extra
+from catstream.fleet.cluster import HEAD_RESOURCE, NAMESPACE, connect, disconnect
+from catstream.fleet.local import LocalFleet
+from catstream.fleet.manager import Manager, actor_name
+from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.learned import Learned
+from catstream.messages import FleetStatus
+
+__all__ = ["Fleet"]
+
+_ANSWER_SECONDS = 60.0  # limit for the manager to answer, and to start before that
+_DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
+_TURN_SECONDS = 0.2
+
+
+class Fleet:
+    """Connects to the manager of a fleet; `up` starts it, on this machine or on a cluster of Ray. Use it in a `with`.
+
+    Parameters
+    ----------
+    spec : path or FleetSpec
+        The file fleet.toml, or what was read from it. Needed for `up` only.
+    name : str
+        Name of the fleet; by default that of the spec, or the only one that runs.
+    address : str
+        HOST:PORT of the head of a cluster. Empty for a fleet on this machine alone, which `up` starts.
+    token_file : path
+        File with the token of the cluster, with an address. Whoever has it can run any code on the cluster.
+
+    Raises
+    ------
+    FleetError
+        From the constructor, if the spec is not valid, or there is no such fleet. From each method, if the manager
+        cannot be reached or does not do it; the message names the stream and the node.
+    MissingExtraError
+        If Ray is not installed.
+    """
+
+    def __init__(
+        self,
+        spec: str | os.PathLike[str] | FleetSpec | None = None,
+        *,
+        name: str = "",
+        address: str = "",
+        token_file: str | os.PathLike[str] | None = None,
+    ) -> None:
+        require_extra("fleet")
+        self._spec = spec if isinstance(spec, FleetSpec) or spec is None else FleetSpec.load(Path(spec))
+        self.name = name or (self._spec.name if self._spec is not None else "")
+        self._address, self._token_file = address, Path(token_file) if token_file is not None else None
+        self._local = None if address else self._local_fleet()
+        self._manager: Any = None
+
+    def up(self, *, nodes: int | None = None, cores: float | None = None) -> list[str]:
+        """Make the spec the desired state; what runs and is unchanged is not touched.
+
+        Parameters
+        ----------
+        nodes : int
+            Number of nodes to start, for a fleet on this machine that does not run yet; by default that of the spec.
+        cores : float
+            Processor cores of each of them; by default an equal share of this machine's.
+
+        Returns
+        -------
+        what is done, a line for each stream
+        """
+        if self._spec is None:
+            raise FleetError("there are no streams: give a file, see docs/how-to/fleet.md")
+        if self._local is not None:
+            self._local.start(nodes or self._spec.nodes, cores)
+            if not self._spec.store:
+                self._spec = replace(self._spec, store=str(self._local.folder / "store"))
+        elif not self._spec.store:
+            raise FleetError(f'the fleet {self.name} needs a store that all nodes reach: store = "s3://BUCKET/PREFIX"')
+        self._connect()
+        import ray
+
+        self._manager = (
+            ray.remote(Manager)
+            .options(
+                name=actor_name(self._spec.name, "manager"),
+                namespace=NAMESPACE,
+                get_if_exists=True,
+                lifetime="detached",
+                num_cpus=0,
+                resources={HEAD_RESOURCE: 0.001},
+                max_restarts=-1,
+                max_task_retries=-1,
+                max_concurrency=8,
+            )
+            .remote(self._spec.name, self._spec.store, local=self._local is not None)
+        )
+        lines: list[str] = self._ask("apply", self._spec.to_json(), _models(self._spec.streams.values()))
+        return lines
+
+    def add(self, spec: StreamSpec) -> list[str]:
+        """Add a stream, or change the one of the same name."""
+        lines: list[str] = self._ask("add", spec, _models([spec]))
+        return lines
+
+    def remove(self, *names: str, forget: bool = False) -> list[str]:
+        """Remove streams. Unless `forget`, their state stays in the store: they continue if they are added again."""
+        answer: list[str] = self._ask("remove", list(names), forget=forget)
+        return answer
+
+    def move(self, name: str, node: str) -> str:
+        """Move a stream to a node, where it stays as long as the node can have it."""
+        answer: str = self._ask("move", name, node)
+        return answer
+
+    def drain(self, node: str, *, undo: bool = False) -> str:
+        """Give all streams of a node away and place none there, for example before it is switched off."""
+        answer: str = self._ask("drain", node, undo=undo)
+        return answer
+
+    def status(self) -> FleetStatus:
+        """The state of all streams and nodes."""
+        answer: FleetStatus = self._ask("status")
+        return answer
+
+    def logs(self, name: str, lines: int = 100) -> list[str]:
+        """The last lines that a stream logged on its node."""
+        answer: list[str] = self._ask("logs", name, lines)
+        return answer
+
+    def down(self) -> None:
+        """Stop all streams after their state was stored, and the manager; on this machine alone, the nodes too."""
+        deadline = time.monotonic() + _DOWN_SECONDS
+        if self._local is None or self._local.running:
+            while self._ask("close") and time.monotonic() < deadline:
+                time.sleep(_TURN_SECONDS)
+            import ray
+
+            ray.kill(self._manager)
+        if self._local is not None:
+            self.close()
+            self._local.stop()
+
+    def close(self) -> None:
+        """Disconnect; the fleet goes on."""
+        self._manager = None
+        disconnect()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _local_fleet(self) -> LocalFleet:
+        """The fleet of this machine with the name, or the only one that runs."""
+        home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream" / "fleets"
+        if self.name:
+            return LocalFleet(home / self.name)
+        running = [each for folder in sorted(home.glob("*")) if (each := LocalFleet(folder)).running]
+        if len(running) != 1:
+            known = (
+                f": say which (--name), there are {', '.join(each.folder.name for each in running)}" if running else ""
+            )
+            raise FleetError(
+                f"{len(running)} fleets run on this machine{known or ': start one with catstream fleet up'}"
+            )
+        self.name = running[0].folder.name
+        return running[0]
+
+    def _connect(self) -> None:
+        if self._local is not None:
+            if not self._local.running:
+                raise FleetError(f"the fleet {self.name} does not run: start it with catstream fleet up")
+            connect(self._local.address, self._local.token_file)
+        elif self._token_file is None:
+            raise FleetError(f"the cluster at {self._address} needs its token: give the file (--token-file)")
+        else:
+            connect(self._address, self._token_file)
+
+    def _ask(self, method: str, *arguments: object, seconds: float = _ANSWER_SECONDS, **options: object) -> Any:
+        """Call a method of the manager, and wait for its answer."""
+        if self._manager is None:
+            self._connect()
+        import ray
+        from ray.exceptions import GetTimeoutError, RayError, RayTaskError
+
+        try:
+            if self._manager is None:
+                self._manager = ray.get_actor(actor_name(self.name, "manager"), namespace=NAMESPACE)
+            return ray.get(getattr(self._manager, method).remote(*arguments, **options), timeout=seconds)
+        except RayTaskError as error:
+            if isinstance(error.cause, CatstreamError):
+                raise error.cause from None
+            raise
+        except ValueError:
+            raise FleetError(
+                f"there is no fleet {self.name!r} on this cluster: start it with catstream fleet up"
+            ) from None
+        except (RayError, GetTimeoutError) as error:
+            why = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise FleetError(f"the manager of {self.name} does not answer ({why}): is its head running?") from None
+
+
+def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:
+    """The contents of the saved models that specs name, by stream and object."""
+    found = {}
+    for stream in streams:
+        for name, file in stream.models.items():
+            Learned.load(file)  # its errors name the file
+            found[stream.name, name] = file.read_bytes()
+    return found

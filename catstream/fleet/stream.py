@@ -1,0 +1,398 @@
+"""A stream of a fleet: one pipeline on this node, its state in the store, and the figures that the manager asks for.
+
+A `Stream` has nothing of Ray in it; `catstream.fleet.manager` makes an actor of it. Its pipeline runs in a thread of
+its own, and its state is stored by another one, so that a slow store does not stop the tracks.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import random
+import socket
+import tempfile
+import threading
+import time
+from collections import deque
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import NamedTuple
+
+from catstream.errors import (
+    CatstreamError,
+    CommandRejectedError,
+    FencedError,
+    FleetError,
+    ServiceError,
+    StoreError,
+    VideoError,
+)
+from catstream.fleet.spec import StreamSpec
+from catstream.fleet.store import Claim, Store
+from catstream.messages import StreamState, StreamStatus, Track
+from catstream.pipeline import Pipeline
+from catstream.state import files, restore, skip
+from catstream.steering import control
+from catstream.storage import Metadata
+from catstream.video.frames import without_password
+from catstream.wire.channels import CHANNELS
+from catstream.wire.keys import Client, create, public_key, synchronise
+
+__all__ = ["Place", "Report", "Stream", "given_model"]
+
+_TURN_SECONDS = 0.1
+_CLAIM_SECONDS = 2.0  # between two attempts to claim a stream in a store that cannot be reached
+_RATE_SECONDS = 5.0  # interval of the rate and of the processor time
+_LATE = 3.0  # a state that is older than so many intervals is a trouble
+_LOG_LINES = 1000
+_PORTS = range(21000, 32000)  # below those that the kernel gives to connections
+_SPARE_FRAMES = 10  # more than the rate says, so that no number of a live source is used twice
+#: What a pipeline reports if no frames are tracked, as the state of a stream.
+_HOLDING: dict[str, StreamState] = {"waiting": "waiting", "paused": "paused"}
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a stream runs.
+
+    node     name of the node
+    address  IP address at which other machines reach its sockets; empty if all clients are on this machine
+    clients  the clients that may connect, by name, if there is an address
+    """
+
+    node: str
+    address: str = ""
+    clients: dict[str, Client] = field(default_factory=dict)
+
+
+class Report(NamedTuple):
+    """What a stream tells the manager.
+
+    status         its figures
+    source_failed  whether it failed because this node cannot read its source
+    fenced         whether it ended because another node has claimed it
+    """
+
+    status: StreamStatus
+    source_failed: bool = False
+    fenced: bool = False
+
+
+@dataclass(slots=True)
+class _Rates:
+    """Frames and processor time per second, over the last seconds."""
+
+    since: float = field(default_factory=time.monotonic)
+    frames: int = 0
+    processor: float = 0.0  # seconds, at the start of the interval
+    rate: float = 0.0
+    cores: float = 0.0
+
+    def update(self, processor: float) -> None:
+        """Compute the rates if the interval is over."""
+        passed = time.monotonic() - self.since
+        if passed >= _RATE_SECONDS:
+            self.rate = self.frames / passed
+            self.cores = max(0.0, processor - self.processor) / passed
+            self.since, self.frames, self.processor = time.monotonic(), 0, processor
+
+
+def given_model(stream: str, name: str) -> str:
+    """The name in the store of a saved model that the spec of a stream gives for an object."""
+    return f"given.{sha256(f'{stream}/{name}'.encode()).hexdigest()[:32]}"
+
+
+class Stream:
+    """Runs the pipeline of one stream until it ends, fails, or is stopped, and stores its state again and again.
+
+    Parameters
+    ----------
+    spec : the stream
+    place : where it runs
+    store : the store of the fleet
+    every : seconds between two states in the store
+
+    Raises
+    ------
+    FleetError
+        From the constructor, if the store is not a valid one.
+    """
+
+    def __init__(self, spec: StreamSpec, place: Place, store: str, every: float) -> None:
+        self._spec, self._place, self._every = spec, place, every
+        self._store = Store(store)
+        self._status = StreamStatus(spec.name, "starting", place.node, source=without_password(spec.source))
+        self._rates = _Rates()
+        self._stop, self._lock = threading.Event(), threading.Lock()
+        self._lines: deque[str] = deque(maxlen=_LOG_LINES)
+        self._pipeline: Pipeline | None = None
+        self._claim: Claim | None = None
+        self._stored_at = 0.0  # seconds since 1970
+        self._store_trouble = self._failure = ""
+        self._source_failed = self._fenced = False
+        self._seq = 0
+        self._stack = ExitStack()
+        self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-stream-")))
+        self._keys = self._folder / "keys"
+        self._thread = threading.Thread(target=self._run, name=f"stream {spec.name}", daemon=True)
+        self._thread.start()
+
+    def report(self) -> Report:
+        """The figures of the stream now."""
+        with self._lock:
+            age = time.time() - self._stored_at if self._stored_at else 0.0
+            pipeline, status = self._pipeline, self._status
+            troubles = [self._failure, self._store_trouble]
+            if not self._store_trouble and age > _LATE * self._every and status.state == "running":
+                troubles.append(f"its state was stored {age:.0f} s ago")
+            if pipeline is not None:
+                troubles += [f"{process}: {trouble}" for process, trouble in pipeline.trouble.items()]
+                if pipeline.lost_seconds:
+                    troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
+            status = replace(
+                status,
+                rate=self._rates.rate,
+                cores=self._rates.cores,
+                stored_seconds=age if self._stored_at else None,
+                trouble="; ".join(filter(None, troubles)),
+            )
+            return Report(status, self._source_failed, self._fenced)
+
+    def logs(self, lines: int) -> list[str]:
+        """The last lines that the stream logged."""
+        return list(self._lines)[-lines:]
+
+    def allow(self, clients: dict[str, Client]) -> None:
+        """Let only these clients connect from now on."""
+        with self._lock:
+            self._place = replace(self._place, clients=clients)
+            if self._place.address and self._keys.exists():
+                synchronise(self._keys, clients)
+
+    def search(self, followed: str) -> None:
+        """Search for an object by the newest merged model of it in the store."""
+        pipeline = self._pipeline
+        if pipeline is not None:
+            try:
+                self._search(pipeline, followed, followed)
+            except CatstreamError as error:
+                _log.warning("%s does not search for %s: %s", self._spec.name, followed, error)
+
+    def stop(self) -> None:
+        """End the pipeline, and store its last state; returns when that is done."""
+        self._stop.set()
+        self._thread.join()
+        self._stack.close()
+
+    def _run(self) -> None:
+        handler = _Lines(self._lines)
+        logging.getLogger("catstream").addHandler(handler)
+        try:
+            self._claim = self._claimed()
+            if self._claim is not None:
+                self._follow(self._claim)
+        except VideoError as error:
+            self._fail(str(error), source=True)
+        except CatstreamError as error:
+            self._fail(str(error))
+        except Exception as error:  # the manager has to see it
+            _log.exception("The stream %s failed.", self._spec.name)
+            self._fail(f"{type(error).__name__}: {error}")
+        finally:
+            logging.getLogger("catstream").removeHandler(handler)
+
+    def _fail(self, why: str, *, source: bool = False) -> None:
+        _log.error("%s: %s", self._spec.name, why)
+        with self._lock:
+            self._pipeline, self._failure, self._source_failed = None, why, source
+            self._status = replace(self._status, state="failed", endpoint="", rate=0.0)
+
+    def _claimed(self) -> Claim | None:
+        """The claim of the stream in the store; waits for the store, None if the stream was stopped meanwhile."""
+        while not self._stop.is_set():
+            try:
+                return self._store.claim(self._spec.name, f"{self._place.node} process {os.getpid()}")
+            except StoreError as error:
+                with self._lock:
+                    self._store_trouble = str(error)
+                self._stop.wait(_CLAIM_SECONDS)
+        return None
+
+    def _follow(self, claim: Claim) -> None:
+        """Run the pipeline from the state in the store, or from the start."""
+        if claim.state is not None and claim.state.facts["ended"]:
+            with self._lock:
+                self._status = replace(self._status, state="ended", frame=int(claim.state.facts["frame"]))
+            return
+        with ExitStack() as stack:
+            pipeline = stack.enter_context(self._made(claim))
+            facts = claim.state.facts if claim.state is not None else {}
+            with self._lock:
+                self._pipeline, self._store_trouble = pipeline, ""
+                self._status = replace(
+                    self._status,
+                    endpoint=pipeline.endpoint,
+                    server=public_key(self._keys) if self._place.address else "",
+                    token=claim.token,
+                    lost_frames=int(facts.get("lost_frames", 0)),
+                    lost_seconds=float(facts.get("lost_seconds", 0.0)),
+                )
+            self._change_objects(pipeline, facts)
+            storing = threading.Thread(target=self._keep_storing, args=(claim,), name="store", daemon=True)
+            storing.start()
+            stack.callback(storing.join)
+            stack.callback(self._stop.set)
+            for tracks in pipeline.by_frame(_TURN_SECONDS):
+                self._take(pipeline, tracks)
+                if self._stop.is_set():
+                    break
+            else:
+                with self._lock:
+                    self._status = replace(self._status, state="ended")
+        if not self._fenced:
+            self._write(claim)
+        with self._lock:
+            self._pipeline = None
+
+    def _made(self, claim: Claim) -> Pipeline:
+        """The pipeline, which continues from the state of the claim if there is one."""
+        settings = self._spec.settings | self._sockets()
+        state = self._folder / "state"
+        if claim.state is None:
+            boxes = self._spec.boxes or None
+            return Pipeline(self._spec.source, boxes, settings, state=state)
+        restore(state, claim.state.files)
+        pipeline = Pipeline(self._spec.source, settings=settings, resume=state)
+        if pipeline.live:
+            self._count_lost(pipeline, state, claim)
+        return pipeline
+
+    def _count_lost(self, pipeline: Pipeline, state: Path, claim: Claim) -> None:
+        """Count the frames of a live source since the last state as lost, so that no number is used twice."""
+        if claim.state is None:
+            return
+        facts = claim.state.facts
+        seconds = max(0.0, time.time() - float(facts["time"]))
+        newest = int(facts["seq"]) + math.ceil(seconds * float(facts["rate"])) + _SPARE_FRAMES
+        lost = skip(state, pipeline.settings, newest)
+        facts["lost_frames"] = int(facts["lost_frames"]) + lost
+        facts["lost_seconds"] = float(facts["lost_seconds"]) + seconds
+        _log.warning("%s: %d frames in %.1f s were lost", self._spec.name, lost, seconds)
+
+    def _sockets(self) -> dict[str, object]:
+        """The settings of the sockets: those of a private folder, or ports of this node with keys made here."""
+        if not self._place.address:
+            return {"run.endpoint": "", "run.keys": ""}
+        with self._lock:
+            create(self._keys)
+            synchronise(self._keys, self._place.clients)
+        endpoint = f"tcp://{self._place.address}:{_free_port(self._place.address)}"
+        return {"run.endpoint": endpoint, "run.keys": str(self._keys)}
+
+    def _change_objects(self, pipeline: Pipeline, facts: Metadata) -> None:
+        """Begin the objects that the spec has now and had not when the state was made, and forget the others."""
+        before = set(facts["objects"]) if facts else set(self._spec.boxes)
+        now = self._spec.boxes.keys() | self._spec.models.keys()
+        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as steering:
+            for name in sorted(self._spec.boxes.keys() - before):
+                steering.set_box(self._spec.boxes[name], name)
+            for name in sorted(before - now):
+                with suppress(CommandRejectedError):  # it was forgotten already
+                    steering.forget(name)
+        for name in sorted(self._spec.models.keys() - before):
+            self._search(pipeline, given_model(self._spec.name, name), name)
+
+    def _search(self, pipeline: Pipeline, stored: str, name: str) -> None:
+        """Search for an object by a saved model in the store."""
+        file = self._folder / "given.safetensors"
+        if (model := self._store.get_model(stored)) is None:
+            raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
+        file.write_bytes(model.files["model"])
+        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as steering:
+            steering.search(file, name)
+
+    def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
+        """Count a frame; an empty mapping means that none has arrived for a while."""
+        self._rates.update(_processor_seconds([os.getpid(), *pipeline.pids.values()]))
+        with self._lock:
+            status = self._status
+            if tracks:
+                self._rates.frames += 1
+                newest = next(iter(tracks.values()))
+                models = {name: track.model_version for name, track in tracks.items()}
+                self._seq = newest.seq
+                status = replace(status, frame=newest.frame, models=models)
+            state = _HOLDING.get(pipeline.holding, "running" if self._seq else "starting")
+            skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
+            self._status = replace(status, state=state, skipped=skipped)
+
+    def _keep_storing(self, claim: Claim) -> None:
+        """Store the state every few seconds, until the stream stops or another holder has claimed it."""
+        while not self._stop.wait(self._every):
+            self._write(claim)
+
+    def _write(self, claim: Claim) -> None:
+        """Store the newest checkpoint; a store that takes nothing is a trouble, another holder ends the stream."""
+        status, seq = self._status, self._seq
+        facts: Metadata = {
+            "time": time.time(),
+            "seq": seq,
+            "frame": status.frame,
+            "rate": max(status.rate, self._rates.rate, self._pipeline.rate if self._pipeline is not None else 0.0),
+            "lost_frames": status.lost_frames,
+            "lost_seconds": status.lost_seconds,
+            "objects": sorted(self._spec.boxes.keys() | self._spec.models.keys()),
+            "ended": status.state == "ended",
+        }
+        trouble = ""
+        try:
+            if content := files(self._folder / "state"):
+                claim.write(content, facts)
+                self._stored_at = facts["time"]
+        except FencedError as error:
+            _log.warning("%s: %s", self._spec.name, error)
+            self._fenced = True
+            self._stop.set()
+        except (ServiceError, OSError) as error:
+            trouble = f"its state cannot be stored: {error}"
+        with self._lock:
+            self._store_trouble = trouble
+
+
+class _Lines(logging.Handler):
+    """Keeps log records as lines of text."""
+
+    def __init__(self, lines: deque[str]) -> None:
+        super().__init__(logging.INFO)
+        self._lines = lines
+
+    def emit(self, record: logging.LogRecord) -> None:
+        moment = time.strftime("%H:%M:%S", time.localtime(record.created))
+        self._lines.append(f"{moment} {record.levelname.lower()} {record.getMessage()}")
+
+
+def _processor_seconds(pids: list[int]) -> float:
+    """Processor time of processes so far, in seconds."""
+    seconds = 0.0
+    for pid in pids:
+        with suppress(OSError, ValueError, IndexError):  # it has ended
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+            seconds += (int(fields[11]) + int(fields[12])) / _TICKS
+    return seconds
+
+
+def _free_port(address: str) -> int:
+    """A port of this node after which the ports of all channels are free."""
+    count = max(channel.port + len(channel.senders) for channel in CHANNELS.values())
+    while True:
+        first = random.choice(_PORTS)
+        with ExitStack() as stack, suppress(OSError):
+            for port in range(first, first + count):
+                stack.enter_context(socket.socket()).bind((address, port))
+            return first
