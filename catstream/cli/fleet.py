@@ -141,7 +141,7 @@ def status(place: str, keys: str, as_json: bool) -> None:
     \b
     EXAMPLES
       catstream fleet status
-      catstream fleet status --fleet tcp://10.0.0.1:5800 --keys my-keys --json | jq .streams
+      catstream fleet status --fleet 10.0.0.1:5690 --keys my-keys --json | jq .streams
     """
     with Registry(place, keys=keys) as registry:
         found = registry.streams()

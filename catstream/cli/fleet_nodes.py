@@ -28,8 +28,9 @@ _ports = click.option(
 @click.command()
 @click.option("--listen", required=True, metavar="IP:PORT", help="Private address of this machine, or 127.0.0.1.")
 @click.option("--folder", required=True, type=_FOLDER, help="Folder for the token and the state of the cluster.")
+@click.option("--registry", default=5690, show_default=True, metavar="PORT", help="Port of the registry.")
 @_ports
-def head(listen: str, folder: Path, ports: int) -> None:
+def head(listen: str, folder: Path, registry: int, ports: int) -> None:
     """Run the head of a fleet, which runs no streams, until SIGTERM.
 
     \b
@@ -40,7 +41,7 @@ def head(listen: str, folder: Path, ports: int) -> None:
     from catstream.fleet import keeper
 
     _log_to_terminal()
-    keeper.keep_head(listen, folder, ports)
+    keeper.keep_head(listen, folder, ports, registry)
 
 
 @click.command()

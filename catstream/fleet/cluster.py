@@ -52,6 +52,9 @@ HEAD_RESOURCE = "catstream-head"
 #: Prefix of the labels that `catstream fleet node` gives to a node. All others are the user's, or Ray's own.
 PREFIX = "catstream/"
 
+#: Variables of the processes on the head: the folder of the fleet, and where the registry listens.
+FOLDER_VARIABLE, REGISTRY_VARIABLE = "CATSTREAM_FLEET_FOLDER", "CATSTREAM_FLEET_REGISTRY"
+
 _LOOPBACK = "127.0.0.1"
 _PROBE_SECONDS = 15.0
 _REACH_SECONDS = 3.0

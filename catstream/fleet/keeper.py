@@ -29,11 +29,15 @@ from catstream.fleet import cluster
 from catstream.services import start
 from catstream.storage import is_locked, lock
 from catstream.wire.endpoint import private_folder
+from catstream.wire.keys import create
 
 __all__ = ["PORTS", "holder", "keep_head", "keep_node"]
 
 #: Number of ports that a node uses if its first port is given.
 PORTS = 100
+
+#: Port of the registry, by default.
+REGISTRY_PORT = 5690
 
 _OBJECT_STORE_BYTES = 80_000_000  # the least that Ray accepts with some room: messages of a fleet are small
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 30.0
@@ -47,7 +51,7 @@ _LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?")
 _log = logging.getLogger(__name__)
 
 
-def keep_head(listen: str, folder: Path, ports: int = 0) -> None:
+def keep_head(listen: str, folder: Path, ports: int = 0, registry: int = REGISTRY_PORT) -> None:
     """Run the head of a cluster until SIGTERM or SIGINT.
 
     Parameters
@@ -55,6 +59,7 @@ def keep_head(listen: str, folder: Path, ports: int = 0) -> None:
     listen : IP:PORT, a private address of this machine
     folder : for the token, which is made if there is none, and for the state of the cluster
     ports : first of the `PORTS` ports of its processes; 0 for any that are free
+    registry : port of the registry
 
     Raises
     ------
@@ -67,6 +72,9 @@ def keep_head(listen: str, folder: Path, ports: int = 0) -> None:
     cluster.make_token(token)
     cluster.read_token(token)
     state.mkdir(mode=0o700, exist_ok=True)
+    if not (folder / "keys").exists():
+        create(folder / "keys")
+    own = {cluster.FOLDER_VARIABLE: str(folder.absolute()), cluster.REGISTRY_VARIABLE: f"tcp://{host}:{registry}"}
     arguments = [
         *("--head", "--port", str(port), "--include-dashboard", "false", "--no-monitor", "--disable-usage-stats"),
         *("--resources", json.dumps({cluster.HEAD_RESOURCE: 1})),
@@ -77,7 +85,7 @@ def keep_head(listen: str, folder: Path, ports: int = 0) -> None:
             f"the head of the fleet at {listen}",
             arguments,
             _labels("head", 0, {}),
-            cluster.environment(token, state),
+            cluster.environment(token, state) | own,
             f"the head listens at {listen}; a node joins with a copy of {token.absolute()}: "
             f"catstream fleet node --head {listen} --token-file token --name NAME",
         ).run()
