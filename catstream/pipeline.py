@@ -66,8 +66,8 @@ class Pipeline:
     Parameters
     ----------
     source : str
-        A video file, a folder of images, a pattern such as `images/%05d.png`, a camera (`0`), or a stream
-        (`rtsp://...`).
+        A video file, a folder of images, a pattern such as `images/%05d.png`, a camera (`0`), a stream
+        (`rtsp://...`), or a live demo (`demo:1`).
     box : str, four numbers, or a mapping of names to such boxes
         x, y, w, h of the object in the first frame, in pixels: `(120, 80, 64, 48)` or `"120,80,64,48"`; of several
         objects by name: `{"anna": (120, 80, 64, 48), "ben": (300, 90, 60, 150)}`. Without a box or a model, the run

@@ -29,7 +29,8 @@ Truth = TypeVar("Truth")
     "--frames", type=click.IntRange(min=2), help="Length of the video.  [default: 600, of several objects 300]"
 )
 @click.option("--render-only", is_flag=True, help="Only write the video and its ground truth.")
-def demo(output: Path, objects: int, frames: int | None, render_only: bool) -> None:
+@click.option("--live", metavar="demo:SEED", help="Only print the box of the first frame of this live source.")
+def demo(output: Path, objects: int, frames: int | None, render_only: bool, live: str | None) -> None:
     """Render a video with ground truth, track its objects, and print the accuracy.
 
     A dahlia moves over a lake: it rotates and changes its size, the brightness
@@ -37,6 +38,10 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool) -> N
     picture and returns. With --objects, several flowers and other objects with
     names cross and occlude one another. Their accuracy is measured as MOTA, IDF1
     and HOTA, which needs an extra: pip install "catstream[mot]".
+
+    The source demo:SEED is a part of the video as a live source, which needs no
+    camera and never ends. SEED is a number; demo:SEED?size=640x480&rate=10
+    changes the frames. --live prints the box of its first frame.
 
     \b
     Writes
@@ -48,8 +53,14 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool) -> N
     Examples
       catstream demo
       catstream demo --objects 8 --output crowd
+      catstream demo --live demo:1
+      catstream track demo:1 --box "$(catstream demo --live demo:1)" --view
     """
-    if objects == 1:
+    if live is not None:
+        from catstream.video.live_demo import first_box
+
+        click.echo(first_box(live))
+    elif objects == 1:
         _one(output, frames, render_only)
     else:
         _several(output, objects, frames, render_only)

@@ -92,7 +92,8 @@ def track(
     images/%05d.png, a camera (0 or /dev/video0), or a stream (rtsp://... or
     http://... for MJPEG). Cameras and streams are live: only the newest frame
     is tracked, the frames before it are skipped and counted, and a lost source
-    is opened again until it is available.
+    is opened again until it is available. demo:1 is a live source without a
+    camera: see `catstream demo`.
 
     The detector, the compressor and the trainer run as separate processes.
     Ctrl-C, SIGTERM and the loss of the terminal end them; the results so far

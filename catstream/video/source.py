@@ -12,12 +12,13 @@ The text is one of these:
     a pattern           images/%05d.png or images/*.png
     a camera            0 or /dev/video0
     a stream            rtsp://HOST/PATH, or http://HOST/PATH for MJPEG
+    a live demo         demo:1; it needs no camera, see `catstream.video.live_demo`
     a file:// address   file:///home/me/walk.mp4
 
 Files and images are read to the last frame, and no frame is skipped. If a file
 is damaged, the frames before the damage are returned and then `VideoError` is
-raised; with `skip_damaged`, reading continues after the damage. Cameras and
-streams are live: see `catstream.video.live`.
+raised; with `skip_damaged`, reading continues after the damage. The others
+are live: see `catstream.video.live`.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".we
 VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
 _FOLDERS = ("img", "imgs", "color", "rgb")
 _EXPECTED = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
-_LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+")
+_LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+|demo:.*")
 
 #: A video that ends this many seconds before its stated duration was cut off. Rounding and audio cause less.
 _CUT_OFF_SECONDS = 0.5
@@ -141,10 +142,10 @@ class _FileSource(Source):
 
 
 def is_live(text: str | Path) -> bool:
-    """Return whether a text names a camera or a stream. A number names a camera; a folder named 0 is ./0.
+    """Return whether a text names a live source. A number names a camera; a folder named 0 is ./0.
 
-    >>> [is_live(text) for text in ("0", "/dev/video2", "rtsp://10.0.0.7/stream", "./0", "walk.mp4")]
-    [True, True, True, False, False]
+    >>> [is_live(text) for text in ("0", "/dev/video2", "rtsp://10.0.0.7/stream", "demo:1", "./0", "walk.mp4")]
+    [True, True, True, True, False, False]
     """
     return _LIVE_ADDRESS.fullmatch(str(text)) is not None
 
@@ -185,9 +186,11 @@ def open_source(
     if is_live(text):
         if part != ALL_FRAMES:
             raise VideoError("a live source gives only its newest frame: leave out start, end and stride")
-        from catstream.video.live import LiveSource  # imported here because files do not need its threads
+        # Imported here because files do not need threads, or the rendering of the demo.
+        from catstream.video.live import LiveSource
+        from catstream.video.live_demo import PREFIX, LiveDemo
 
-        return LiveSource(str(text), start, since=since, idle=idle)
+        return (LiveDemo if str(text).startswith(PREFIX) else LiveSource)(str(text), start, since=since, idle=idle)
     if str(text) == "-":
         raise VideoError(
             "standard input is not a source, because a restarted process cannot read it again: "

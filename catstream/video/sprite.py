@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,8 +20,14 @@ _DAHLIA = (308, 221)  # centre of the dahlia in its photograph, in pixels
 
 
 def load_photograph(name: str) -> np.ndarray:
-    """Load a photograph that scikit-learn ships as float32 BGR. Scikit-learn's own loader needs Pillow."""
-    path = files("sklearn") / "datasets" / "images" / f"{name}.jpg"
+    """Load a photograph that scikit-learn ships as float32 BGR.
+
+    The file is read without an import of scikit-learn, which takes seconds and whose own loader needs Pillow.
+    """
+    package = find_spec("sklearn")
+    assert package is not None
+    assert package.origin is not None, "scikit-learn is a dependency"
+    path = Path(package.origin).parent / "datasets" / "images" / f"{name}.jpg"
     return np.array(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR), np.float32)
 
 

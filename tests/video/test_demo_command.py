@@ -35,3 +35,8 @@ def test_several_objects_are_followed_and_measured(tmp_path):
     assert float(scores[1]) > 0.9
     assert scores[4] == "0"
     assert (tmp_path / "tracks" / "crowd.mp4").exists()
+
+
+def test_the_box_of_a_live_demo_is_printed():
+    result = CliRunner().invoke(demo, ["--live", "demo:1"])
+    assert (result.exit_code, result.output) == (0, "184,88,57,58\n")
