@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from catstream.box import Box
 from catstream.errors import FleetError
 from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.video.live_demo import first_box
 
 WHOLE = """
 name = "site"
@@ -183,3 +184,10 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 def test_a_stored_spec_that_is_damaged_is_an_error(text):
     with pytest.raises(FleetError, match="is damaged: apply the fleet file again"):
         FleetSpec.from_json(text)
+
+
+def test_the_streams_of_the_example_begin_with_the_boxes_that_they_name():
+    fleet = FleetSpec.load(Path(__file__).parents[2] / "examples" / "fleet.toml")
+    assert len(fleet.streams) == 6
+    for stream in fleet.streams.values():
+        assert list(stream.boxes.values()) == [first_box(stream.source)]
