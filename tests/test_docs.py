@@ -83,7 +83,14 @@ def verbs() -> dict[str, click.Command]:
 
 def commands_of(verb: click.Command) -> Iterator[click.Command]:
     """A command, or the commands of a group."""
-    yield from verb.commands.values() if isinstance(verb, click.Group) else [verb]
+    yield from by_name(verb).values() if isinstance(verb, click.Group) else [verb]
+
+
+def by_name(group: click.Group) -> dict[str, click.Command]:
+    """The commands of a group; a module that holds one may be imported for it."""
+    with click.Context(group) as context:
+        found = {name: group.get_command(context, name) for name in group.list_commands(context)}
+    return {name: command for name, command in found.items() if command is not None}
 
 
 def test_every_setting_and_preset_has_its_row():
@@ -194,10 +201,10 @@ def wrong_words(name: str, *words: str) -> Iterator[str]:
     verb = verbs()[name]
     if isinstance(verb, click.Group):
         command, *words = words
-        if command not in verb.commands:
+        if command not in by_name(verb):
             yield f"shows `catstream {name} {command}`, but there is no such command"
             return
-        verb = verb.commands[command]
+        verb = by_name(verb)[command]
     with click.Context(verb) as context:
         known = {flag for option in verb.get_params(context) for flag in option.opts}
     if wrong := {word for word in words if word.startswith("--")} - known:
