@@ -3,6 +3,7 @@
     name = "site"                      # the default is the name of the file
     store = "state"                    # a folder, file:///..., or s3://bucket/prefix
     every = 5.0                        # seconds between two states of a stream in the store
+    nodes = 3                          # nodes that are started if the fleet runs on this machine alone
 
     [streams.cam-7]
     source = "rtsp://camera/1"
@@ -231,7 +232,7 @@ class FleetSpec:
             _text("name", tables["name"], folder),
             store if not store or "://" in store else str(folder / store),
             _number("every", tables.get("every", _EVERY), folder),
-            int(_number("nodes", tables.get("nodes", 1), folder)),
+            _count("nodes", tables.get("nodes", 1)),
             {name: StreamSpec.parse(name, table, folder) for name, table in streams.items()},
         )
 
@@ -249,6 +250,12 @@ def _number(key: str, value: object, _: Path) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise FleetError(f"{key} must be a number, got {reprlib.repr(value)}")
     return float(value)
+
+
+def _count(key: str, value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise FleetError(f"{key} must be a whole number, got {reprlib.repr(value)}")
+    return value
 
 
 def _source(key: str, value: object, folder: Path) -> str:

@@ -129,6 +129,8 @@ def test_the_digest_changes_exactly_if_the_stream_must_be_started_anew(change, r
         ('[streams.".."]\nsource="0"', "'..' is no name of a stream"),
         ('naem="a"\n[streams.a]\nsource="0"', "there is no key 'naem', did you mean 'name'? there are name, store"),
         ('every=0\n[streams.a]\nsource="0"', "the fleet site: every must be above 0 and at most 3600 s, got 0"),
+        ('nodes=65\n[streams.a]\nsource="0"', "the fleet site: nodes must be from 1 to 64, got 65"),
+        ('nodes=1.5\n[streams.a]\nsource="0"', "nodes must be a whole number, got 1.5"),
         ('every="5"\n[streams.a]\nsource="0"', "every must be a number, got '5'"),
     ],
 )  # fmt: skip
@@ -180,6 +182,22 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
         FleetSpec.load(tmp_path / "a.toml")
 
 
+def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
+    def spec(**streams):
+        return FleetSpec("site", streams={name: StreamSpec(name, *given) for name, given in streams.items()})
+
+    old, box = spec(a=["0"], b=["0"], c=["0"], d=["0"]), {"": Box(1, 2, 30, 40)}
+    new = spec(b=["1"], c=["0"], d=["0"], e=["0", box])
+    new.streams["d"] = replace(new.streams["d"], cores=2.0)
+    assert old.changes(new) == [
+        "a: is removed",
+        "b: starts again with its changes",
+        "c: is unchanged",
+        "d: goes on with its changes",
+        "e: is added",
+    ]
+
+
 @pytest.mark.parametrize("text", ["", "[]", "{}", "[" * 100_000])
 def test_a_stored_spec_that_is_damaged_is_an_error(text):
     with pytest.raises(FleetError, match="is damaged: apply the fleet file again"):
@@ -188,6 +206,6 @@ def test_a_stored_spec_that_is_damaged_is_an_error(text):
 
 def test_the_streams_of_the_example_begin_with_the_boxes_that_they_name():
     fleet = FleetSpec.load(Path(__file__).parents[2] / "examples" / "fleet.toml")
-    assert len(fleet.streams) == 6
+    assert (len(fleet.streams), fleet.nodes) == (6, 3)
     for stream in fleet.streams.values():
         assert list(stream.boxes.values()) == [first_box(stream.source)]
