@@ -6,8 +6,10 @@ import logging
 import os
 import resource
 import secrets
+import socket
 import stat
 import threading
+import traceback
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,7 +17,7 @@ import pytest
 
 from catstream import storage
 from catstream.errors import FencedError, FleetError, StoreError
-from catstream.fleet import log
+from catstream.fleet import log, objects
 from catstream.fleet.log import LARGEST_CLAIM
 from catstream.fleet.store import Store
 
@@ -225,3 +227,79 @@ def test_a_file_is_created_whole_or_not_at_all(tmp_path):
     with pytest.raises(FileExistsError):
         storage.create_atomically(tmp_path / "a", b"second")
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"first")]
+
+
+def test_a_stopped_server_is_a_store_error_and_the_next_write_succeeds(s3_server):
+    claim = Store("s3://fleet/stopped").claim("cam-7", "node-1")
+    claim.write(STATE, {"frame": 1})
+    s3_server.stop()
+    with pytest.raises(StoreError, match=r"streams/cam-7/.* cannot be written: .*check the network and the server"):
+        claim.write(STATE, {"frame": 2})
+    s3_server.__init__(*s3_server.get_host_and_port(), verbose=False)  # with the objects that it had
+    s3_server.start()
+    claim.write(STATE, {"frame": 3})
+    assert Store("s3://fleet/stopped").newest("cam-7").facts == {"frame": 3}
+
+
+def test_a_server_that_never_answers_is_a_store_error_after_the_time_limit(monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        monkeypatch.setattr(objects, "_SECONDS", 0.2)
+        monkeypatch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*silent.getsockname()))
+        for name, value in SECRETS.items():
+            monkeypatch.setenv(name, value)
+        with pytest.raises(StoreError, match=r"no answer within 0\.2 s"):
+            Store("s3://fleet").newest("cam-7")
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "s3://AKIA-not-to-be-seen:secret-not-to-be-seen@fleet/prefix",
+        "s3://fleet/prefix?token=token-not-to-be-seen",
+        "https://AKIA-not-to-be-seen@host/fleet",
+        "gs://not-to-be-seen",
+        "s3://Not-To-Be-Seen",
+        "file://not-to-be-seen/folder",
+    ],
+)
+def test_a_url_with_credentials_or_of_another_kind_is_refused_and_not_repeated(url):
+    with pytest.raises(FleetError) as refused:
+        Store(url)
+    assert "not-to-be-seen" not in str(refused.value).lower()
+
+
+@pytest.mark.usefixtures("s3_server")
+@pytest.mark.parametrize("url", ["s3://fleet/p", "s3://no-such-bucket/p", "s3://unreachable/p"])
+def test_no_credential_is_in_a_message_a_repr_a_traceback_or_a_log(url, caplog, monkeypatch):
+    caplog.set_level(logging.DEBUG)
+    if "unreachable" in url:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", "http://user:password-not-to-be-seen@127.0.0.1:9")
+    store, shown = Store(url), []
+    try:
+        claim = store.claim("cam-7", "node-1")
+        claim.write(STATE, {})
+        shown.append(repr(claim))
+    except StoreError as error:
+        shown += [*traceback.format_exception(error), repr(error)]
+    assert "not-to-be-seen" not in "".join([*shown, repr(store), *(record.getMessage() for record in caplog.records)])
+
+
+@pytest.mark.usefixtures("s3_server")
+def test_a_missing_bucket_and_missing_credentials_are_named(monkeypatch):
+    with pytest.raises(StoreError, match="there is no such bucket: create it"):
+        Store("s3://no-such-bucket").claim("cam-7", "node-1")
+    for name in SECRETS:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("HOME", "/nowhere")
+    with pytest.raises(StoreError, match="no credentials were found: set AWS_PROFILE"):
+        Store("s3://fleet").claim("cam-7", "node-1")
+
+
+@pytest.mark.usefixtures("s3_server")
+def test_a_server_that_ignores_if_none_match_is_refused(monkeypatch):
+    store = Store("s3://fleet/overwrites")
+    overwrite = store._objects._fs.pipe_file
+    monkeypatch.setattr(store._objects._fs, "pipe_file", lambda path, data, **_: overwrite(path, data))
+    with pytest.raises(StoreError, match="ignores If-None-Match"):
+        store.claim("cam-7", "node-1")
