@@ -284,7 +284,5 @@ def test_after_a_claim_no_older_holder_adds_a_state_and_nothing_acknowledged_is_
     monkeypatch.setattr(log, "_CLAIMS", kept)
     run_state_machine_as_test(
         Fencing,
-        settings=settings(
-            max_examples=int(__import__("os").environ.get("HYP") or 60), stateful_step_count=20, deadline=None
-        ),
+        settings=settings(max_examples=60, stateful_step_count=20, deadline=None),
     )
