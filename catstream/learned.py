@@ -25,8 +25,8 @@ from catstream.detection.likeness import Likeness
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
 from catstream.heads import HEADS
-from catstream.messages import Model
-from catstream.names import check_name
+from catstream.messages import Features, Model
+from catstream.names import check_name, listed
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
 from catstream.storage import Arrays, Metadata
@@ -34,7 +34,7 @@ from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 from catstream.wire.checks import check_message
 
-__all__ = ["Learned", "merge"]
+__all__ = ["Learned", "begun", "merge"]
 
 _KIND = "learned 3"  # and the version of what the file holds
 
@@ -197,6 +197,23 @@ class Learned:
             tree, width = self.trees[name], len(self.model.weights) + head.more_columns
             if tree.size != self.settings.coreset.size or tree.width not in (0, width):
                 raise ValueError(f"its tree {name!r} has {tree.size} rows of length {tree.width}")
+
+
+def begun(features: Features, settings: Settings) -> dict[str, Compressor]:
+    """The compressors of the objects that begin with a saved model in a message, by name.
+
+    Raises
+    ------
+    ProtocolError
+        If a saved model is damaged, or one of other features.
+    SettingsError
+        If the settings do not suit its trees.
+    """
+    models = {name: part.model for name, part in features.objects.items() if part.model}
+    return {
+        name: Learned.from_bytes(model, f"the saved model of {listed([name])}").compressor(settings, name)
+        for name, model in models.items()
+    }
 
 
 def merge(parts: Sequence[Learned]) -> Learned:

@@ -60,7 +60,13 @@ State = Literal["bootstrapping", "present", "absent"]
 
 Level = Literal["lost", "redetected", "weak", "confident"]
 
-Verb = Literal["set-box", "forget", "pause", "resume", "save", "stop"]
+Verb = Literal["set-box", "search", "forget", "pause", "resume", "save", "stop"]
+
+#: Bytes of a saved model at most.
+LARGEST_MODEL = 511 << 20
+
+#: The same for one that is given by a command.
+LARGEST_GIVEN_MODEL = 63 << 20
 
 #: The state of a stream of a fleet: "waiting" is for a box, "unplaced" is without a node that fits.
 StreamState = Literal["starting", "running", "waiting", "paused", "moving", "unplaced", "failed", "ended"]
@@ -156,12 +162,14 @@ class ObjectFeatures:
     training  training rows of each group of `catstream.heads`; a group without rows is left out
     detector  state of the detector after this frame, from which a restarted detector continues; None before it has one
     begins    whether a new object is tracked under this name from this frame on: its trees begin anew
+    model     the saved model that the trees continue, if the object begins with one; otherwise empty
     """
 
     box: Box | None
     training: Annotated[dict[str, TrainingRows], Named(dict.fromkeys(GROUPS, 0))] = field(default_factory=dict)
     detector: DetectorState | None = None
     begins: bool = False
+    model: Annotated[bytes, Bytes("a saved model", longest=LARGEST_MODEL, begin=b"")] = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,7 +414,7 @@ class SavedModel:
     """
 
     version: int
-    file: Annotated[bytes, Bytes("a saved model", longest=511 << 20, begin=b"")]
+    file: Annotated[bytes, Bytes("a saved model", longest=LARGEST_MODEL, begin=b"")]
     object: ObjectName = ""
 
 
@@ -472,7 +480,8 @@ class Command:
     box     for "set-box": box of the object in the next frame that is tracked, in pixels; during a pause of a file, in
             the frame that is held
     keep    for "set-box": whether it is the same object, so that everything learned about it is kept
-    object  for "set-box", "forget" and "save": name of the object
+    object  for "set-box", "search", "forget" and "save": name of the object
+    model   for "search": the saved model of the object, which is searched for from the next frame on
     """
 
     id: str
@@ -480,6 +489,7 @@ class Command:
     box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
     keep: bool = False
     object: ObjectName = ""
+    model: Annotated[bytes | None, Bytes("a saved model", LARGEST_GIVEN_MODEL, b""), OnlyWith("verb", "search")] = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,17 @@ import os
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Self
 
 import numpy as np
 
 from catstream import kalman, storage
+from catstream.box import Box
+from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.detection.detector import Detector
+from catstream.detection.likeness import Likeness
 from catstream.detection.objects import Detectors, prepare
 from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, ServiceError
 from catstream.features.layout import row_length
@@ -25,7 +29,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.image import as_bgr
 from catstream.learned import Learned
 from catstream.messages import Features, Model, Track, Tracks
-from catstream.names import UNNAMED, Boxes, boxes_by_name, check_count, listed
+from catstream.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
 from catstream.storage import Arrays, Metadata, with_prefix
@@ -114,7 +118,14 @@ class MultiTracker:
             self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
             self._learn(*detectors.step(pyramid, time, given))
 
-    def update(self, frame: np.ndarray, time: float = 0.0, *, begin: Boxes | None = None) -> dict[str, Track]:
+    def update(
+        self,
+        frame: np.ndarray,
+        time: float = 0.0,
+        *,
+        begin: Boxes | None = None,
+        search: Mapping[str, Learned] | None = None,
+    ) -> dict[str, Track]:
         """Find the objects in the next frame, and learn from it.
 
         Parameters
@@ -122,6 +133,9 @@ class MultiTracker:
         begin : mapping of str to boxes
             The boxes of objects that begin in this frame. An object of the same name is forgotten. If one box is
             refused, no object begins, and the frame counts as not seen.
+        search : mapping of str to Learned
+            Saved models of objects that are searched for from this frame on, by name. Each is absent until it is found,
+            and learning continues from its saved model. An object of the same name is forgotten.
 
         Returns
         -------
@@ -134,10 +148,13 @@ class MultiTracker:
         FrameError
             For an array that is not a frame, or is of another size than those before.
         ObjectError
-            For a name as in `init`.
+            For a name as in `init`, or one that has both a box and a saved model.
+        SettingsError
+            If the settings do not suit a saved model.
         """
         _ = self.tracks
-        image, boxes = as_bgr(frame), boxes_by_name(begin or {})
+        image, boxes, models = as_bgr(frame), boxes_by_name(begin or {}), search or {}
+        compressors = self._continued(models, boxes)
         if image.shape[:2] != self._size:
             (height, width), (first_height, first_width) = image.shape[:2], self._size
             raise FrameError(
@@ -147,8 +164,18 @@ class MultiTracker:
         with one_thread():
             pyramid = Pyramid.of(image)
             given = self.detectors.begin_all(boxes, pyramid, time)
-            self._learn(*self.detectors.step(pyramid, time, given))
+            for name, learned in models.items():
+                self.detectors.seek(name, learned.model, learned.box, learned.likeness())
+            self._learn(*self.detectors.step(pyramid, time, given), compressors)
         return self.tracks
+
+    def _continued(self, models: Mapping[str, Learned], boxes: Mapping[str, Box]) -> dict[str, Compressor]:
+        """The compressors of the objects of saved models; an error if one of the objects cannot begin."""
+        if both := models.keys() & boxes.keys():
+            raise ObjectError(f"{listed(sorted(both))}: a box and a saved model for one object: give one of them")
+        names = {check_name(name) for name in (*self.detectors.detectors, *boxes, *models)}
+        check_count(len(names), self.settings.run.objects_most)
+        return {name: learned.compressor(self.settings, name) for name, learned in models.items()}
 
     def forget(self, name: str) -> None:
         """Follow an object no more; everything learned of it is dropped with the next frame.
@@ -198,6 +225,8 @@ class MultiTracker:
             model, model_metadata = pack(detector.model, f"model.{i}")
             start, start_metadata = detector.scm_state()
             arrays |= model | {f"bootstrap.{i}.{key}": array for key, array in start.items()}
+            if detector.likeness is not None:
+                arrays |= {f"likeness.{i}.{key}": array for key, array in detector.likeness.state().items()}
             objects.append({"name": name, "model": model_metadata, "bootstrap": start_metadata})
         whole: Metadata = {
             "kind": _KIND,
@@ -249,7 +278,10 @@ class MultiTracker:
                     f"catstream {metadata['program']} wrote it"
                 )
             self._resume(self.detectors.add(str(each["name"])), model)
-            self.detectors.detectors[each["name"]].resume_scm(with_prefix(arrays, f"bootstrap.{i}."), each["bootstrap"])
+            detector = self.detectors.detectors[each["name"]]
+            detector.resume_scm(with_prefix(arrays, f"bootstrap.{i}."), each["bootstrap"])
+            if likeness := with_prefix(arrays, f"likeness.{i}."):
+                detector.likeness = Likeness.from_state(likeness)
         height, width = metadata["size"]
         self._size = int(height), int(width)
         tracks = unpack(Tracks, arrays, metadata["tracks"], "tracks")
@@ -264,9 +296,11 @@ class MultiTracker:
             raise ValueError(f"it does not say where the object {detector.name!r} was")
         detector.resume(state, model)
 
-    def _learn(self, tracks: Tracks, features: Features) -> None:
+    def _learn(
+        self, tracks: Tracks, features: Features, learned: Mapping[str, Compressor] = MappingProxyType({})
+    ) -> None:
         self._tracks = tracks.tracks
-        for sample in self.forest.take(features):
+        for sample in self.forest.take(features, learned):
             self.detectors.adopt(self.trainer.train(sample))
         if tracks.frame >= self.settings.search.motion_frames // 2:
             kalman.prepare()  # after twice as many frames, a sample has the centres

@@ -2,6 +2,7 @@
 
     DIR/job.safetensors     the job of the run, readable by its owner only: see `catstream.job`
     DIR/desired_state.json  what was commanded: see `catstream.services.desired`
+    DIR/searched_models/    the saved models that objects are searched for by: see `catstream.services.model_files`
     DIR/trees/              the compressor's checkpoints: see `catstream.compression.checkpoint_store`
 
 A pipeline locks DIR, and its compressor DIR/trees. The kernel releases a lock when its process ends, however that
@@ -26,14 +27,18 @@ from catstream.messages import Position
 from catstream.names import UNNAMED, listed
 from catstream.settings import Settings
 
-__all__ = ["TREES", "began", "files", "learned", "locked", "position", "restore", "skip"]
+__all__ = ["SEARCHED", "TREES", "began", "files", "learned", "locked", "position", "restore", "skip"]
 
 #: Folder of the checkpoints, in that of the state.
 TREES = "trees"
+#: Folder of the saved models that objects are searched for by, in that of the state.
+SEARCHED = "searched_models"
 
 _HELP = "give another folder"
 _SMALL = ("job.safetensors", "desired_state.json")
-_NAMES = re.compile(rf"job\.safetensors|desired_state\.json|{TREES}/[0-9]+\.safetensors")
+_NAMES = re.compile(
+    rf"job\.safetensors|desired_state\.json|{TREES}/[0-9]+\.safetensors|{SEARCHED}/[0-9a-f]+\.safetensors"
+)
 _ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
 
 
@@ -79,9 +84,10 @@ def files(folder: Path) -> dict[str, bytes]:
         checkpoints = sorted((folder / TREES).glob("[0-9]*.safetensors"))
         names = [
             *(name for name in _SMALL if (folder / name).exists()),
+            *(f"{path.parent.name}/{path.name}" for path in (folder / SEARCHED).glob("[0-9a-f]*.safetensors")),
             *(f"{TREES}/{path.name}" for path in checkpoints[-1:]),
         ]
-        with contextlib.suppress(FileNotFoundError):  # a newer checkpoint has just taken its place
+        with contextlib.suppress(FileNotFoundError):  # a newer file has just taken its place
             return {name: (folder / name).read_bytes() for name in names} if checkpoints else {}
     raise ServiceError(f"the state in {str(folder)!r} changes too quickly to be read: try again")
 

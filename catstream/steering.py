@@ -1,4 +1,4 @@
-"""Send commands to a running pipeline: set the box of an object, forget an object, pause, resume, save, stop.
+"""Send commands to a running pipeline: set a box, search for an object, forget one, pause, resume, save, stop.
 
     import catstream
 
@@ -20,7 +20,7 @@ from uuid import uuid4
 from catstream.box import Box
 from catstream.errors import CommandRejectedError, SilenceError
 from catstream.learned import Learned
-from catstream.messages import Answer, Command, SavedModel, Verb
+from catstream.messages import Answer, Command, SavedModel
 from catstream.names import UNNAMED, check_name
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
@@ -77,7 +77,31 @@ class Control:
         ObjectError
             If the name is not valid.
         """
-        return self._ask("set-box", object, Box.parse(box), keep)
+        return self._ask(Command(uuid4().hex, "set-box", Box.parse(box), keep, object=check_name(object)))
+
+    def search(self, model: Learned | str | os.PathLike[str], object: str = UNNAMED) -> Answer:
+        """Search for the object of a saved model from the next frame on, beside the others.
+
+        The object is absent until it is found in the whole frame, and learning continues from the saved model, as with
+        the argument `model` of `catstream.Pipeline`. The model is sent to the pipeline, which keeps a copy.
+
+        Parameters
+        ----------
+        model : path or Learned
+            The saved model, or a file of it on this machine.
+        object : str
+            Name of the object. If an object has this name already, this one takes its place, and everything that was
+            learned of the previous one is dropped. Without a name, the only object is meant.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid.
+        ServiceError, ProtocolError
+            If the file cannot be read, or is not a saved model.
+        """
+        learned = model if isinstance(model, Learned) else Learned.load(model)
+        return self._ask(Command(uuid4().hex, "search", model=learned.to_bytes(), object=check_name(object)))
 
     def forget(self, object: str = UNNAMED) -> Answer:
         """Stop tracking an object, and drop everything that was learned of it; without a name, the only object.
@@ -89,15 +113,15 @@ class Control:
         ObjectError
             If the name is not valid.
         """
-        return self._ask("forget", object)
+        return self._ask(Command(uuid4().hex, "forget", object=check_name(object)))
 
     def pause(self) -> Answer:
         """Stop processing frames; the frames of a live source are counted as skipped."""
-        return self._ask("pause")
+        return self._ask(Command(uuid4().hex, "pause"))
 
     def resume(self) -> Answer:
         """Continue processing frames."""
-        return self._ask("resume")
+        return self._ask(Command(uuid4().hex, "resume"))
 
     def save(self, path: str | os.PathLike[str], object: str = UNNAMED) -> Answer:
         """Write everything that was learned of an object to a file on this machine, atomically.
@@ -118,14 +142,14 @@ class Control:
         ServiceError
             If the file cannot be written.
         """
-        answer = self._ask("save", object)
+        answer = self._ask(Command(uuid4().hex, "save", object=check_name(object)))
         learned = self._newest(answer.object, answer.version)
         learned.save(path)
         return replace(answer, version=learned.model.version)
 
     def stop(self) -> Answer:
         """End the run as if the source had ended: everything learned is stored first."""
-        return self._ask("stop")
+        return self._ask(Command(uuid4().hex, "stop"))
 
     def close(self) -> None:
         """Disconnect; the pipeline continues."""
@@ -150,8 +174,8 @@ class Control:
             "check the pipeline with catstream status"
         )
 
-    def _ask(self, verb: Verb, name: str = UNNAMED, box: Box | None = None, keep: bool = False) -> Answer:
-        answer = self._commands.ask(Command(uuid4().hex, verb, box, keep, check_name(name)), self.timeout)
+    def _ask(self, command: Command) -> Answer:
+        verb, answer = command.verb, self._commands.ask(command, self.timeout)
         if answer is None:
             raise SilenceError(
                 f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "

@@ -198,7 +198,7 @@ def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
             raise ValueError(f"it is of version {header['version']}, this catstream reads {_VERSION}")
         if header["checksum"] != _checksum(arrays, metadata):
             raise ValueError("its checksum does not match")
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (SafetensorError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ProtocolError(f"{name} is not an undamaged file of catstream ({error}): use an older copy") from None
     return arrays, metadata
 

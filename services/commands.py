@@ -12,11 +12,13 @@ from dataclasses import replace
 
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
-from catstream.errors import BoxError, ObjectError
+from catstream.errors import BoxError, CatstreamError, ObjectError
 from catstream.features.pyramid import Pyramid
+from catstream.learned import Learned
 from catstream.messages import Answer, Command
 from catstream.names import UNNAMED, check_count, check_name, listed
 from catstream.services.desired import DesiredState
+from catstream.services.model_files import ModelFiles
 
 __all__ = ["STOPPED", "CommandHandler"]
 
@@ -31,22 +33,29 @@ class CommandHandler:
     ----------
     detectors : the detectors that the commands are for
     desired : the desired state at the start
+    models : the saved models that it names
 
     Attributes
     ----------
     desired : the desired state now
+    models : the saved models that it names
     end_reason : reason for which no more frames are tracked; empty while frames are tracked
     """
 
-    def __init__(self, detectors: Detectors, desired: DesiredState) -> None:
+    def __init__(self, detectors: Detectors, desired: DesiredState, models: ModelFiles) -> None:
         self.desired, self.end_reason = desired, STOPPED if desired.stopped else ""
-        self._detectors = detectors
+        self.models, self._detectors = models, detectors
         self._boxes: deque[Command] = deque()  # to be applied to the next frame
 
     @property
     def has_box(self) -> bool:
         """Whether a box waits for a frame."""
         return bool(self._boxes)
+
+    @property
+    def needed_models(self) -> set[str]:
+        """The names of the saved models that a restarted detector may need for the frames that it repeats, or later."""
+        return self.desired.models_since(self._detectors.seq - self._detectors.settings.run.unstored_frames)
 
     @property
     def counters(self) -> dict[str, float]:
@@ -98,8 +107,8 @@ class CommandHandler:
         if box is None:
             raise BoxError("no box was given")
         at, of_name = f"at {box} in frame {detectors.seq}", f" {name}" if name else ""
-        known = detectors.detectors.get(name)
-        if command.keep and known is not None and known.model.version:
+        known, begun = detectors.detectors.get(name), self.desired.objects_at(detectors.seq)
+        if command.keep and known is not None and known.model.version and self.desired.objects[name] is begun.get(name):
             return detectors.correct(name, frame, box, time), f"the same object{of_name} continues {at}"
         if name not in self.desired.objects:
             check_count(len(self.desired.objects) + 1, detectors.settings.run.objects_most)
@@ -137,15 +146,32 @@ class CommandHandler:
             case "stop":
                 self.desired, self.end_reason = replace(self.desired, stopped=True), STOPPED
                 return self._answer(command, True, f"the stream ends {after}")
+            case "search":
+                return self._search(command)
         try:
             name = self._name(command)
             if not self.desired.objects:
-                raise ObjectError("no object is tracked yet: give one a box first (set-box)")
+                raise ObjectError("no object is tracked yet: give one a box first (set-box), or a saved model (search)")
             if name not in self.desired.objects:
                 raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.desired.objects)}")
         except ObjectError as error:
             return self._answer(command, False, str(error))
         return self._forget(command, name, after) if command.verb == "forget" else self._save(command, name, after)
+
+    def _search(self, command: Command) -> Answer:
+        """Begin an object in the next frame: it is searched for by a saved model."""
+        settings, seq = self._detectors.settings, self._detectors.seq
+        try:
+            name = self._name(command)
+            if name not in self.desired.objects:
+                check_count(len(self.desired.objects) + 1, settings.run.objects_most)
+            learned = Learned.from_bytes(command.model or b"", "the file")
+            learned.check_fits(settings)
+        except CatstreamError as error:
+            return self._answer(command, False, str(error))
+        self.desired = self.desired.begun(name, learned.box, seq + 1, self.models.add(learned))
+        reason = f"{listed([name])} is searched for from frame {seq} on, by model {learned.model.version}"
+        return self._answer(command, True, reason, name)
 
     def _forget(self, command: Command, name: str, after: str) -> Answer:
         """Stop tracking an object; everything learned of it is dropped."""

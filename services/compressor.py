@@ -10,7 +10,7 @@ from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
 from catstream.job import Job
-from catstream.learned import Learned
+from catstream.learned import begun
 from catstream.messages import End, Features
 from catstream.recording.file import RecordingWriter
 from catstream.services.loop import Process
@@ -59,7 +59,7 @@ class CompressorLoop:
         job, settings, endpoint = process.job, process.settings, process.endpoint
         self._process = process
         self._checkpoints = _checkpoints(job, stack)
-        self._forest = _forest(job, self._checkpoints)
+        self._forest = self._checkpoints.load(settings) if self._checkpoints is not None else Forest(settings)
         position = self._forest.position
         self._progress = Progress(position, position.seq, time.monotonic())
         self._prepared = False
@@ -96,7 +96,9 @@ class CompressorLoop:
             self._recorder.write(features)
         self._prepare()
         before = self._forest.compressors.keys()
-        for sample in self._forest.take(features):
+        if any(part.model for part in features.objects.values()):
+            self._process.allow(_IMPORT_SECONDS)
+        for sample in self._forest.take(features, begun(features, self._process.settings)):
             self._samples.send(sample)
         if self._forest.compressors.keys() != before:
             self._samples.keep_only(self._forest.compressors)
@@ -167,15 +169,6 @@ class CompressorLoop:
 def _checkpoints(job: Job, stack: ExitStack) -> CheckpointStore | None:
     """The checkpoints of a run, locked for this process; None if the run has no state folder."""
     return None if job.state is None else CheckpointStore(stack.enter_context(locked(job.state / TREES, _LOCK_SECONDS)))
-
-
-def _forest(job: Job, checkpoints: CheckpointStore | None) -> Forest:
-    """A forest that continues from the newest checkpoint or from saved models, or a new one."""
-    forest = checkpoints.load(job.settings) if checkpoints is not None else Forest(job.settings)
-    if not forest.seq:
-        for name, file in job.models.items():
-            forest.add(Learned.load(file).compressor(job.settings, name))
-    return forest
 
 
 def reading_seconds(file: Path) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from catstream.detection.detector import Result
@@ -17,22 +17,28 @@ from catstream.wire.endpoint import Endpoint
 
 __all__ = ["CommandChannel"]
 
+_MODEL_SECONDS = 60.0  # limit for reading saved models, and for writing them to a slow disk
+
 _log = logging.getLogger(__name__)
 
 
 class CommandChannel(Responder[Command, Answer]):
     """Connects a `CommandHandler` to its socket and to its file.
 
-    The desired state is written to disk before a command is answered. If the disk is full, this is logged, and the
-    command is carried out nevertheless.
+    The desired state and the saved models that it names are written to disk before a command is answered. If the disk
+    is full, this is logged, and the command is carried out nevertheless.
 
     Parameters
     ----------
     file : file for the desired state; None if it is not stored
+    allow : extends the watchdog's deadline by seconds
     """
 
-    def __init__(self, endpoint: Endpoint, handler: CommandHandler, file: Path | None) -> None:
-        super().__init__(CONTROL, endpoint)
+    def __init__(
+        self, endpoint: Endpoint, handler: CommandHandler, file: Path | None, allow: Callable[[float], None]
+    ) -> None:
+        super().__init__(CONTROL, endpoint, longest=CONTROL.limit)
+        self._allow = allow
         self._handler, self._file = handler, file
         self._kept: DesiredState | None = None
         self._conclude([])
@@ -40,6 +46,8 @@ class CommandChannel(Responder[Command, Answer]):
     def carry_out(self) -> bool:
         """Carry out the commands that have arrived; return whether there were any."""
         commands = self.receive_all()
+        if any(command.model is not None for command in commands):
+            self._allow(_MODEL_SECONDS)
         self._conclude(self._handler.carry_out(commands))
         return bool(commands)
 
@@ -67,7 +75,9 @@ class CommandChannel(Responder[Command, Answer]):
         if self._file is not None and self._handler.desired != self._kept:
             self._kept = self._handler.desired
             try:
+                self._handler.models.store()  # before the state that names them
                 self._kept.save(self._file)
+                self._handler.models.keep_only(self._handler.needed_models)
             except OSError as error:
                 _log.warning("the desired state cannot be written to %s (%s)", self._file, error.strerror)
         for answer in answers:

@@ -22,12 +22,14 @@ _PAST = 256  # far more than there are in the frames that a restarted detector r
 class DesiredObject:
     """An object that is to be followed.
 
-    box     the object in its first frame; of about its size if a saved model searches for it
-    begins  seq of the message of that first frame, 0 if the object is found by a saved model
+    box     the object in its first frame; the last box in the saved model if the object begins with one
+    begins  seq of the message of its first frame
+    model   name of the saved model that it begins with, see `catstream.services.model_files`; empty if it has none
     """
 
     box: Box
-    begins: int = 0
+    begins: int
+    model: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,21 +66,27 @@ class DesiredState:
         """Whether no frames are tracked: the run is paused, or waits for a box."""
         return self.paused or not self.objects
 
-    def begun(self, name: str, box: Box, seq: int) -> DesiredState:
+    def begun(self, name: str, box: Box, seq: int, model: str = "") -> DesiredState:
         """The state after an object has begun in message `seq`, in the place of another one of its name."""
         before = self.without(name, seq - 1) if name in self.objects else self
-        return replace(before, objects=before.objects | {name: DesiredObject(box, seq)})
+        return replace(before, objects=before.objects | {name: DesiredObject(box, seq, model)})
 
     def without(self, name: str, last: int) -> DesiredState:
-        """The state after an object was forgotten; message `last` is the last one with a track of it."""
-        past = (*self.past, PastObject(name, self.objects[name], last))[-_PAST:]
-        objects = {other: each for other, each in self.objects.items() if other != name}
+        """The state after an object was forgotten; message `last` is the last one that may have a track of it."""
+        each = self.objects[name]
+        past = (*self.past, PastObject(name, each, last))[-_PAST:] if each.begins <= last else self.past
+        objects = {other: its for other, its in self.objects.items() if other != name}
         return replace(self, objects=objects, past=past)
 
     def objects_at(self, seq: int) -> dict[str, DesiredObject]:
         """The objects of which message `seq` has a track, by name."""
         past = {was.name: was.each for was in self.past if was.each.begins <= seq <= was.last}
         return past | {name: each for name, each in self.objects.items() if each.begins <= seq}
+
+    def models_since(self, seq: int) -> set[str]:
+        """The names of the saved models that the objects of message `seq`, or of a later one, begin with."""
+        past = (was.each for was in self.past if was.last >= seq)
+        return {each.model for each in (*self.objects.values(), *past)} - {""}
 
     def save(self, path: Path) -> None:
         """Write the state to a file atomically.
@@ -114,4 +122,4 @@ class DesiredState:
 
 def _object(read: Mapping[str, Any]) -> DesiredObject:
     """An object as JSON gives it."""
-    return DesiredObject(Box(*read["box"]), int(read["begins"]))
+    return DesiredObject(Box(*read["box"]), int(read["begins"]), str(read["model"]))

@@ -25,9 +25,11 @@ from catstream.services.control import CommandChannel
 from catstream.services.delivery import Step, next_step
 from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.loop import Process
+from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import DataSender, Outputs
 from catstream.services.pacing import Awaited, awaited
 from catstream.services.resume import agree, start
+from catstream.state import SEARCHED
 from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password
 from catstream.video.source import open_source
@@ -54,14 +56,12 @@ _log = logging.getLogger(__name__)
 def main(process: Process) -> None:
     """Track the objects of the job to the last frame of its source."""
     process.source = _shown(process.job.source)
-    learned = {name: Learned.load(file) for name, file in process.job.models.items()}
     reason, failed = "the source has ended", False
     with ExitStack() as stack:
-        loop = DetectorLoop(process, stack, learned)
+        loop = DetectorLoop(process, stack)
         loop.wait_for_subscribers()
         if process.job.resume:
             loop.resume()
-        loop.seek()
         frames = loop.open(stack)
         try:
             for frame in frames:
@@ -83,20 +83,16 @@ def main(process: Process) -> None:
 class DetectorLoop:
     """The detectors, and the sockets that they are connected to.
 
-    Parameters
-    ----------
-    learned : the saved model of each object that is searched for, by name
-
     Every method that waits does so in turns: see `turn`.
     """
 
-    def __init__(self, process: Process, stack: ExitStack, learned: dict[str, Learned]) -> None:
+    def __init__(self, process: Process, stack: ExitStack) -> None:
         state = process.job.state
         file = state / _FILE if state is not None else None
         self.detectors = Detectors(process.settings)
-        self._process, self._learned = process, learned
-        self._commands = CommandHandler(self.detectors, _desired(process, learned))
-        self._control = stack.enter_context(CommandChannel(process.endpoint, self._commands, file))
+        self._process, self._model_files = process, ModelFiles(state / SEARCHED if state is not None else None)
+        self._commands = CommandHandler(self.detectors, _desired(process, self._model_files), self._model_files)
+        self._control = stack.enter_context(CommandChannel(process.endpoint, self._commands, file, process.allow))
         self._outputs = stack.enter_context(Outputs(process))
         self._models = stack.enter_context(Subscriber(MODELS, process.endpoint))
         self._source: Source | None = None
@@ -145,19 +141,28 @@ class DetectorLoop:
         begin = start(positions, models, commands.desired, Detector(self._process.settings).state_at)
         self.detectors.seq, commands.desired = begin.seq, begin.desired
         for name, (state, model) in begin.objects.items():
-            detector = self.detectors.add(name)
-            detector.resume(state, model)
-            if state.first_window is None and name in self._learned:
-                detector.likeness = self._learned[name].likeness()
+            self.detectors.add(name).resume(state, model)
+        for name, each in begin.desired.objects_at(begin.seq).items():
+            self._seek_again(name, each, models)
         for sender, position in zip(self._outputs.senders, positions, strict=True):
             sender.resume(begin.seq, position.seq)
 
-    def seek(self) -> None:
-        """Search for the objects of saved models that were not found yet, unless a command gave them a box."""
-        for name, each in self._commands.desired.objects.items():
-            if not each.begins and name not in self.detectors.detectors:
-                learned = self._learned[name]
-                self.detectors.add(name).seek(learned.model, learned.box, learned.likeness())
+    def _seek_again(self, name: str, each: DesiredObject, models: dict[str, Model]) -> None:
+        """Continue to search for an object by its saved model, unless it was found before the restart."""
+        known = self.detectors.detectors.get(name)
+        if known is not None and (known.state is None or known.state.first_window is not None):
+            return
+        if (learned := self._learned(each)) is None:
+            return
+        if known is not None:
+            known.likeness = learned.likeness()
+        else:  # its state is not known: it counts as not found
+            model = models.get(name, learned.model)
+            self.detectors.add(name).seek(model, learned.box, learned.likeness(), each.begins - 1)
+
+    def _learned(self, each: DesiredObject) -> Learned | None:
+        """The saved model that an object begins with, None if it has none."""
+        return self._model_files.get(each.model) if each.model else None
 
     def _position(self, sender: DataSender) -> Position:
         """The position that a receiver reports; there is no time-out."""
@@ -244,16 +249,22 @@ class DetectorLoop:
         objects = self._commands.desired.objects_at(seq)
         for name in detectors.detectors.keys() - objects.keys():
             detectors.forget(name)
+        begun: dict[str, Learned] = {}
         for name, each in objects.items():  # in the order in which they began, in which the samples are numbered
             if name in given:
                 continue
-            if seq <= max(each.begins, 1):
-                self._process.allow(_OPEN_SECONDS)
             if seq == each.begins:
+                self._process.allow(_OPEN_SECONDS)
+            if seq == each.begins and (learned := self._learned(each)) is not None:
+                detectors.seek(name, learned.model, learned.box, learned.likeness())
+                begun[name] = learned
+            elif seq == each.begins and not each.model:
                 given[name] = detectors.begin(name, pyramid, each.box, frame.time)
             elif name not in detectors.detectors:  # it was forgotten later: see `catstream.services.resume`
                 given[name] = Detector(self._process.settings, name).miss(seq, frame.time)
-        return detectors.step(pyramid, frame.time, given)
+        tracks, features = detectors.step(pyramid, frame.time, given)
+        models = {name: replace(features.objects[name], model=learned.to_bytes()) for name, learned in begun.items()}
+        return tracks, replace(features, objects=features.objects | models)
 
     def send(self, frame: Frame, tracks: Tracks, features: Features) -> None:
         """Send the tracks and the features of a frame; wait while a window is full."""
@@ -358,7 +369,7 @@ def opening_seconds(part: slice, first: int) -> tuple[float, float]:
     return _OPEN_SECONDS + ((part.start or 0) + first * step) * _SKIP_SECONDS, (step - 1) * _SKIP_SECONDS
 
 
-def _desired(process: Process, learned: dict[str, Learned]) -> DesiredState:
+def _desired(process: Process, models: ModelFiles) -> DesiredState:
     """The desired state at the start: the stored one if the run is resumed, otherwise that of the job."""
     job = process.job
     if job.resume and job.state is not None and (job.state / _FILE).exists():
@@ -368,7 +379,9 @@ def _desired(process: Process, learned: dict[str, Learned]) -> DesiredState:
             process.trouble = str(error)
             _log.warning("%s", error)
     boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
-    return DesiredState(boxes | {name: DesiredObject(each.box) for name, each in learned.items()})
+    learned = {name: Learned.load(file) for name, file in job.models.items()}
+    sought = {name: DesiredObject(each.box, begins=1, model=models.add(each)) for name, each in learned.items()}
+    return DesiredState(boxes | sought)
 
 
 def _shown(source: str) -> str:

@@ -53,7 +53,7 @@ def start(
     An object that was forgotten after that message continues too, until the message after which it was forgotten. If
     nothing was learned of any object yet, the start is before the first frame of the first of them. If nothing was
     learned of one of several objects, which takes long with the paper's first tracker only, it begins anew where it was
-    last.
+    last. An object of a saved model, of which the compressor has no trees, begins anew too.
 
     Parameters
     ----------
@@ -63,15 +63,18 @@ def start(
     state_at : returns the state of a detector from only its last and its first box
     """
     last, versions = _last(positions), positions[0].versions
+    for name, each in _continuing(last, desired).items():
+        if each.model and name not in positions[0].objects and desired.objects.get(name) == each:
+            desired = desired.begun(name, each.box, last.seq + 1, each.model)
     continuing = _continuing(last, desired)
     if not versions:
-        return Start(min((max(each.begins, 1) - 1 for each in continuing.values()), default=last.seq), desired=desired)
+        return Start(min((each.begins - 1 for each in continuing.values()), default=last.seq), desired=desired)
     objects = {}
     for name, each in continuing.items():
         found = last.objects.get(name, ObjectPosition())
         if name in versions and name in models and (state := _state(found, each, state_at)) is not None:
             objects[name] = state, models[name]
-        elif each.begins and desired.objects.get(name) == each:
+        elif not each.model and desired.objects.get(name) == each:
             desired = desired.begun(name, found.box or each.box, last.seq + 1)
     return Start(last.seq, objects, desired)
 
@@ -83,7 +86,7 @@ def _last(positions: Sequence[Position]) -> Position:
 
 def _continuing(last: Position, desired: DesiredState) -> dict[str, DesiredObject]:
     """The objects that began before a position and have a track in the message after it, in the order of the trees."""
-    objects = {name: each for name, each in desired.objects_at(last.seq + 1).items() if max(each.begins, 1) <= last.seq}
+    objects = {name: each for name, each in desired.objects_at(last.seq + 1).items() if each.begins <= last.seq}
     return {name: objects[name] for name in last.objects if name in objects} | objects
 
 

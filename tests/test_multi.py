@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from catstream import parallel, storage
 from catstream.box import Box
-from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError
+from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, SettingsError
 from catstream.multi import MultiTracker
+from catstream.settings import Settings
 from catstream.tracker import Tracker
 
 STEPS = {"anna": (4, 1), "ben": (-3, 2), "cleo": (0, -4)}  # pixels a frame
@@ -161,6 +162,48 @@ def test_forget_drops_one_object_and_an_unknown_one_is_an_error(frames):
         tracker.forget(name)
     assert tracker.update(frames[2]) == {}
     assert tracker.update(frames[3], begin={"ben": box_of("ben", 3)})["ben"].state == "bootstrapping"
+
+
+@pytest.fixture(scope="module")
+def cleo(frames):
+    """A saved model of cleo."""
+    tracker = MultiTracker({"coreset.size": 8})
+    tracker.init(frames[0], {"cleo": box_of("cleo", 0)})
+    for frame in frames[1:]:
+        tracker.update(frame)
+    return tracker.learned("cleo")
+
+
+def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not_affect(frames, cleo, tmp_path):
+    tracker, other = MultiTracker({"coreset.size": 8}), MultiTracker({"coreset.size": 8})
+    for each in (tracker, other):
+        each.init(frames[0], {"anna": box_of("anna", 0)})
+    for number, frame in enumerate(frames[1:], start=1):
+        tracks = tracker.update(frame, search={"cleo": cleo} if number == 2 else None)
+        assert without_version(tracks["anna"]) == without_version(other.update(frame)["anna"])
+        if number == 3:  # not found yet
+            assert tracks["cleo"].state == "absent"
+            tracker.save(tmp_path / "kept")
+            tracker = MultiTracker.load(tmp_path / "kept")
+    assert tracks["cleo"].box.overlap(box_of("cleo", number)) > 0.6
+    assert tracks["cleo"].model_version > cleo.model.version
+    assert set(cleo.origins) < set(tracker.learned("cleo").origins)
+
+
+def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
+    tracker, other = MultiTracker({"run.objects_most": 2, "coreset.size": 8}), MultiTracker({"coreset.size": 8})
+    for each in (tracker, other):
+        each.init(frames[0], {"anna": box_of("anna", 0)})
+    for search, error, why in [
+        ({"ben": cleo, "cleo": cleo}, ObjectError, "3 objects are more than 2"),
+        ({"no name": cleo}, ObjectError, "is not a name"),
+        ({"cleo": replace(cleo, settings=Settings())}, SettingsError, "learned with coreset.size=64"),
+    ]:
+        with pytest.raises(error, match=why):
+            tracker.update(frames[1], search=search)
+    with pytest.raises(ObjectError, match="a box and a saved model"):
+        tracker.update(frames[1], begin={"cleo": box_of("cleo", 1)}, search={"cleo": cleo})
+    assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
 
 
 @pytest.mark.parametrize("after", [1, 6, 11], ids="after {} frames".format)

@@ -32,6 +32,7 @@ VERBS = {
     "replay": "Replay a recording to subscribers, or train on it again.",
     "status": "Show the state of a running pipeline.",
     "set-box": "Set the box of an object in a running pipeline.",
+    "search": "Search for the object of a saved model in a running pipeline.",
     "forget": "Stop tracking an object in a running pipeline.",
     "pause": "Pause a running pipeline.",
     "resume": "Resume a paused pipeline.",
@@ -45,7 +46,7 @@ VERBS = {
 }
 
 #: Module of the commands that share one.
-_MODULES = dict.fromkeys(("set-box", "forget", "pause", "resume", "save", "stop"), "steer")
+_MODULES = dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "steer")
 
 
 def verb(name: str) -> click.Command:

@@ -1,4 +1,4 @@
-"""`catstream set-box`, `forget`, `pause`, `resume`, `save` and `stop`: commands to a running pipeline."""
+"""`catstream set-box`, `search`, `forget`, `pause`, `resume`, `save` and `stop`: commands to a running pipeline."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from catstream.names import UNNAMED, check_name, split_name
 from catstream.state import learned
 from catstream.steering import Control, control
 
-__all__ = ["forget", "pause", "resume", "save", "set_box", "stop"]
+__all__ = ["forget", "pause", "resume", "save", "search", "set_box", "stop"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +105,26 @@ def set_box(pipeline: Control, box: str, keep: bool) -> str:
     """
     name, value = split_name(box)
     return pipeline.set_box(Box.parse(value), name, keep=keep).reason
+
+
+@click.command()
+@click.argument("file", metavar="[NAME=]FILE")
+@_with_control
+def search(pipeline: Control, file: str) -> str:
+    """Search for the object of a saved model in a running pipeline.
+
+    The object is absent until it is found in the whole frame, and learning
+    continues from FILE, which `catstream save` wrote. The other objects are
+    tracked as before. If an object has the NAME already, this one takes its
+    place. Without NAME, the only object is meant.
+
+    \b
+    EXAMPLES
+      catstream search walker.safetensors
+      catstream search anna=anna.safetensors --endpoint run
+    """
+    name, path = split_name(file)
+    return pipeline.search(path, name).reason
 
 
 @click.command()

@@ -6,6 +6,7 @@ It is the only owner of the object's coreset trees: one for each head of `catstr
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from hashlib import blake2b
 
 import numpy as np
@@ -73,12 +74,24 @@ class Compressor:
         settings: Settings,
         name: str = "",
     ) -> Compressor:
-        """A compressor that inserts another stream into copies of the trees of an earlier one."""
+        """A compressor that inserts another stream into copies of the trees of an earlier one; see `begin` too."""
         self = cls(settings, name)
         self.trees = {head: tree.copy() for head, tree in trees.items()}
         self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name), centres
         self._sampled_leaves, self._earlier = self.leaves, origins
         return self
+
+    def begin(self, frame: int, version: int) -> Sample | None:
+        """Number the sample that the trees of an earlier stream begin this one with; None if there is none.
+
+        Parameters
+        ----------
+        frame : number of the first frame in this stream
+        version : the smallest that is free in this stream; a higher one of the sample is kept
+        """
+        if self.last_sample is not None:
+            self.last_sample = replace(self.last_sample, version=max(self.version, version), frame=frame)
+        return self.last_sample
 
     @property
     def width(self) -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from types import MappingProxyType
 
 from catstream import storage
 from catstream.compression.compressor import Compressor
@@ -19,8 +21,9 @@ _KIND = "forest 1"  # and the version of what a checkpoint holds
 class Forest:
     """Takes the features of every frame, and returns the samples of the objects whose trees have grown enough.
 
-    An object begins with its first features. If a message has no part for it, its trees are dropped. The same messages
-    make the same samples, bit for bit, also across `save` and `load`.
+    An object begins with its first features, with new trees or with those of an earlier stream. If a message has no
+    part for it, its trees are dropped. The same messages make the same samples, bit for bit, also across `save` and
+    `load`.
 
     Attributes
     ----------
@@ -34,11 +37,6 @@ class Forest:
         self.seq = self.version = 0
         self.frame = -1
         self.compressors: dict[str, Compressor] = {}
-
-    def add(self, compressor: Compressor) -> None:
-        """Add an object that was learned in an earlier stream, before the first message of this one."""
-        self.compressors[compressor.name] = compressor
-        self.version = max(self.version, compressor.version)
 
     def skip(self, frames: int) -> None:
         """Count frames of a live source that nobody saw: the next message has a number after theirs."""
@@ -56,10 +54,14 @@ class Forest:
                         "width",
                     )
 
-    def take(self, features: Features) -> list[Sample]:
+    def take(self, features: Features, learned: Mapping[str, Compressor] = MappingProxyType({})) -> list[Sample]:
         """Insert the features of one frame; returns the samples that are due.
 
         A message whose `seq` was processed before is ignored.
+
+        Parameters
+        ----------
+        learned : compressors of `catstream.learned.begun` for the objects that begin in this message with a saved model
 
         Raises
         ------
@@ -75,20 +77,22 @@ class Forest:
                 "send from the one after the last acknowledged"
             )
         self.check_features(features)  # before the first tree takes its rows, so that all trees hold the same frames
-        self.compressors = {name: self._compressor(name, part.begins) for name, part in features.objects.items()}
-        samples = []
+        before = self.compressors | {name: learned.get(name) for name, each in features.objects.items() if each.begins}
+        self.compressors = {name: before.get(name) or Compressor(self.settings, name) for name in features.objects}
+        samples: list[Sample] = []
         for name, part in features.objects.items():
-            sample = self.compressors[name].take(features.frame, part, self.version + 1)
-            if sample is not None:
-                self.version = sample.version
-                samples.append(sample)
+            compressor = self.compressors[name]
+            if part.begins:
+                self._add(compressor.begin(features.frame, self.version + 1), samples)
+            self._add(compressor.take(features.frame, part, self.version + 1), samples)
         self.seq, self.frame = features.seq, features.frame
         return samples
 
-    def _compressor(self, name: str, begins: bool) -> Compressor:
-        """The compressor of an object; a new one if it begins."""
-        before = None if begins else self.compressors.get(name)
-        return before or Compressor(self.settings, name)
+    def _add(self, sample: Sample | None, samples: list[Sample]) -> None:
+        """Add a sample, if there is one, to those of a frame."""
+        if sample is not None:
+            self.version = sample.version
+            samples.append(sample)
 
     @property
     def position(self) -> Position:

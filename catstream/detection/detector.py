@@ -80,10 +80,12 @@ class Detector:
             scm = SparseCollaborativeModel(frame.image, box, np.random.default_rng(rng))
         model, training = teacher.first_training(frame, window, np.random.default_rng(rng), self.settings)
         self.state, self.model, self._scm = DetectorState(seq - 1, "confident", window, window, window), model, scm
-        return self._result(seq, time, 1.0, training, begins=True)
+        return self._result(seq, time, 1.0, training)
 
-    def seek(self, model: Model, box: Box, likeness: Likeness) -> None:
+    def seek(self, model: Model, box: Box, likeness: Likeness, frame: int = 0) -> None:
         """Start with a saved model: the object is absent until it is found, in whichever frame and size that is.
+
+        Another object before it is forgotten.
 
         It is found at a window that looks like the object and scores `sighting_lead` higher than the rest of the
         frame, in `sighting_frames` successive frames. Of two objects that look alike, neither is found.
@@ -92,6 +94,7 @@ class Detector:
         ----------
         box : in pixels, about as large as the object may be
         likeness : to the object
+        frame : number of the first frame that is searched
 
         Raises
         ------
@@ -104,8 +107,9 @@ class Detector:
                 "learn it anew with this catstream"
             )
         window = Window.around(box, self.settings.search.context)
-        self.state = DetectorState(0, "lost", window, window, None)
-        self.model, self.newest_version, self.likeness = model, model.version, likeness
+        self.state = DetectorState(frame, "lost", window, window, None)
+        self.model, self.likeness, self._scm = model, likeness, None
+        self.newest_version = max(self.newest_version, model.version)
 
     def look(self, frame: Pyramid, seq: int) -> Detection:
         """Search the object in the next frame. The state then has the place that was expected.
@@ -207,7 +211,7 @@ class Detector:
             raise BoxError("there is no box to follow yet: call init with a frame and a box first")
         return self.state
 
-    def _result(self, seq: int, time: float, score: float, training: Training, *, begins: bool = False) -> Result:
+    def _result(self, seq: int, time: float, score: float, training: Training) -> Result:
         state = self._known()
         track = track_of(state, seq, time, score, self.model, self.settings, self.name)
-        return track, ObjectFeatures(track.box, training, state, begins)
+        return track, ObjectFeatures(track.box, training, state, begins=state.first_frame == seq - 1)

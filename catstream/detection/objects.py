@@ -8,6 +8,7 @@ from copy import copy
 from catstream.box import Box
 from catstream.detection.assignment import assigned
 from catstream.detection.detector import Detector, Result
+from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.errors import ObjectError
 from catstream.features.pyramid import Pyramid
@@ -22,7 +23,7 @@ __all__ = ["Detectors", "prepare"]
 class Detectors:
     """Follows the objects of one stream, each with a detector of its own.
 
-    For a frame, `begin` or `correct` the objects whose box is given, then `step`.
+    For a frame, `begin` or `correct` the objects whose box is given, and `seek` those of saved models; then `step`.
 
     Attributes
     ----------
@@ -67,6 +68,21 @@ class Detectors:
         self.detectors.pop(name, None)
         self.detectors[name] = detector  # the last one, also if another object had the name
         return result
+
+    def seek(self, name: str, model: Model, box: Box, likeness: Likeness) -> None:
+        """Search for the object of a saved model from the next frame on; another one of this name is forgotten.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid, or there are too many objects. Nothing changes.
+        ProtocolError
+            As `Detector.seek` does. Nothing changes.
+        """
+        detector = self.detectors.get(name) or self._made(name)
+        detector.seek(model, box, likeness, self.seq)
+        self.detectors.pop(name, None)
+        self.detectors[name] = detector  # the last one, as in `begin`
 
     def begin_all(self, boxes: Mapping[str, Box], frame: Pyramid, time: float = 0.0) -> dict[str, Result]:
         """Start several objects with their boxes in the next frame, by name; if one is refused, none of them.

@@ -11,6 +11,7 @@ import numpy as np
 from catstream.compression.forest import Forest
 from catstream.errors import RecordingError
 from catstream.heads import APPEARANCE
+from catstream.learned import begun
 from catstream.messages import Features, Model, ObjectFeatures
 from catstream.recording.file import Recording
 from catstream.settings import Settings
@@ -128,7 +129,7 @@ def learn(
         for name, part in features.objects.items():
             result.prequential.add(newest.get(name), part)
         started = time.perf_counter()
-        models = [trainer.train(sample) for sample in forest.take(features)]
+        models = [trainer.train(sample) for sample in forest.take(features, begun(features, settings))]
         result.seconds += time.perf_counter() - started
         for model in models:
             newest[model.object] = model

@@ -131,7 +131,7 @@ PREVIEWS: Channel[Preview] = Channel(
     "previews", (Preview,), ("detector",), None, "newest", port=8, megabytes=1, role="watch", high_water_mark=8
 )
 CONTROL: Channel[Command | Answer] = Channel(
-    "control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=1, role="steer"
+    "control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=64, role="steer"
 )
 TRAINING: Channel[Run | Features | End] = Channel(
     "training",

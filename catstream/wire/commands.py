@@ -23,7 +23,9 @@ __all__ = ["Requester", "Responder"]
 
 _MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and that are received at once
 _LONGEST_QUESTION = 1 << 20  # bytes
+_MOST_QUEUED = 256 << 20  # bytes of questions that a socket queues for each client
 _REPEAT_SECONDS = 0.2
+_BYTES_PER_SECOND = 1e6  # of a slow network: a large question is repeated later
 
 
 class _HasId(Protocol):
@@ -53,9 +55,10 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
     def ask(self, question: Question, seconds: float) -> Answer | None:
         """Send a question until it is answered; None if no answer arrived in time."""
         data, deadline = encode(question), monotonic() + seconds
+        pause = _REPEAT_SECONDS + len(data) / _BYTES_PER_SECOND
         while (left := deadline - monotonic()) > 0:
             self._send(data)
-            if (answer := self.receive(question.id, min(left, _REPEAT_SECONDS))) is not None:
+            if (answer := self.receive(question.id, min(left, pause))) is not None:
                 return answer
         return None
 
@@ -83,11 +86,14 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
     Parameters
     ----------
     channel : its first kind of message is the question, its second one the answer
+    longest : bytes of a question at most
     """
 
-    def __init__(self, channel: Channel[Question | Answer], endpoint: Endpoint) -> None:
-        super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=_MAX_QUESTIONS)
-        self._socket.set(zmq.MAXMSGSIZE, _LONGEST_QUESTION)
+    def __init__(
+        self, channel: Channel[Question | Answer], endpoint: Endpoint, longest: int = _LONGEST_QUESTION
+    ) -> None:
+        super().__init__(zmq.ROUTER, channel, endpoint, min(_MAX_QUESTIONS, _MOST_QUEUED // longest))
+        self._socket.set(zmq.MAXMSGSIZE, longest)
         self._question_kind = cast(type[Question], channel.messages[0])
         self._waiting: dict[str, bytes] = {}  # the peer that asked last, by the id of its question
         self._answers: dict[str, bytes] = {}  # the last ones, by the id of their question

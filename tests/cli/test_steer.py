@@ -1,4 +1,4 @@
-"""`catstream set-box`, `forget`, `pause`, `resume`, `save` and `stop`, as a person uses them."""
+"""`catstream set-box`, `search`, `forget`, `pause`, `resume`, `save` and `stop`, as a person uses them."""
 
 from __future__ import annotations
 
@@ -107,6 +107,15 @@ def test_a_saved_model_finds_the_object_in_another_run(video, catstream, said, s
     found = rows(tmp_path / "out")
     assert [row["state"] for row in found[3:]] == ["present"] * 57  # each frame is searched for one of three sizes
     assert int(found[0]["model_version"]) >= 1
+    run = catstream("track", source, "--output", tmp_path / "later", "--set", f"run.endpoint={tmp_path / 'run'}")
+    code, answer = steer("search", f"anna={tmp_path / 'out'}")
+    assert (code, "there is no saved model" in answer) == (1, True)
+    code, answer = steer("search", f"anna={tmp_path / 'one'}")
+    assert (code, answer.startswith("anna is searched for from frame 0 on, by model ")) == (0, True)
+    assert run.wait(120) == 0
+    with (tmp_path / "later" / "demo.csv").open() as file:
+        later = list(csv.DictReader(file))
+    assert [row["state"] for row in later] == [row["state"] for row in found]
 
 
 def test_a_box_and_a_model_for_one_object_are_an_error(video, said, tmp_path):

@@ -14,7 +14,11 @@ import zmq
 
 from catstream.errors import CommandRejectedError, ObjectError, ProtocolError, ServiceError, SettingsError
 from catstream.learned import Learned
+from catstream.messages import Model
+from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
+from catstream.recording.file import Recording
+from catstream.recording.learning import learn
 from catstream.services.desired import DesiredState
 from catstream.settings import Settings
 from catstream.steering import control
@@ -280,3 +284,52 @@ def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_
         Pipeline(path, boxes[0], model=saved)
     with pytest.raises(SettingsError, match=r"learned with coreset.size=\d+, this run has coreset.size=5"):
         Pipeline(path, settings={"coreset.size": 5}, model=saved)
+
+
+@pytest.mark.parametrize("victims", [(), ("detector", "compressor", "trainer")], ids=str)
+def test_an_object_is_searched_for_in_a_running_pipeline_as_in_one_process_whoever_dies(
+    video, saved, victims, tmp_path
+):
+    path, settings = video[0], Settings(run={"lockstep": True})
+    tracks, first = [], set()
+    with (
+        Pipeline(path, {"ben": PATCH}, settings, part=slice(0, 40), record=tmp_path / "run.mcap") as pipeline,
+        control(pipeline.endpoint, timeout=SECONDS) as steering,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        for _ in range(2):  # the second one takes the place of the first
+            first.add(taken(pipeline, tracks, pool.submit(steering.search, saved, "anna")).frame + 1)
+            for victim in victims:
+                os.kill(pipeline.pids[victim], signal.SIGKILL)
+        tracks += pipeline
+        assert pipeline.restarts >= 2 * len(victims)
+    expected, learned, tracker = [], Learned.load(saved), MultiTracker()
+    with open_source(path) as source:
+        for frame, _ in zip(source, range(40), strict=False):
+            if expected:
+                tracker.update(frame.image, frame.time, search={"anna": learned} if frame.number in first else None)
+            else:
+                tracker.init(frame.image, {"ben": PATCH}, frame.time)
+            expected += tracker.tracks.values()
+    assert tracks == expected
+    assert tracks[-1].object == "anna"
+    assert tracks[-1].box.overlap(video[1][39]) > 0.5
+    recording = Recording(tmp_path / "run.mcap")
+    assert learn(recording, recording.settings).identical == recording.counts[Model]
+
+
+def test_an_object_that_is_searched_for_is_found_after_a_resume_without_the_file(video, saved, tmp_path):
+    path, boxes = video
+    copy = tmp_path / "anna.safetensors"
+    copy.write_bytes(saved.read_bytes())
+    with steered(path, state=tmp_path / "kept") as (pipeline, steering, _):
+        told(pipeline, lambda counters: counters["waiting"])
+        steering.pause()
+        assert steering.search(copy, "anna").reason.startswith("anna is searched for from frame 0 on")
+    copy.unlink()
+    with steered(None, resume=tmp_path / "kept") as (pipeline, steering, _):
+        steering.resume()
+        tracks = list(pipeline)
+    assert [track.frame for track in tracks] == list(range(len(boxes)))
+    truth = zip(tracks, boxes, strict=True)
+    assert sum(track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth) > 0.8 * len(tracks)

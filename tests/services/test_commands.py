@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import cache
 
 import pytest
 from hypothesis import settings
@@ -13,8 +14,10 @@ from catstream.box import Box
 from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
 from catstream.messages import Command
+from catstream.multi import MultiTracker
 from catstream.services.commands import STOPPED, CommandHandler
 from catstream.services.desired import DesiredObject, DesiredState, PastObject
+from catstream.services.model_files import ModelFiles
 from catstream.settings import Settings
 from catstream.video.demo import render
 
@@ -23,7 +26,17 @@ FRAME = Pyramid.of(IMAGE)
 BOXES = [Box(40, 30, 20, 20), Box(400, 30, 20, 20)]  # the second is outside of the frame
 NAMES = ["", "anna", "ben", "carl"]
 MOST = 2
-QUICK = Settings(teaching={"copies": 0}, run={"objects_most": MOST})
+QUICK = Settings(teaching={"copies": 0}, coreset={"size": 8}, run={"objects_most": MOST})
+
+
+@cache
+def saved():
+    """A saved model of the object at the first of the boxes."""
+    tracker = MultiTracker(QUICK)
+    tracker.init(IMAGE, {"": BOXES[0]})
+    for _ in range(9):
+        tracker.update(IMAGE)
+    return tracker.learned()
 
 
 class Steering(RuleBasedStateMachine):
@@ -32,13 +45,13 @@ class Steering(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
         self.detectors = Detectors(QUICK)
-        self.handler = CommandHandler(self.detectors, DesiredState())
+        self.handler = CommandHandler(self.detectors, DesiredState(), ModelFiles(None))
         self.ids = map(str, itertools.count())
         self.open, self.paused, self.stopped = set(), False, False
-        self.first = {}  # the message in which each object began
+        self.objects = {}  # as they should be
 
-    def give(self, verb, name="", box=None, keep=False):
-        command = Command(next(self.ids), verb, box, keep, name)
+    def give(self, verb, name="", box=None, keep=False, model=None):
+        command = Command(next(self.ids), verb, box, keep, name, model)
         self.open.add(command.id)
         return self.answered(self.handler.carry_out([command]))
 
@@ -49,9 +62,9 @@ class Steering(RuleBasedStateMachine):
 
     def meant(self, name):
         """The object that a name stands for, None if that is not clear."""
-        if name or not self.first or "" in self.first:
+        if name or not self.objects or "" in self.objects:
             return name
-        return None if len(self.first) > 1 else next(iter(self.first))
+        return None if len(self.objects) > 1 else next(iter(self.objects))
 
     @rule(verb=st.sampled_from(["pause", "resume"]))
     def pause_or_resume(self, verb):
@@ -65,14 +78,25 @@ class Steering(RuleBasedStateMachine):
         assert bool(answers) == self.stopped
         assert not any(answer.done for answer in answers)
 
+    @rule(name=st.sampled_from(NAMES), damaged=st.booleans())
+    def search(self, name, damaged):
+        meant, data = self.meant(name), saved().to_bytes()
+        (answer,) = self.give("search", name, model=data[:-9] if damaged else data)
+        room = meant is not None and len(self.objects.keys() | {meant}) <= MOST
+        assert answer.done == (room and not damaged and not self.stopped)
+        if answer.done:
+            self.objects.pop(meant, None)
+            model = self.handler.models.add(saved())
+            self.objects[meant] = DesiredObject(saved().box, self.detectors.seq + 1, model)
+
     @rule(name=st.sampled_from(NAMES))
     def forget(self, name):
         meant = self.meant(name)
         (answer,) = self.give("forget", name)
-        assert answer.done == (meant in self.first and not self.stopped)
+        assert answer.done == (meant in self.objects and not self.stopped)
         if answer.done:
             assert answer.object == meant
-            del self.first[meant]
+            del self.objects[meant]
 
     @precondition(lambda self: self.detectors.seq < 4)
     @rule()
@@ -80,15 +104,22 @@ class Steering(RuleBasedStateMachine):
         given, answers = self.handler.begin(FRAME, 0.0)
         done = [answer for answer in self.answered(answers) if answer.done]
         assert [answer.object for answer in done] == list(given)
-        self.first |= dict.fromkeys(given, self.detectors.seq + 1)
-        if self.first:
+        seq, kept = self.detectors.seq + 1, {a.object for a in done if a.reason.startswith("the same object")}
+        assert all(self.objects[name].model and self.objects[name].begins < seq for name in kept)
+        for name in [name for name in given if name not in kept]:
+            self.objects.pop(name, None)
+            self.objects[name] = DesiredObject(BOXES[0], seq)
+        if self.objects:
+            for name, each in self.objects.items():
+                if each.model and each.begins == seq:
+                    self.detectors.seek(name, saved().model, saved().box, saved().likeness())
             tracks, features = self.detectors.step(FRAME, 0.0, given)
-            assert tracks.tracks.keys() == features.objects.keys() == self.first.keys()
+            assert tracks.tracks.keys() == features.objects.keys() == self.objects.keys()
 
     @rule(name=st.sampled_from(NAMES))
     def save(self, name):
         (answer,) = self.give("save", name)
-        assert not answer.done
+        assert not answer.done or self.objects[answer.object].model, "nothing is trained here"
         assert answer.reason
 
     @rule()
@@ -107,9 +138,9 @@ class Steering(RuleBasedStateMachine):
     def the_last_command_of_each_kind_holds(self):
         desired = self.handler.desired
         assert (desired.paused, desired.stopped) == (self.paused, self.stopped)
-        assert desired.objects == {name: DesiredObject(BOXES[0], first) for name, first in self.first.items()}
-        assert self.detectors.detectors.keys() == self.first.keys()
-        assert len(self.first) <= MOST
+        assert list(desired.objects.items()) == list(self.objects.items())
+        assert self.handler.needed_models >= {each.model for each in self.objects.values() if each.model}
+        assert len(self.objects) <= MOST
         assert self.handler.end_reason == (STOPPED if self.stopped else "")
         assert len(self.open) == 0 or self.handler.has_box
 
@@ -126,7 +157,7 @@ TestSteering.settings = settings(max_examples=40, stateful_step_count=14)
 @pytest.fixture
 def handler():
     """The handler of a run with the objects anna and ben in its first frame."""
-    handler = CommandHandler(Detectors(QUICK), DesiredState())
+    handler = CommandHandler(Detectors(QUICK), DesiredState(), ModelFiles(None))
     answer(handler, Command("a", "set-box", BOXES[0], object="anna"), Command("b", "set-box", BOXES[0], object="ben"))
     return handler
 
@@ -197,7 +228,7 @@ def test_a_frame_that_is_repeated_has_a_track_of_each_object_of_its_time(handler
 
 def test_a_handler_that_is_released_forgets_that_it_was_stopped():
     desired = DesiredState({"": DesiredObject(BOXES[0], begins=1)})
-    handler = CommandHandler(Detectors(QUICK), desired)
+    handler = CommandHandler(Detectors(QUICK), desired, ModelFiles(None))
     handler.carry_out([Command("1", "stop")])
     assert handler.desired.stopped
     handler.clear_stop()

@@ -10,7 +10,7 @@ from catstream.services.desired import DesiredState
 
 BOX = Box(1.0, 2.0, 30.0, 40.0)
 names = st.sampled_from(["", "anna", "ben"])
-events = st.lists(st.tuples(names, st.booleans()), max_size=9)
+events = st.lists(st.tuples(names, st.sampled_from([None, "", "a", "b"])), max_size=9)
 
 
 @given(events, st.booleans(), st.booleans())
@@ -28,11 +28,20 @@ def test_the_objects_of_each_message_are_known_later(events):
         assert last.objects_at(seq) == after(events[:seq]).objects
 
 
+@given(events)
+def test_the_saved_models_of_the_objects_of_later_messages_are_known(events):
+    last = after(events)
+    for first in range(1, len(events) + 1):
+        seqs = range(first, len(events) + 1)
+        needed = {each.model for seq in seqs for each in last.objects_at(seq).values()} - {""}
+        assert last.models_since(first) == needed
+
+
 def after(events, state=DesiredState()):  # noqa: B008
-    """The state after objects have begun or were forgotten, one event a message."""
-    for seq, (name, begins) in enumerate(events, start=1):
-        if begins:
-            state = state.begun(name, BOX, seq)
+    """The state after objects have begun, with a saved model or without, or were forgotten, one event a message."""
+    for seq, (name, model) in enumerate(events, start=1):
+        if model is not None:
+            state = state.begun(name, BOX, seq, model)
         elif name in state.objects:
             state = state.without(name, seq - 1)
     return state

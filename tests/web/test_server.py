@@ -23,6 +23,7 @@ from catstream.messages import Health
 from catstream.services.commands import CommandHandler
 from catstream.services.control import CommandChannel
 from catstream.services.desired import DesiredState
+from catstream.services.model_files import ModelFiles
 from catstream.settings import Settings
 from catstream.web.app import pipeline_site
 from catstream.web.dashboard import Dashboard
@@ -288,9 +289,12 @@ def test_malformed_json_is_rejected_like_any_invalid_command(page, body):
 
 
 def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered(page, pipeline, folder, until, rng):
-    handler = CommandHandler(Detectors(Settings(run={"objects_most": 2})), DesiredState())
+    handler = CommandHandler(Detectors(Settings(run={"objects_most": 2})), DesiredState(), ModelFiles(None))
     frame = Pyramid.of(rng.integers(0, 255, (120, 160, 3), np.uint8))
-    with CommandChannel(Endpoint.parse(str(folder)), handler, None) as channel, ThreadPoolExecutor(1) as pool:
+    with (
+        CommandChannel(Endpoint.parse(str(folder)), handler, None, lambda _: None) as channel,
+        ThreadPoolExecutor(1) as pool,
+    ):
 
         def answer(verb, name, **more):
             asked = pool.submit(page.post, "/control", json={"verb": verb, "object": name, **more})

@@ -1,0 +1,66 @@
+"""The files of the saved models that objects begin with: a restarted detector begins the objects again."""
+
+from __future__ import annotations
+
+import logging
+from hashlib import blake2b
+from pathlib import Path
+
+from catstream import storage
+from catstream.errors import CatstreamError
+from catstream.learned import Learned
+
+__all__ = ["ModelFiles"]
+
+_log = logging.getLogger(__name__)
+
+
+class ModelFiles:
+    """Saved models by name, which is a digest of the content, in memory and in a folder.
+
+    Parameters
+    ----------
+    folder : folder of the files; None if they are kept in memory only
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._models: dict[str, Learned] = {}
+
+    def add(self, learned: Learned) -> str:
+        """Keep a saved model in memory; return its name."""
+        name = blake2b(learned.to_bytes(), digest_size=16).hexdigest()
+        self._models[name] = learned
+        return name
+
+    def get(self, name: str) -> Learned | None:
+        """The saved model of a name, None if its file cannot be read."""
+        if name not in self._models and self._folder is not None:
+            try:
+                self._models[name] = Learned.load(self._file(name))
+            except CatstreamError as error:
+                _log.warning("the object of a saved model is not searched for any more: %s", error)
+        return self._models.get(name)
+
+    def store(self) -> None:
+        """Write the saved models in memory that have no file yet.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written.
+        """
+        for name, learned in self._models.items():
+            if self._folder is not None and not self._file(name).exists():
+                self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+                storage.write_atomically(self._file(name), learned.to_bytes(), mode=0o600)
+
+    def keep_only(self, names: set[str]) -> None:
+        """Remove all saved models but those of these names, from memory and from the folder."""
+        self._models = {name: learned for name, learned in self._models.items() if name in names}
+        for file in self._folder.glob("*.safetensors") if self._folder is not None else ():
+            if file.stem not in names:
+                file.unlink(missing_ok=True)
+
+    def _file(self, name: str) -> Path:
+        return (self._folder or Path()) / f"{name}.safetensors"

@@ -1,0 +1,52 @@
+"""The files of saved models: they are read as they were written, and a damaged one is missing."""
+
+from __future__ import annotations
+
+import stat
+
+import pytest
+
+from catstream.multi import MultiTracker
+from catstream.services.model_files import ModelFiles
+from catstream.video.demo import render
+
+
+@pytest.fixture(scope="module")
+def learned():
+    tracker = MultiTracker({"coreset.size": 8})
+    for number, (image, box) in enumerate(render(8, (160, 120))):
+        if number:
+            tracker.update(image)
+        else:
+            tracker.init(image, {"anna": box})
+    return tracker.learned("anna")
+
+
+def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_path):
+    files = ModelFiles(tmp_path / "models")
+    name = files.add(learned)
+    files.store()
+    (file,) = (tmp_path / "models").iterdir()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert ModelFiles(tmp_path / "models").get(name).to_bytes() == learned.to_bytes()
+
+
+def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, caplog):
+    files = ModelFiles(tmp_path)
+    name = files.add(learned)
+    files.store()
+    (tmp_path / f"{name}.safetensors").write_bytes(b"torn")
+    assert ModelFiles(tmp_path).get(name) is None
+    files.keep_only(set())
+    assert list(tmp_path.iterdir()) == []
+    assert files.get(name) is None
+    assert "is not searched for any more" in caplog.text
+
+
+def test_without_a_folder_models_are_kept_in_memory(learned):
+    files = ModelFiles(None)
+    name = files.add(learned)
+    files.store()
+    files.keep_only({name})
+    assert files.get(name) is learned
+    assert files.get("another") is None
