@@ -41,7 +41,7 @@ def test_a_stream_runs_to_its_end_and_its_state_is_stored(spec, store, until):
     status = stream.report().status
     assert (status.node, status.frame, status.trouble) == ("n1", FRAMES - 1, "")
     state = Store(store).newest("cam-7")
-    assert state.facts["ended"] and state.facts["seq"] == FRAMES
+    assert (state.facts["ended"], state.facts["seq"]) == (True, FRAMES)
 
 
 def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
@@ -75,7 +75,8 @@ def test_a_source_that_cannot_be_opened_is_named(store, until, tmp_path):
     with started(StreamSpec("cam-8", str(tmp_path / "none.mp4")), store) as stream:
         until(lambda: stream.report().status.state == "failed")
     report = stream.report()
-    assert report.source_failed and "none.mp4" in report.status.trouble
+    assert report.source_failed
+    assert "none.mp4" in report.status.trouble
 
 
 def test_a_stream_goes_on_while_the_store_takes_nothing(spec, store, until, monkeypatch):
