@@ -79,6 +79,12 @@ class Link:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
+    @property
+    def port(self) -> int:
+        """The port on which it listens."""
+        port: int = self._socket.getsockname()[1]
+        return port
+
     def cut(self) -> None:
         """Break all connections, and accept none until `mend`."""
         self._up = False

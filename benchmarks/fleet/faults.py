@@ -1,0 +1,333 @@
+"""Injects a random schedule of faults into a fleet on three nodes, and checks that no stream and no row is lost.
+
+Nodes are killed or frozen with all of their processes, two nodes at once too; the head is killed; the link between a node
+and the store is cut; the store cannot be reached by anybody. The store is a real S3 server in memory. Three streams are
+live, and three are short films in lockstep: whenever a film ends, its trees must be equal, bit for bit, to those of a run
+in one process without faults, and it begins anew. Recovery is the time from the fault to the second frame that a stream
+tracks afterwards, where the fault has ended its processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic, sleep
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
+
+from arena import Link
+from chaos import fingerprint, quantiles, undisturbed
+from nodes import freeze_node, kill_node, thaw_node
+from table import Table, command, publish
+
+from catstream.box import Box
+from catstream.compression.forest import Forest
+from catstream.errors import CatstreamError
+from catstream.fleet.fleet import Fleet
+from catstream.fleet.local import LocalFleet
+from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.fleet.store import Store
+from catstream.messages import FleetStatus, StreamStatus
+from catstream.registry import Registry
+from catstream.settings import Settings
+from catstream.state import restore
+from catstream.video import demo
+from catstream.video.live_demo import first_box
+
+NAME = "faults"
+NODES = ("node-1", "node-2", "node-3")
+CORES = 2.0  # of a node, as placement counts them: one node bears all streams
+NEED = 0.3
+EVERY = 3.0  # seconds between two states
+FILM = 400  # frames
+FROZEN = (4.0, 8.0)  # seconds
+CUT = 10.0
+UNREACHABLE = 60.0
+WITHOUT_HEAD = 10.0
+CALM = (0.5, 3.0)  # seconds between a recovery and the next fault
+PATIENCE = 180.0
+LIVE = {"live-1": "demo:1?rate=5", "live-2": "demo:2?rate=5", "live-3": "demo:3?rate=5"}
+FILMS = ("film-1", "film-2", "film-3")
+
+
+class Trial:
+    """A fleet under faults.
+
+    recovery  seconds until the streams that a fault hit went on, by the name of the fault
+    wrong     descriptions of what must not happen
+    """
+
+    def __init__(self, stack: ExitStack, seed: int) -> None:
+        self.random = np.random.default_rng(seed)
+        self.recovery: dict[str, list[float]] = defaultdict(list)
+        self.wrong: list[str] = []
+        self.films = 0  # that have ended with the right trees
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cs-")))
+        os.environ["XDG_STATE_HOME"] = str(folder)
+        self.links = self._open_store(stack)
+        demo.write(folder, FILM, (320, 240))
+        self.film = folder / "demo.mp4"
+        self.box = Box(*np.loadtxt(folder / "groundtruth_rect.txt", delimiter=",", max_rows=1).tolist())
+        self.calm = fingerprint(undisturbed(str(self.film), {"": self.box})[1])
+        spec = FleetSpec(NAME, "s3://states/faults", EVERY, streams={each.name: each for each in self._streams()})
+        self.local = LocalFleet(folder / "catstream" / "fleets" / NAME)
+        stack.callback(self.local.stop)
+        self.local.start(0)
+        for node in NODES:
+            self.start_node(node)
+        self.fleet = stack.enter_context(Fleet(spec))
+        self.fleet.up(nodes=len(NODES), cores=CORES)
+        self.registry = stack.enter_context(Registry(NAME, timeout=2.0))
+        self.store = Store(spec.store)
+
+    def _open_store(self, stack: ExitStack) -> dict[str, Link]:
+        """Start an S3 server, and a link to it for each node and for this process."""
+        import boto3
+        from moto.server import ThreadedMotoServer
+
+        server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+        server.start()
+        stack.callback(server.stop)
+        host, port = server.get_host_and_port()
+        os.environ |= {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1"}
+        boto3.client("s3", endpoint_url=f"http://{host}:{port}").create_bucket(Bucket="states")
+        links = {name: Link(("127.0.0.1", 0), (host, port)) for name in (*NODES, "head")}
+        for link in links.values():
+            stack.callback(link.close)
+        os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{links['head'].port}"
+        return links
+
+    def _streams(self) -> Iterator[StreamSpec]:
+        for name, source in LIVE.items():
+            yield StreamSpec(name, source, {"": first_box(source)}, cores=NEED)
+        for name in FILMS:
+            yield StreamSpec(name, str(self.film), {"": self.box}, settings={"run.lockstep": True}, cores=NEED)
+
+    def start_node(self, name: str) -> None:
+        """Start a node, which has a link of its own to the store."""
+        before = os.environ["AWS_ENDPOINT_URL"]
+        os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{self.links[name].port}"
+        try:
+            self.local.start_node(name, CORES)
+        finally:
+            os.environ["AWS_ENDPOINT_URL"] = before
+
+    def status(self) -> FleetStatus | None:
+        """The state of the fleet; None while the registry does not answer."""
+        with suppress(CatstreamError):
+            return self.registry.streams()
+        return None
+
+    def until(self, done: Callable[[FleetStatus], bool], what: str) -> bool:
+        """Wait until something holds; False, and a note, if it does not in time."""
+        deadline = monotonic() + PATIENCE
+        while monotonic() < deadline:
+            status = self.status()
+            if status is not None and done(status):
+                return True
+            sleep(0.05)
+        self.wrong.append(f"{what} did not happen in {PATIENCE:g} s")
+        return False
+
+    def settle(self) -> None:
+        """Wait until all nodes live and all streams run; films that have ended are checked and begin anew."""
+        for node in set(NODES) - set(self.local.names):
+            self.start_node(node)
+        self.until(lambda status: all(_is_up(each) for each in status.streams.values()), "all streams running")
+        status = self.status()
+        for name in FILMS:
+            if status is not None and status.streams[name].state == "ended":
+                self._check_film(name)
+                self.fleet.remove(name, forget=True)
+                self.until(lambda status, name=name: name not in status.streams, f"the end of {name}")
+                self.fleet.add(next(each for each in self._streams() if each.name == name))
+
+    def _check_film(self, name: str) -> None:
+        state = self.store.newest(name)
+        if state is None:
+            self.wrong.append(f"{name} has ended without a state")
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            restore(Path(folder), state.files)
+            (file,) = Path(folder).glob("trees/*.safetensors")
+            forest = Forest.load(file, Settings(run={"lockstep": True}).for_length(FILM))
+        if forest.seq != FILM or fingerprint(forest) != self.calm:
+            self.wrong.append(f"{name} has {forest.seq} of {FILM} messages, or other trees")
+        else:
+            self.films += 1
+
+    def recovered(self, fault: str, hit: dict[str, StreamStatus], since: float) -> None:
+        """Wait until each stream that was hit tracks again, and keep the times."""
+        first: dict[str, int] = {}
+        waiting = dict(hit)
+
+        def step(status: FleetStatus) -> bool:
+            for name, before in list(waiting.items()):
+                now = status.streams[name]
+                if now.token > before.token and now.state == "running":
+                    if now.frame > first.setdefault(name, now.frame):
+                        self.recovery[fault].append(monotonic() - since)
+                        del waiting[name]
+                elif now.state == "ended":
+                    del waiting[name]
+            return not waiting
+
+        self.until(step, f"{fault}: the recovery of {', '.join(waiting)}")
+
+
+def _is_up(stream: StreamStatus) -> bool:
+    return stream.state == "ended" or (stream.state == "running" and stream.frame >= 0)
+
+
+def _on(status: FleetStatus, *nodes: str) -> dict[str, StreamStatus]:
+    return {name: each for name, each in status.streams.items() if each.node in nodes and each.state == "running"}
+
+
+def kill(trial: Trial, status: FleetStatus) -> None:
+    node = str(trial.random.choice(NODES))
+    begin = monotonic()
+    kill_node(trial.local, node)
+    trial.recovered("node killed", _on(status, node), begin)
+
+
+def kill_two(trial: Trial, status: FleetStatus) -> None:
+    nodes = [str(node) for node in trial.random.choice(NODES, 2, replace=False)]
+    begin = monotonic()
+    for node in nodes:
+        kill_node(trial.local, node)
+    trial.recovered("two nodes killed", _on(status, *nodes), begin)
+
+
+def freeze(trial: Trial, status: FleetStatus) -> None:
+    node = str(trial.random.choice(NODES))
+    begin = monotonic()
+    freeze_node(trial.local, node)
+    hit = _on(status, node)
+    trial.recovered("node frozen", hit, begin)
+    sleep(max(0.0, float(trial.random.uniform(*FROZEN)) - (monotonic() - begin)))
+    thaw_node(trial.local, node)
+    trial.until(lambda status: status.nodes[node].state == "alive", f"the return of {node}")
+
+
+def kill_head(trial: Trial, status: FleetStatus) -> None:
+    kill_node(trial.local, "head")
+    sleep(WITHOUT_HEAD)
+    begin = monotonic()
+    trial.local.start(0)
+    trial.until(lambda status: len(status.streams) == len(LIVE) + len(FILMS), "the registry after the head's return")
+    trial.recovery["head killed"].append(monotonic() - begin)
+    _check_untouched(trial, "head killed", status)
+
+
+def cut(trial: Trial, status: FleetStatus) -> None:
+    node = str(trial.random.choice(NODES))
+    trial.links[node].cut()
+    sleep(CUT)
+    trial.links[node].mend()
+    _stored(trial, "node cut off the store", status, _on(status, node))
+
+
+def unreachable(trial: Trial, status: FleetStatus) -> None:
+    for link in trial.links.values():
+        link.cut()
+    sleep(UNREACHABLE)
+    for link in trial.links.values():
+        link.mend()
+    _stored(trial, "store not reached for a minute", status, _on(status, *NODES))
+
+
+def _stored(trial: Trial, fault: str, before: FleetStatus, hit: dict[str, StreamStatus]) -> None:
+    """Wait until the streams that were hit have stored a state again; they must have gone on."""
+    begin = monotonic()
+
+    def fresh(each: StreamStatus) -> bool:
+        return each.state == "ended" or (each.stored_seconds is not None and each.stored_seconds < monotonic() - begin)
+
+    trial.until(lambda status: all(fresh(status.streams[name]) for name in hit), f"{fault}: a new state")
+    trial.recovery[fault].append(monotonic() - begin)
+    _check_untouched(trial, fault, before)
+
+
+def _check_untouched(trial: Trial, fault: str, before: FleetStatus) -> None:
+    """All streams must have gone on with the same processes."""
+    now = trial.status()
+    for name, each in before.streams.items() if now is not None else ():
+        if each.state == "running" and now.streams[name].token != each.token:
+            trial.wrong.append(f"{fault}: {name} was started again")
+        elif each.state == "running" and now.streams[name].frame <= each.frame:
+            trial.wrong.append(f"{fault}: {name} stood still")
+
+
+#: Fault -> how often it occurs in 100.
+FAULTS: dict[Callable[[Trial, FleetStatus], None], int] = {
+    kill: 42,
+    freeze: 20,
+    kill_two: 12,
+    kill_head: 14,
+    cut: 10,
+    unreachable: 2,
+}
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    cycles = 6 if options.quick else options.cycles
+    faults = [fault for fault, often in FAULTS.items() for _ in range(max(1, round(often * cycles / 100)))]
+    with ExitStack() as stack:
+        trial = Trial(stack, options.seed)
+        order = trial.random.permutation(len(faults))
+        begin = monotonic()
+        for number, place in enumerate(order, start=1):
+            trial.settle()
+            sleep(float(trial.random.uniform(*CALM)))
+            status = trial.status()
+            if status is None:
+                trial.wrong.append("the registry did not answer")
+                continue
+            faults[place](trial, status)
+            print(f"{number} of {len(faults)}: {faults[place].__name__}, {len(trial.wrong)} wrong", file=sys.stderr)
+        trial.until(lambda status: all(status.streams[name].state == "ended" for name in FILMS), "the end of all films")
+        trial.settle()
+        minutes = (monotonic() - begin) / 60
+        status = trial.status() or replace(FleetStatus(NAME, 0.0))
+        lost = [each for name, each in status.streams.items() if name in LIVE]
+    yield Table(
+        f"Recovery of {len(faults)} faults, 3 nodes, 6 streams",
+        ("fault", "times", "p50 s", "p99 s", "slowest s"),
+        list(quantiles(trial.recovery)),
+        "killed, frozen: from the fault to the second new frame of each stream of the node; head: from its start to the "
+        "first answer of the registry; store: from its return to a new state of all streams",
+    )
+    yield Table(
+        "Learned rows",
+        ("films", "trees the same", "rows lost", "rows doubled", "wrong", "live: frames lost", "s lost", "minutes"),
+        [
+            (
+                "in lockstep",
+                trial.films,
+                0 if not trial.wrong else None,
+                0 if not trial.wrong else None,
+                len(trial.wrong),
+                sum(each.lost_frames for each in lost),
+                sum(each.lost_seconds for each in lost),
+                minutes,
+            )
+        ],
+        "; ".join(trial.wrong),
+    )
+
+
+if __name__ == "__main__":
+    parser = command(__doc__)
+    parser.add_argument("--cycles", type=int, default=100, help="number of faults (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the schedule (default: %(default)s)")
+    options = parser.parse_args()
+    publish(figures(options), options)
