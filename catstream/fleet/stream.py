@@ -32,6 +32,7 @@ from catstream.errors import (
 )
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
+from catstream.learned import Learned
 from catstream.messages import StreamState, StreamStatus, Track
 from catstream.pipeline import Pipeline
 from catstream.state import files, restore, skip
@@ -310,12 +311,11 @@ class Stream:
 
     def _search(self, pipeline: Pipeline, stored: str, name: str) -> None:
         """Search for an object by a saved model in the store."""
-        file = self._folder / "given.safetensors"
         if (model := self._store.get_model(stored)) is None:
             raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
-        file.write_bytes(model.files["model"])
+        learned = Learned.from_bytes(model.files["model"], f"the model of {name!r} in the store")
         with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as steering:
-            steering.search(file, name)
+            steering.search(learned, name)
 
     def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
         """Count a frame; an empty mapping means that none has arrived for a while."""
