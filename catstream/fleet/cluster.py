@@ -32,6 +32,7 @@ __all__ = [
     "NAMESPACE",
     "PREFIX",
     "NodeFacts",
+    "child_environment",
     "connect",
     "disconnect",
     "environment",
@@ -56,6 +57,7 @@ PREFIX = "catstream/"
 FOLDER_VARIABLE, REGISTRY_VARIABLE = "CATSTREAM_FLEET_FOLDER", "CATSTREAM_FLEET_REGISTRY"
 
 _LOOPBACK = "127.0.0.1"
+_PRIVATE = [ipaddress.IPv4Network(network) for network in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16")]
 _PROBE_SECONDS = 15.0
 _REACH_SECONDS = 3.0
 _SHORTEST_TOKEN = 32  # characters
@@ -90,6 +92,12 @@ def environment(token_file: Path, gcs_folder: Path | None = None) -> dict[str, s
     if gcs_folder is not None:
         variables |= {"RAY_gcs_storage": "rocksdb", "RAY_gcs_storage_path": str(gcs_folder.absolute())}
     return variables
+
+
+def child_environment(token_file: Path, gcs_folder: Path | None = None) -> dict[str, str]:
+    """Return all variables for a child process that uses Ray: those of the user that concern Ray are left out."""
+    others = {name: value for name, value in start.environment().items() if not name.startswith("RAY_")}
+    return others | environment(token_file, gcs_folder)
 
 
 def versions() -> dict[str, str]:
@@ -153,10 +161,10 @@ def private_address(text: str) -> tuple[str, int]:
         raise FleetError(f"expected an IPv4 address and a port above 1023, as in 10.0.0.1:6400, got {text!r}") from None
     if address.is_loopback and host != _LOOPBACK:
         raise FleetError(f"Ray would listen on all interfaces for {host}: use {_LOOPBACK}:{port} on a single machine")
-    if not address.is_private or address.is_unspecified or address.is_reserved:
+    if host != _LOOPBACK and not any(address in network for network in _PRIVATE):
         raise FleetError(
             f"{host} is not a private address: the nodes of a fleet are connected by a private network or a VPN "
-            f"(10.0.0.0/8, 172.16.0.0/12, 192.168.0.0/16), or run on one machine ({_LOOPBACK})"
+            f"({', '.join(map(str, _PRIVATE))}), or run on one machine ({_LOOPBACK})"
         )
     return host, int(port)
 
@@ -170,6 +178,12 @@ def stay_on_loopback() -> None:
     from ray._private import services
 
     services.resolve_ip_for_localhost = lambda host: _LOOPBACK if host == "localhost" else host
+
+
+def _print_nothing() -> None:
+    """Keep Ray from writing to the standard output of a command when a node dies."""
+    worker: Any = import_module("ray._private.worker")
+    worker.print_to_stdstream = lambda *_, **__: None
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +269,7 @@ def connect(address: str, token_file: Path) -> None:
             f"this machine is not a node of the fleet at {address}: run the command on a node, or let this machine "
             f"join without cores (catstream fleet node --head {address} --token-file {token_file} --cores 0)"
         )
+    os.environ.pop("RAY_AUTH_TOKEN", None)  # Ray would prefer it to the file
     os.environ.update(environment(token_file))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Ray, about its own future
@@ -263,6 +278,7 @@ def connect(address: str, token_file: Path) -> None:
         raylet: Any = import_module("ray._raylet")
         raylet.AuthenticationTokenLoader.instance().reset_cache()  # this process may have used another fleet before
         stay_on_loopback()
+        _print_nothing()
         try:
             ray.init(address, namespace=NAMESPACE, log_to_driver=False, logging_level=logging.ERROR)
         except (ray.exceptions.RayError, ConnectionError, RuntimeError, ValueError) as error:
@@ -320,7 +336,7 @@ def probe(address: str, token_file: Path) -> list[dict[str, Any]]:
             "head), and is this its address?"
         ) from None
     command = [sys.executable, "-P", "-m", "catstream.fleet.probe", address]
-    variables = start.environment() | environment(token_file)
+    variables = child_environment(token_file)
     try:
         done = subprocess.run(command, env=variables, capture_output=True, timeout=_PROBE_SECONDS, check=False)
         answer = json.loads(done.stdout)

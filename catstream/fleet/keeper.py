@@ -26,7 +26,6 @@ from pathlib import Path
 from catstream.errors import FleetError, UnreachableError
 from catstream.extras import require_extra
 from catstream.fleet import cluster
-from catstream.services import start
 from catstream.storage import is_locked, lock
 from catstream.wire.endpoint import private_folder
 from catstream.wire.keys import create
@@ -45,6 +44,8 @@ _HEALTHY_SECONDS = 60.0  # Ray ran for so long: its next death is a new one, and
 _END_SECONDS = 10.0  # for Ray to end its processes before they are killed
 _LOOK_SECONDS = 0.2
 _STARTED = "Ray runtime started."
+_DEATHS = "Some Ray subprocesses exited unexpectedly"  # before a report of many lines
+_DIED = re.compile(r"\w+ \[exit code=-?\d+\]")
 _LINE = re.compile(r"\S+ \S+\t(?P<level>[A-Z]+) \S+ -- (?P<text>.*)")  # of `ray start --log-style record`
 _LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?")
 
@@ -85,10 +86,10 @@ def keep_head(listen: str, folder: Path, ports: int = 0, registry: int = REGISTR
             f"the head of the fleet at {listen}",
             arguments,
             _labels("head", 0, {}),
-            cluster.environment(token, state) | own,
+            cluster.child_environment(token, state) | own,
             f"the head listens at {listen}; a node joins with a copy of {token.absolute()}: "
             f"catstream fleet node --head {listen} --token-file token --name NAME",
-        ).run()
+        ).run(_ended())
 
 
 def keep_node(
@@ -124,10 +125,10 @@ def keep_node(
             f"node {name}",
             arguments,
             _labels(name, cores, labels),
-            cluster.environment(token_file),
+            cluster.child_environment(token_file),
             f"node {name} has joined the fleet at {head}: {own}, {cores:g} cores",
             lambda: _check_head(name, head, token_file),
-        ).run()
+        ).run(_ended())
 
 
 def holder(name: str, folder: Path) -> int | None:
@@ -156,10 +157,9 @@ def _ports(first: int) -> list[str]:
     """The arguments of `ray start` for fixed ports, so that a firewall can name them."""
     if not first:
         return []
-    names = "node-manager", "object-manager", "metrics-export", "runtime-env-agent"
+    names = "node-manager", "object-manager", "runtime-env-agent"
     single = [word for i, name in enumerate(names) for word in (f"--{name}-port", str(first + i))]
-    agent = ["--dashboard-agent-grpc-port", str(first + 4), "--dashboard-agent-listen-port", str(first + 5)]
-    return [*single, *agent, "--min-worker-port", str(first + 10), "--max-worker-port", str(first + PORTS - 1)]
+    return [*single, "--min-worker-port", str(first + len(names)), "--max-worker-port", str(first + PORTS - 1)]
 
 
 def _check_labels(name: str, labels: dict[str, str]) -> None:
@@ -210,12 +210,12 @@ def _alone(name: str, folder: Path) -> Iterator[None]:
 
 @dataclass
 class _Keeper:
-    """Runs `ray start` until a signal arrives, and starts it again after its death.
+    """Runs `ray start` until an event is set, and starts it again after its death.
 
     title      of what it runs, for its messages
     arguments  of `ray start`
     labels     of the node
-    variables  to add to the environment
+    variables  the environment of its processes
     started    message of each start
     check      called before each start: a reason to wait, or empty
     """
@@ -226,13 +226,11 @@ class _Keeper:
     variables: dict[str, str]
     started: str
     check: Callable[[], str] = str
-    last: str = field(default="it printed nothing", init=False)
+    cause: str = field(default="", init=False)  # of the last death
+    dying: bool = field(default=False, init=False)  # Ray reports the death of one of its processes
 
-    def run(self) -> None:
-        """Run until SIGTERM or SIGINT."""
-        ended = threading.Event()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: ended.set())
+    def run(self, ended: threading.Event) -> None:
+        """Run until the event is set."""
         pause = _FIRST_PAUSE
         with private_folder() as folder:
             while not ended.is_set():
@@ -247,8 +245,9 @@ class _Keeper:
         _log.info("%s has ended", self.title)
 
     def _run_once(self, folder: Path, ended: threading.Event) -> str:
-        """Run Ray until it ends or a signal arrives; return how it ended."""
+        """Run Ray until it ends or the event is set; return how it ended."""
         (folder / "ray_current_cluster").unlink(missing_ok=True)  # of its predecessor: Ray would not start
+        self.cause, self.dying = "", False
         labels = self.labels | {f"{cluster.PREFIX}since": str(int(time.time()))}
         process = subprocess.Popen(
             [
@@ -256,7 +255,7 @@ class _Keeper:
                 *("--temp-dir", str(folder), "--log-style", "record", "--log-color", "false", *self.arguments),
                 *("--labels", ",".join(map("=".join, labels.items()))),
             ],
-            env=start.environment() | self.variables,
+            env=self.variables,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -266,7 +265,7 @@ class _Keeper:
             assert process.stdout is not None
             self._forward_lines(process.stdout.fileno(), lambda: process.poll() is not None or ended.is_set())
             _end(process)
-        return f"{self.title} died with {_ending(process.returncode)}: {self.last}"
+        return f"{self.title} died with {_ending(process.returncode)}: {self.cause or 'it printed nothing'}"
 
     def _forward_lines(self, handle: int, over: Callable[[], bool]) -> None:
         """Log the lines that matter until all is over; processes of Ray may hold the pipe open for longer."""
@@ -283,16 +282,27 @@ class _Keeper:
                 finished = finished or over()
 
     def _forward(self, line: str) -> None:
-        """Log a line of Ray if it matters."""
+        """Log a line of Ray if it matters; keep the one that says why Ray ends."""
         found = _LINE.fullmatch(line)
-        if found is None:
-            self.last = line.strip() or self.last
-        elif _STARTED in found["text"]:
+        text = found["text"] if found is not None else line.strip()
+        if found is not None and _STARTED in text:
+            self.cause = ""
             _log.info("%s", self.started)
             _notify("READY=1")
-        elif found["level"] not in ("INFO", "SUCC", "VINFO", "VVINFO"):
-            self.last = found["text"]
-            _log.warning("%s: %s", self.title, self.last)
+        elif _DIED.fullmatch(text) or (found is None and text and not self.dying):
+            self.cause = text
+        elif text.startswith(_DEATHS):
+            self.dying = True
+        elif found is not None and found["level"] not in ("INFO", "SUCC") and not self.dying:
+            _log.warning("%s: %s", self.title, text)
+
+
+def _ended() -> threading.Event:
+    """An event that is set by SIGTERM and SIGINT."""
+    event = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: event.set())
+    return event
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

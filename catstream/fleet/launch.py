@@ -9,6 +9,7 @@ import ctypes
 import os
 import signal
 import sys
+from importlib import import_module
 
 __all__ = ["main"]
 
@@ -27,7 +28,22 @@ def main() -> None:
     from catstream.fleet.cluster import stay_on_loopback
 
     stay_on_loopback()
+    _close_ports()
     ray()
+
+
+def _close_ports() -> None:
+    """Make Ray behave as if only its own package were installed.
+
+    With grpcio or the packages of `ray[default]` it would open ports for its client, job submission and metrics, which
+    a fleet does not use.
+    """
+    missing = ImportError("a fleet does not use it")
+    for module, name in (
+        ("ray.scripts.scripts", "get_ray_client_dependency_error"),
+        ("ray._private.utils", "get_dashboard_dependency_error"),
+    ):
+        setattr(import_module(module), name, lambda: missing)
 
 
 if __name__ == "__main__":

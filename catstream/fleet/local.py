@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,7 +21,7 @@ from catstream.storage import write_atomically
 __all__ = ["LocalFleet"]
 
 _HOST = "127.0.0.1"
-_START_SECONDS = 90.0
+_START_SECONDS = 150.0  # on a machine that is busy
 _END_SECONDS = 20.0
 _LOOK_SECONDS = 0.05
 _MAIN = "from catstream.cli import main; main()"
@@ -90,18 +89,36 @@ class LocalFleet:
         self.folder.chmod(0o700)
         (self.folder / "logs").mkdir(exist_ok=True)
         cores = round(len(os.sched_getaffinity(0)) / nodes, 2) if cores is None and nodes else cores
-        began: dict[str, subprocess.Popen[bytes]] = {}
+        began: dict[str, int] = {}
         try:
             if not self.running:
                 address = self._remembered_address()
                 self._keep(began, {"head": ["head", "--listen", address, "--folder", str(self.folder)]})
-            node = ["node", "--head", self.address, "--token-file", str(self.token_file)]
             wanted = [f"node-{number}" for number in range(1, nodes + 1)]
             missing = [name for name in wanted if holder(name, self.folder) is None]
-            self._keep(began, {name: [*node, "--name", name, "--cores", f"{cores:g}"] for name in missing})
+            self._keep(began, {name: self._node(name, cores or 0.0, {}) for name in missing})
         except BaseException:
             self._stop(began)
             raise
+
+    def start_node(self, name: str, cores: float, labels: dict[str, str] | None = None) -> None:
+        """Start one more node, and wait until it has joined.
+
+        Raises
+        ------
+        FleetError
+            If it does not start.
+        """
+        self._keep({}, {name: self._node(name, cores, labels or {})})
+
+    def stop_node(self, name: str) -> None:
+        """Stop a node for good."""
+        self._stop([name])
+
+    def _node(self, name: str, cores: float, labels: dict[str, str]) -> list[str]:
+        options = [word for label in labels.items() for word in ("--label", "=".join(label))]
+        place = ["--head", self.address, "--token-file", str(self.token_file), "--folder", str(self.folder)]
+        return ["node", *place, "--name", name, "--cores", f"{cores:g}", *options]
 
     def stop(self) -> None:
         """Stop all nodes, then the head. The token, the state of the cluster and the logs stay."""
@@ -118,7 +135,7 @@ class LocalFleet:
         write_atomically(path, address.encode())
         return address
 
-    def _keep(self, began: dict[str, subprocess.Popen[bytes]], commands: dict[str, list[str]]) -> None:
+    def _keep(self, began: dict[str, int], commands: dict[str, list[str]]) -> None:
         """Start background processes by name, and wait until each has reported that Ray runs."""
         waited = set(commands)
         with tempfile.TemporaryDirectory(prefix="catstream-") as folder, contextlib.ExitStack() as stack:
@@ -135,23 +152,26 @@ class LocalFleet:
                     with contextlib.suppress(BlockingIOError):
                         receivers[name].recv(100)
                         waited.discard(name)
-                return not waited or any(began[name].poll() is not None for name in waited)
+                return not waited or any(_has_ended(began[name]) for name in waited)
 
             if not _wait(settled, _START_SECONDS) or waited:
-                name = min(waited, key=lambda name: began[name].poll() is None)
+                name = min(waited, key=lambda name: not _has_ended(began[name]))
                 raise FleetError(f"{name} does not start: {self._last_line(name)}")
 
-    def _spawn(self, name: str, command: list[str], notified: str) -> subprocess.Popen[bytes]:
-        with (self.folder / "logs" / f"{name}.log").open("ab") as log:
-            return subprocess.Popen(
-                [sys.executable, "-P", "-c", _MAIN, "fleet", *command, "--ports", "0"],
-                env=start.environment() | {"NOTIFY_SOCKET": notified},
-                cwd=self.folder,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
+    def _spawn(self, name: str, command: list[str], notified: str) -> int:
+        """Start a background process that reports to the socket `notified`; return its process id."""
+        log = self.folder / "logs" / f"{name}.log"
+        return os.posix_spawn(  # unlike a Popen, it may outlive this process without a warning
+            sys.executable,
+            [sys.executable, "-P", "-c", _MAIN, "fleet", *command, "--ports", "0"],
+            start.environment() | {"NOTIFY_SOCKET": notified},
+            file_actions=[
+                (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
+                (os.POSIX_SPAWN_OPEN, 1, log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600),
+                (os.POSIX_SPAWN_DUP2, 1, 2),
+            ],
+            setsid=True,
+        )
 
     def _stop(self, names: Iterable[str]) -> None:
         """End the background processes of these names, and wait for them."""
@@ -167,6 +187,14 @@ class LocalFleet:
     def _last_line(self, name: str) -> str:
         lines = (self.folder / "logs" / f"{name}.log").read_text(errors="replace").strip().splitlines()
         return lines[-1].removeprefix("catstream: ") if lines else "it printed nothing"
+
+
+def _has_ended(pid: int) -> bool:
+    """Whether a child of this process has ended."""
+    try:
+        return os.waitpid(pid, os.WNOHANG) != (0, 0)
+    except ChildProcessError:  # this was known before
+        return True
 
 
 def _signal(pid: int, number: int) -> None:
