@@ -24,19 +24,29 @@ from typing import Self, TypeVar
 from uuid import uuid4
 
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import FleetStatus, Listing, NodeStatus, Question, StreamStatus
+from catstream.messages import End, FleetStatus, Listing, NodeStatus, Question, StreamStatus
 from catstream.schema import LONGEST_LIST
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, private_folder
 from catstream.wire.keys import Keys
 
-__all__ = ["Place", "Registry", "RegistryServer", "address_of", "fleet_and_stream", "locate"]
+__all__ = [
+    "FollowedStream",
+    "Place",
+    "Registry",
+    "RegistryServer",
+    "address_of",
+    "described",
+    "fleet_and_stream",
+    "locate",
+]
 
 Status = TypeVar("Status", StreamStatus, NodeStatus)
 
 _PREFIX = "fleet://"
 _LONGEST_TROUBLE = 1000  # characters
+_QUIET_SECONDS = 1.0  # without a message, after which the registry is asked where the stream runs; then repeated
 _TURN_SECONDS = 0.5  # after which the endpoint of a fleet on this machine is read again, while it does not answer
 
 
@@ -55,6 +65,10 @@ class Place:
     def identity(self) -> tuple[str, str, int]:
         """Differs for each pipeline that was started for the stream."""
         return self.status.endpoint, self.status.server, self.status.token
+
+    def continues_as(self, later: Place) -> bool:
+        """Whether the numbers of the frames go on at a later place of the stream."""
+        return (self.status.source, self.status.began) == (later.status.source, later.status.began)
 
 
 class Registry:
@@ -195,6 +209,91 @@ class Registry:
         return endpoint if self._keys is None else replace(endpoint, keys=self._keys)
 
 
+class FollowedStream:
+    """Follows a stream of a fleet from one pipeline to the next, without waiting.
+
+    While nothing arrives from the stream's pipeline, the registry is asked once a second where the stream runs. If the
+    manager does not answer, the last answer holds. The end of a pipeline is the end of the stream only if the registry
+    says so: a stream that moves is stopped on one node, and goes on at another one.
+
+    Parameters
+    ----------
+    registry : Registry
+        The registry of the fleet; it is closed with this object.
+    stream : str
+        Name of the stream.
+
+    Attributes
+    ----------
+    place : Place
+        Where the stream runs; if it runs nowhere now, where it ran before.
+    status : StreamStatus
+        Its newest state.
+    end : End or None
+        The reason why the stream has ended; None while it goes on.
+
+    Raises
+    ------
+    ServiceError
+        If the fleet has no such stream, or does not accept the keys.
+    SilenceError
+        If the manager does not answer at first.
+    """
+
+    def __init__(self, registry: Registry, stream: str) -> None:
+        self._stream, self._registry = stream, registry
+        self._pipeline_end: End | None = None
+        self.end: End | None = None
+        try:
+            self.place = self._registry.place(stream)
+        except ServiceError:
+            self._registry.close()
+            raise
+        self._conclude(self.place.status)
+        self._next_question = monotonic() + _QUIET_SECONDS
+
+    def message_arrived(self) -> None:
+        """Report a message from the pipeline: the registry is not asked while there are any."""
+        self._next_question = monotonic() + _QUIET_SECONDS
+
+    def pipeline_ended(self, end: End) -> None:
+        """Report the end of the pipeline: the registry is asked at once whether it is that of the stream."""
+        self._pipeline_end, self._next_question = self._pipeline_end or end, monotonic()
+
+    def has_moved(self) -> bool:
+        """Ask if it is time to, take the answer if it has arrived, and return whether `place` has another pipeline."""
+        now = monotonic()
+        if now >= self._next_question:
+            self._registry.request(self._stream)
+            self._next_question = now + _QUIET_SECONDS
+        answer = self._registry.receive(self._stream)
+        if answer is None:
+            return False
+        fleet, place = answer
+        if place is None:
+            self.end = End(0, f"the stream {self._stream} was removed from the fleet {fleet}")
+            return False
+        moved = place.endpoint is not None and place.identity != self.place.identity
+        if moved:
+            self.place, self._pipeline_end = place, None
+        self._conclude(place.status)
+        return moved
+
+    def fileno(self) -> int:
+        """Readable if an answer may have arrived."""
+        return self._registry.fileno()
+
+    def close(self) -> None:
+        """Disconnect from the registry."""
+        self._registry.close()
+
+    def _conclude(self, status: StreamStatus) -> None:
+        """Keep the state; end if the stream has ended."""
+        self.status = status
+        if status.state == "ended":
+            self.end = self._pipeline_end or End(0, f"the stream {self._stream} has ended")
+
+
 class RegistryServer:
     """Answers the questions of clients about the streams and nodes of a fleet.
 
@@ -279,7 +378,7 @@ def address_of(fleet: str, stream: str) -> str:
     return f"{_PREFIX}{fleet.removeprefix(_PREFIX).rstrip('/')}/{stream}" if fleet else f"{_PREFIX}{stream}"
 
 
-def fleet_and_stream(endpoint: str) -> tuple[str, str] | None:
+def fleet_and_stream(endpoint: str | Endpoint) -> tuple[str, str] | None:
     """The fleet and the stream of an address, None if it is no address of a stream of a fleet.
 
     Raises
@@ -290,7 +389,7 @@ def fleet_and_stream(endpoint: str) -> tuple[str, str] | None:
     >>> fleet_and_stream("fleet://head:5690/cam-7"), fleet_and_stream("fleet://cam-7"), fleet_and_stream("run")
     (('head:5690', 'cam-7'), ('', 'cam-7'), None)
     """
-    if not endpoint.startswith(_PREFIX):
+    if isinstance(endpoint, Endpoint) or not endpoint.startswith(_PREFIX):
         return None
     fleet, _, stream = endpoint.removeprefix(_PREFIX).rpartition("/")
     if not stream or "/" in fleet or (":" in stream and not fleet):
@@ -301,8 +400,23 @@ def fleet_and_stream(endpoint: str) -> tuple[str, str] | None:
     return fleet, stream
 
 
-def locate(endpoint: str, keys: str = "", source: str = "") -> Endpoint:
-    """The endpoint of a running pipeline, as `find` does, or of a stream of a fleet at this moment.
+def described(status: StreamStatus) -> str:
+    """The state of a stream, for a message to the user.
+
+    >>> described(StreamStatus("cam-7", "unplaced", trouble="cam-7 needs a node with site=north"))
+    'it is unplaced: cam-7 needs a node with site=north'
+    """
+    return f"it is {status.state}{': ' if status.trouble else ''}{status.trouble}"
+
+
+def locate(endpoint: str | Endpoint, keys: str = "", source: str = "", *, timeout: float = 5.0) -> Endpoint:
+    """The endpoint of a running pipeline, as `find` returns it; for the address of a stream, that of its pipeline now.
+
+    What is an `Endpoint` already is returned.
+
+    Parameters
+    ----------
+    timeout : seconds to wait for an answer of the registry
 
     Raises
     ------
@@ -311,13 +425,14 @@ def locate(endpoint: str, keys: str = "", source: str = "") -> Endpoint:
     SilenceError
         If the manager of the fleet does not answer.
     """
+    if isinstance(endpoint, Endpoint):
+        return endpoint
     address = fleet_and_stream(endpoint)
     if address is None:
         return find(endpoint, keys, source)
     fleet, stream = address
-    with Registry(fleet, keys) as registry:
+    with Registry(fleet, keys, timeout=timeout) as registry:
         place = registry.place(stream)
     if place.endpoint is None:
-        trouble = f": {place.status.trouble}" if place.status.trouble else ""
-        raise ServiceError(f"the stream {stream} runs nowhere, it is {place.status.state}{trouble}")
+        raise ServiceError(f"the stream {stream} runs nowhere, {described(place.status)}")
     return place.endpoint

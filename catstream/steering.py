@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from time import monotonic
 from typing import Self
@@ -22,12 +23,16 @@ from catstream.errors import CommandRejectedError, SilenceError
 from catstream.learned import Learned
 from catstream.messages import Answer, Command, SavedModel
 from catstream.names import UNNAMED, check_name
+from catstream.registry import fleet_and_stream, locate
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
-from catstream.wire.endpoint import find
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
 __all__ = ["Control", "control"]
+
+#: Seconds to wait for the registry of a fleet before each command; without an answer, the stream has not moved.
+_REGISTRY_SECONDS = 1.0
 
 
 class Control:
@@ -52,8 +57,12 @@ class Control:
         From each command, if these keys do not have the role "steer".
     """
 
-    def __init__(self, endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> None:
-        self._place = find(endpoint, keys, source)
+    def __init__(
+        self, endpoint: str | Endpoint = "", *, timeout: float = 5.0, keys: str = "", source: str = ""
+    ) -> None:
+        self._stream = str(endpoint) if fleet_and_stream(endpoint) is not None else ""
+        self._keys = keys
+        self._place = locate(endpoint, keys, source)
         self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
         self._commands = Requester[Command, Answer](CONTROL, self._place)
 
@@ -174,7 +183,19 @@ class Control:
             "check the pipeline with catstream status"
         )
 
+    def _follow(self) -> None:
+        """Connect to the pipeline that a stream of a fleet has now; if its manager does not answer, to the last one."""
+        if not self._stream:
+            return
+        with suppress(SilenceError):
+            place = locate(self._stream, self._keys, timeout=_REGISTRY_SECONDS)
+            if place != self._place:
+                self._commands.close()
+                self._place, self.endpoint = place, str(place)
+                self._commands = Requester[Command, Answer](CONTROL, place)
+
     def _ask(self, command: Command) -> Answer:
+        self._follow()
         verb, answer = command.verb, self._commands.ask(command, self.timeout)
         if answer is None:
             raise SilenceError(
@@ -193,6 +214,7 @@ def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source:
     ----------
     endpoint : str
         Endpoint of the pipeline, in the format of the setting `run.endpoint`. Empty for the only pipeline of this user.
+        The address of a stream of a fleet, as for `catstream.subscribe`: each command goes where the stream runs then.
     timeout : float
         Seconds to wait for the answer to a command.
     keys : str
@@ -203,6 +225,7 @@ def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source:
     Raises
     ------
     ServiceError
-        If `endpoint` is empty and not exactly one pipeline runs, or if the keys cannot be read.
+        If `endpoint` is empty and not exactly one pipeline runs, if the fleet has no such stream or it runs nowhere, or
+        if the keys cannot be read.
     """
     return Control(endpoint, timeout=timeout, keys=keys, source=source)

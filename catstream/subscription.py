@@ -8,6 +8,9 @@
 
 The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them. With
 `object="anna"`, only the messages about this object are transmitted.
+
+`catstream.subscribe("fleet://cam-7", "tracks")` subscribes to a stream of a fleet, wherever it runs: the subscription
+goes on if the stream moves to another node.
 """
 
 from __future__ import annotations
@@ -19,9 +22,10 @@ from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
 
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, Preview, Run, Sample, Track
-from catstream.names import check_name
+from catstream.names import UNNAMED, check_name
+from catstream.registry import FollowedStream, Registry, described, fleet_and_stream, locate
 from catstream.wire.announced import Announcement
-from catstream.wire.channels import CHANNELS, HEALTH, TRACKS
+from catstream.wire.channels import CHANNELS, HEALTH, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.newest import Subscriber
 from catstream.wire.readable import readable
@@ -77,6 +81,46 @@ class GapCounter:
         self._seq = seq
 
 
+class _Connection:
+    """The sockets of a subscription to one pipeline.
+
+    Parameters
+    ----------
+    only, about : the one kind of message to receive, and the object that it is about; None for all
+    announcement : announces this subscription to a pipeline that starts later; None if nothing does
+
+    Attributes
+    ----------
+    messages : receives the messages of the channel
+    endpoint : Endpoint
+    ends : receives the end: if this subscriber is slow, the end could be among the messages that are dropped
+    """
+
+    def __init__(
+        self,
+        channel: Channel[Any],
+        endpoint: Endpoint,
+        only: type | None,
+        about: str | None,
+        announcement: Announcement | None = None,
+    ) -> None:
+        self.endpoint, self._announcement = endpoint, announcement
+        reader = announcement.reader if announcement is not None else ""
+        self.messages = Subscriber(channel, endpoint, only, about=about, reader=reader)
+        self.ends = Subscriber(TRACKS, endpoint, only=End)
+
+    def withdraw_announcement(self) -> None:
+        """Tell pipelines at this endpoint not to wait for this subscriber any more."""
+        if self._announcement is not None:
+            self._announcement.close()
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.withdraw_announcement()
+        self.messages.close()
+        self.ends.close()
+
+
 class Subscription(Generic[Message]):
     """The messages of one channel of a running pipeline, until the pipeline ends; iterate with `for` or `async for`.
 
@@ -87,12 +131,16 @@ class Subscription(Generic[Message]):
     the pipeline. If both run on the same machine as the same user, the pipeline waits for it, so that it receives every
     message.
 
+    The subscription to a stream of a fleet goes on if the stream moves or is started again, and while the manager of
+    the fleet cannot be reached. It ends if the stream has ended, or was removed from the fleet. A frame that the stream
+    repeats is not returned a second time; the frames that nobody tracked in between are counted in `missed`.
+
     Attributes
     ----------
     end : End or None
-        The last message of the pipeline; None before it was received.
+        The last message of the pipeline, or the reason why the stream of a fleet has ended; None before that.
     endpoint : str
-        Endpoint of the pipeline.
+        Endpoint of the pipeline, or the address of the stream.
     keys : str
         Folder of the client keys; empty if there are none.
     timeout : float or None
@@ -108,7 +156,7 @@ class Subscription(Generic[Message]):
 
     def __init__(
         self,
-        endpoint: str,
+        endpoint: str | Endpoint,
         channel: str,
         *,
         object: str | None = None,
@@ -124,21 +172,26 @@ class Subscription(Generic[Message]):
                 f"a message of {channel} is about all objects: subscribe to {', '.join(_KINDS)} for one object, or to "
                 f"{channel} without an object"
             )
-        about = None if object is None else check_name(object)
-        place = find(endpoint, keys)
-        self.endpoint, self.timeout = str(place), timeout
-        self.keys = str(place.keys.folder) if place.keys is not None else ""
+        self._about = None if object is None else check_name(object)
+        self.endpoint, self.keys, self.timeout = str(endpoint), keys, timeout
         self.end: End | None = None
         self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
         self._close_time = float("inf")  # when to wait no more
-        # A pipeline that starts here later waits until this subscription has connected.
-        self._announcement = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
-        reader = self._announcement.reader if self._announcement else ""
-        only = None if about is None else _KINDS[channel]
-        self._messages = Subscriber(self._channel, place, only, about=about, reader=reader)
-        self._about, self._version = about, math.inf  # of the model of the object's last track
-        # A socket of its own for the end: if this subscriber is slow, the end could be among the dropped messages.
-        self._ends = Subscriber(TRACKS, place, only=End)
+        self._version = math.inf  # of the model of the object's last track
+        self._frames: dict[str, int] = {}  # the newest of each object, of a stream of a fleet
+        self._rejected = 0  # by the connections before this one
+        self._connection: _Connection | None = None
+        self._stream: FollowedStream | None = None
+        if (address := fleet_and_stream(endpoint)) is not None:
+            fleet, stream = address
+            self._stream = FollowedStream(Registry(fleet, keys), stream)
+            self._follow()
+        else:
+            place = locate(endpoint, keys)
+            self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
+            # A pipeline that starts here later waits until this subscription has connected.
+            waits = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
+            self._connection = _Connection(self._channel, place, self._only, self._about, waits)
 
     @property
     def missed(self) -> int:
@@ -159,15 +212,20 @@ class Subscription(Generic[Message]):
         return f"{self.missed} missed{before}"
 
     @property
+    def place(self) -> Endpoint | None:
+        """Endpoint of the connected pipeline; None if the stream of a fleet has not run yet."""
+        return self._connection.endpoint if self._connection is not None else None
+
+    @property
     def rejected(self) -> int:
         """Messages that were dropped because they were not what the channel carries."""
-        return self._messages.rejected
+        return self._rejected + (self._connection.messages.rejected if self._connection is not None else 0)
 
     def close(self) -> None:
         """Disconnect."""
-        self._withdraw_announcement()
-        self._messages.close()
-        self._ends.close()
+        self._disconnect()
+        if self._stream is not None:
+            self._stream.close()
 
     def __enter__(self) -> Self:
         return self
@@ -184,7 +242,7 @@ class Subscription(Generic[Message]):
             if self._ended():
                 raise StopIteration
             poller = select.poll()
-            for socket in (self._messages, self._ends):
+            for socket in self._sockets():
                 poller.register(socket.fileno(), select.POLLIN)
             seconds = self._wait_seconds(deadline)
             poller.poll(seconds * 1000)
@@ -198,24 +256,81 @@ class Subscription(Generic[Message]):
         while (message := self._take()) is None:
             if self._ended():
                 raise StopAsyncIteration
-            await readable([self._messages, self._ends], self._wait_seconds(deadline))
+            await readable(self._sockets(), self._wait_seconds(deadline))
         return message
+
+    @property
+    def _only(self) -> type | None:
+        """The one kind of message to receive, None for all of the channel."""
+        return None if self._about is None else _KINDS[self._name]
+
+    def _sockets(self) -> list[Subscriber[Any] | FollowedStream]:
+        """What is waited for."""
+        sockets: list[Subscriber[Any] | FollowedStream] = []
+        if self._connection is not None:
+            sockets += [self._connection.messages, self._connection.ends]
+        return sockets if self._stream is None else [*sockets, self._stream]
 
     def _take(self) -> Message | None:
         """Return the next message if one was received, without waiting."""
-        while (message := self._messages.receive(0)) is not None:
+        if self._connection is not None and (message := self._receive(self._connection)) is not None:
+            return message
+        self._follow()
+        return None
+
+    def _receive(self, connection: _Connection) -> Message | None:
+        while (message := connection.messages.receive(0)) is not None:
+            if self._stream is not None and not isinstance(message, End):
+                self._stream.message_arrived()
             if isinstance(message, Track | Features):
+                if self._stream is not None and self._is_repeat(message):
+                    continue
                 self._count(message)
             if not isinstance(message, Run | End):
-                self._withdraw_announcement()
+                connection.withdraw_announcement()
                 return cast(Message, message)
             if isinstance(message, End) and self._channel.keeps == "every":  # the last message here
-                self.end, self._close_time = message, 0.0
+                self._pipeline_ended(message, 0.0)
                 return None
-        for end in self._ends.receive_all():
+        for end in connection.ends.receive_all():
             if self.end is None and isinstance(end, End):
-                self.end, self._close_time = end, monotonic() + _DRAIN_SECONDS
+                self._pipeline_ended(end, monotonic() + _DRAIN_SECONDS)
         return None
+
+    def _pipeline_ended(self, end: End, close_time: float) -> None:
+        """End at this time; a stream of a fleet may go on with another pipeline."""
+        if self._stream is not None:
+            self._stream.pipeline_ended(end)
+        else:
+            self.end, self._close_time = end, close_time
+
+    def _follow(self) -> None:
+        """Connect to the pipeline of a stream of a fleet if it has another one, and end if the stream has ended."""
+        if self._stream is None or self.end is not None:
+            return
+        before = self._stream.place
+        moved = self._stream.has_moved()
+        if self._stream.end is not None:
+            self.end, self._close_time = self._stream.end, monotonic() + _DRAIN_SECONDS
+        elif (moved or self._connection is None) and (place := self._stream.place.endpoint) is not None:
+            if not before.continues_as(self._stream.place):
+                self._frames.clear()
+            self._disconnect()
+            self._connection = _Connection(self._channel, place, self._only, self._about)
+
+    def _disconnect(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._rejected += self._connection.messages.rejected
+            self._connection = None
+
+    def _is_repeat(self, message: Track | Features) -> bool:
+        """Whether a stream of a fleet repeats a frame, after it was started again."""
+        name = message.object if isinstance(message, Track) else UNNAMED
+        if message.frame <= self._frames.get(name, -1):
+            return True
+        self._frames[name] = message.frame
+        return False
 
     def _count(self, message: Track | Features) -> None:
         """Count the frames missing before a message, unless its object was not there."""
@@ -226,15 +341,11 @@ class Subscription(Generic[Message]):
             self._version = message.model_version
         self._gaps.take(message.seq)
 
-    def _withdraw_announcement(self) -> None:
-        """Tell pipelines at this endpoint not to wait for this subscriber any more."""
-        if self._announcement is not None:
-            self._announcement.close()
-
     def _ended(self) -> bool:
         if self.end is None or monotonic() < self._close_time:
             return False
-        if self._channel.keeps == "every" and self._about is None:  # one object may have been forgotten before
+        # One object may have been forgotten before; a stream of a fleet may have no last message.
+        if self._channel.keeps == "every" and self._about is None and self.end.seq:
             self._gaps.take(self.end.seq)
         return True
 
@@ -245,9 +356,8 @@ class Subscription(Generic[Message]):
         """Return the seconds to wait for the sockets. Raises SilenceError after the deadline."""
         now = monotonic()
         if now >= deadline and self.end is None:
-            raise SilenceError(
-                f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: is a pipeline running there?"
-            )
+            why = "is a pipeline running there?" if self._stream is None else described(self._stream.status)
+            raise SilenceError(f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {why}")
         until = min(deadline if self.end is None else float("inf"), self._close_time, now + _CONNECTION_CHECK_SECONDS)
         return max(0.0, until - now)
 
@@ -295,7 +405,8 @@ def subscribe(
     ----------
     endpoint : str
         Endpoint of the pipeline, which may start later; the format is that of the setting `run.endpoint`. Empty for the
-        only running pipeline of this user.
+        only running pipeline of this user. The address of a stream of a fleet is `fleet://HOST:PORT/STREAM`, with host
+        and port of the manager; `fleet://FLEET/STREAM` for a fleet of this user, and `fleet://STREAM` for the only one.
     channel : str
         "tracks", "models", "health", "samples", "features" or "previews".
     object : str or None
@@ -312,7 +423,9 @@ def subscribe(
         If `object` is not a valid name.
     ServiceError
         If there is no such channel, or its messages are not about one object each; if `endpoint` is empty and not
-        exactly one pipeline runs; or if the keys cannot be read.
+        exactly one pipeline runs; if the fleet has no such stream; or if the keys cannot be read.
+    SilenceError
+        If the manager of the fleet does not answer.
     """
     return Subscription(endpoint, channel, object=object, timeout=timeout, keys=keys)
 
@@ -329,6 +442,8 @@ def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_T
     SilenceError
         If no report arrives in time.
     """
+    if fleet_and_stream(endpoint) is not None:
+        return _wait_for_stream(endpoint, keys, seconds)
     place, deadline = find(endpoint, keys), monotonic() + seconds
     # Not a `Subscription`: it subscribes to the end of the tracks, too, and a replay waits for a subscriber to tracks.
     with Subscriber(HEALTH, place) as reports:
@@ -336,3 +451,14 @@ def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_T
             if monotonic() >= deadline:
                 raise SilenceError(f"no health arrived from {place} within {seconds:g} s: is a pipeline running there?")
     return place
+
+
+def _wait_for_stream(endpoint: str, keys: str, seconds: float) -> Endpoint:
+    """Wait for a health report of a stream of a fleet, and return the endpoint of its pipeline."""
+    with Subscription[Health](endpoint, "health", timeout=seconds, keys=keys) as reports:
+        next(reports, None)
+        if reports.end is not None or reports.place is None:
+            raise ServiceError(
+                f"{endpoint} does not run: {reports.end.reason if reports.end is not None else 'no place'}"
+            )
+        return reports.place

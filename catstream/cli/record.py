@@ -14,10 +14,11 @@ from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.errors import RecordingError
 from catstream.messages import End, Features, Run
 from catstream.recording.file import Recording, RecordingWriter
+from catstream.registry import locate
 from catstream.services.recorder import Recorder
 from catstream.wire.announced import Announcement
 from catstream.wire.channels import TRAINING
-from catstream.wire.endpoint import Endpoint, find
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
 __all__ = ["record"]
@@ -39,6 +40,7 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
     The pipeline does not wait for the recording. Messages that were sent before it
     started, or that it received too slowly, are missing; their number is printed
     at the end. catstream track --record records all features from the first frame.
+    A stream of a fleet is recorded until its pipeline ends, or moves to another node.
 
     \b
     EXAMPLES
@@ -46,7 +48,7 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
       catstream record --output walk.mcap --endpoint run
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    place = find(endpoint, keys)
+    place = locate(endpoint, keys)
     with (
         Announcement(place, ("training", "tracks")) as waits,
         Subscriber(TRAINING, place, reader=waits.reader) as training,

@@ -143,6 +143,8 @@ def watch(
       catstream watch tracks --json | jq .box
       catstream watch tracks --object anna
       catstream watch models --endpoint run --count 1 --json
+      catstream watch tracks --stream cam-7
+      catstream watch tracks --stream cam-7 --fleet head:5690 --keys anna
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     seen = 0

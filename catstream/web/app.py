@@ -191,7 +191,9 @@ def _command(body: bytes | None) -> _Command:
 
 def _execute(feed: Feed, command: _Command) -> Answer:
     """Send a command and wait for its answer."""
-    with Control(feed.attached_endpoint, keys=feed.keys) as pipeline:
+    if feed.place is None:
+        raise SilenceError("no pipeline is connected: the command was not sent")
+    with Control(feed.place) as pipeline:
         if command.box is not None:
             return pipeline.set_box(command.box, object=command.object, keep=command.keep)
         if command.verb == "forget":

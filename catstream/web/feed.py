@@ -14,6 +14,7 @@ from catstream.registry import locate
 from catstream.subscription import AnyMessage, Subscription
 from catstream.web.dashboard import SILENCE_SECONDS, Dashboard
 from catstream.web.viewers import Viewers
+from catstream.wire.endpoint import Endpoint
 
 __all__ = ["Feed"]
 
@@ -39,14 +40,14 @@ class Feed:
     Attributes
     ----------
     dashboard : the dashboard
-    attached_endpoint, keys : endpoint and keys of the current connection; empty if there is none
+    place : endpoint of the current connection, with its keys; None if there is none
     viewers : the open pages; pictures and features are received while there is one
     """
 
     def __init__(self, endpoint: str = "", keys: str = "") -> None:
         self._endpoint, self._keys = endpoint, keys
         self.dashboard = Dashboard()
-        self.attached_endpoint = self.keys = ""
+        self.place: Endpoint | None = None
         self.viewers = Viewers()
         self._is_running = asyncio.Event()
 
@@ -65,25 +66,23 @@ class Feed:
         """Connect, and reconnect after each loss, until cancelled."""
         while True:
             try:
-                attached_endpoint = await asyncio.to_thread(locate, self._endpoint, self._keys)
-                self.attached_endpoint = str(attached_endpoint)
-                self.dashboard.attach(self.attached_endpoint)
-                self.keys = (
-                    str(attached_endpoint.keys.folder) if attached_endpoint.keys else ""
-                )  # the only pipeline has its keys registered
-                await self._run_attached()
+                self.place = await asyncio.to_thread(locate, self._endpoint, self._keys)
+                self.dashboard.attach(str(self.place))
+                await self._run_attached(self.place)
             except CatstreamError as error:
                 self.dashboard.mark_silent(str(error))
             except Exception as error:  # an unexpected error must not end the feed silently
                 _log.exception("The page lost the pipeline and reconnects.")
                 self.dashboard.mark_silent(f"{type(error).__name__}: {error}")
-            self.attached_endpoint = self.keys = ""
+            self.place = None
             await asyncio.sleep(_PAUSE_SECONDS)
 
-    async def _run_attached(self) -> None:
+    async def _run_attached(self, place: Endpoint) -> None:
         """Receive all channels until the pipeline ends or is silent."""
         self._is_running.clear()
-        tasks = [asyncio.create_task(self._forward(channel)) for channel in (*_LIVENESS, *_PERMANENT, *_FOR_VIEWERS)]
+        tasks = [
+            asyncio.create_task(self._forward(place, channel)) for channel in (*_LIVENESS, *_PERMANENT, *_FOR_VIEWERS)
+        ]
         try:
             done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
@@ -95,7 +94,7 @@ class Feed:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _forward(self, channel: str) -> End | None:
+    async def _forward(self, place: Endpoint, channel: str) -> End | None:
         """Feed the messages of a channel until the pipeline ends; channels for viewers only while there are viewers.
 
         The other channels do not identify their pipeline. They are read only after a track or health report arrived:
@@ -107,7 +106,7 @@ class Feed:
                 await self._is_running.wait()
             if channel in _FOR_VIEWERS:
                 await self.viewers.wait()
-            with Subscription[AnyMessage](self.attached_endpoint, channel, timeout=timeout, keys=self.keys) as messages:
+            with Subscription[AnyMessage](place, channel, timeout=timeout) as messages:
                 async for message in messages:
                     self.dashboard.take(message, monotonic())
                     if self.dashboard.phase == "running":

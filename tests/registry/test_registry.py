@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
-from threading import Event
 
 import pytest
 
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages import FleetStatus, NodeStatus, StreamStatus
-from catstream.registry import Registry, RegistryServer, address_of, fleet_and_stream, locate
+from catstream.registry import Registry, address_of, fleet_and_stream, locate
 from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, running
 from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, public_key, revoke, synchronise
 from catstream.wire.rejects import rejects
@@ -20,40 +17,14 @@ CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)
 SITE = FleetStatus("site", 1.7e9, {"cam-7": CAM}, {"north": NodeStatus("north", "alive")})
 
 
-@contextmanager
-def managing(status=SITE, text="", keys=""):
-    """A manager in a thread, which answers with this state of the fleet."""
-    over = Event()
-
-    def serve():
-        while not over.is_set():
-            server.turn(0.01)
-
-    with RegistryServer(text, keys, lambda: status) as server, ThreadPoolExecutor(1) as pool:
-        serving = pool.submit(serve)
-        try:
-            yield server.endpoint
-        finally:
-            over.set()
-            serving.result(20)
-
-
-@pytest.fixture
-def fleet_keys(folder):
-    """The keys of a fleet, and beside them those of a client that may watch."""
-    create(folder / "keys")
-    allow(folder / "keys", "anna", "watch", output=folder / "anna")
-    return folder / "keys"
-
-
-def test_the_state_of_a_fleet_arrives_as_it_is():
-    with managing(), Registry() as registry:
+def test_the_state_of_a_fleet_arrives_as_it_is(managing):
+    with managing(SITE), Registry() as registry:
         assert registry.streams() == SITE
         place = registry.place("cam-7")
     assert (place.status, str(place.endpoint), place.endpoint.source) == (CAM, "run", "walk.mp4")
 
 
-def test_a_fleet_with_more_streams_than_a_message_holds_arrives_whole():
+def test_a_fleet_with_more_streams_than_a_message_holds_arrives_whole(managing):
     many = FleetStatus(
         "site",
         1.7e9,
@@ -64,18 +35,22 @@ def test_a_fleet_with_more_streams_than_a_message_holds_arrives_whole():
         assert registry.streams() == many
 
 
-def test_a_long_description_of_a_problem_is_shortened_and_the_rest_arrives():
+def test_a_long_description_of_a_problem_is_shortened_and_the_rest_arrives(managing):
     long = replace(SITE, streams={"cam-7": replace(CAM, trouble="x" * 5000)})
     with managing(long), Registry() as registry:
         assert len(registry.streams().streams["cam-7"].trouble) < 1100
 
 
-def test_a_stream_that_does_not_exist_is_an_error_with_the_names_of_all():
-    with managing(), Registry() as registry, pytest.raises(ServiceError, match=r"site has no stream 'cam-8'.*cam-7"):
+def test_a_stream_that_does_not_exist_is_an_error_with_the_names_of_all(managing):
+    with (
+        managing(SITE),
+        Registry() as registry,
+        pytest.raises(ServiceError, match=r"site has no stream 'cam-8'.*cam-7"),
+    ):
         registry.place("cam-8")
 
 
-def test_a_stream_that_does_not_run_has_no_endpoint():
+def test_a_stream_that_does_not_run_has_no_endpoint(managing):
     idle = replace(SITE, streams={"cam-7": StreamStatus("cam-7", "unplaced", trouble="cam-7 needs site=north")})
     with managing(idle), Registry() as registry:
         assert registry.place("cam-7").endpoint is None
@@ -83,8 +58,8 @@ def test_a_stream_that_does_not_run_has_no_endpoint():
             locate("fleet://cam-7")
 
 
-def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder):
-    with managing() as manager, meeting_place("", folder, source="walk.mp4") as pipeline:
+def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder, managing):
+    with managing(SITE) as manager, meeting_place("", folder, source="walk.mp4") as pipeline:
         assert fleets() == {"site": manager}
         assert running() == [pipeline]
         assert find() == pipeline
@@ -92,30 +67,30 @@ def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder):
     assert fleets() == {}
 
 
-def test_of_several_fleets_the_name_selects_one():
-    with managing(), managing(replace(SITE, name="yard")):
+def test_of_several_fleets_the_name_selects_one(managing):
+    with managing(SITE), managing(replace(SITE, name="yard")):
         with Registry("yard") as registry:
             assert registry.streams().name == "yard"
         with pytest.raises(ServiceError, match=r"2 fleets are running: say which \(--fleet\): site, yard"):
             Registry()
 
 
-def test_without_a_fleet_the_error_says_how_to_get_one():
+def test_without_a_fleet_the_error_says_how_to_get_one(managing):
     with pytest.raises(ServiceError, match=r"no fleet of yours is running: start it \(catstream fleet up\)"):
         Registry()
-    with managing(), pytest.raises(ServiceError, match=r"no fleet 'yard' of yours is running.*; there is site"):
+    with managing(SITE), pytest.raises(ServiceError, match=r"no fleet 'yard' of yours is running.*; there is site"):
         Registry("yard")
 
 
-def test_a_manager_that_was_started_again_elsewhere_is_found():
-    with managing():
+def test_a_manager_that_was_started_again_elsewhere_is_found(managing):
+    with managing(SITE):
         registry = Registry()
     with registry:
         registry.timeout = 0.1
         with pytest.raises(SilenceError, match="no answer from the fleet site at"):
             registry.streams()
         registry.timeout = 20
-        with managing():
+        with managing(SITE):
             assert registry.streams() == SITE
 
 
@@ -127,7 +102,9 @@ def test_an_address_is_read_as_it_is_written():
             fleet_and_stream(wrong)
 
 
-def test_a_client_connects_to_a_stream_with_its_own_keys_and_the_public_key_of_the_stream(fleet_keys, folder, tcp):
+def test_a_client_connects_to_a_stream_with_its_own_keys_and_the_public_key_of_the_stream(
+    fleet_keys, folder, tcp, managing
+):
     create(folder / "stream")
     server, anna = public_key(folder / "stream"), Keys.load(folder / "anna")
     keyed = replace(SITE, streams={"cam-7": replace(CAM, endpoint="tcp://10.0.0.2:5700", server=server)})
@@ -137,7 +114,7 @@ def test_a_client_connects_to_a_stream_with_its_own_keys_and_the_public_key_of_t
     assert str(place.endpoint) == "tcp://10.0.0.2:5700"
 
 
-def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder, tcp):
+def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder, tcp, managing):
     address = tcp.removeprefix("tcp://")
     create(folder / "other")
     with managing(SITE, tcp, str(fleet_keys)):

@@ -1,0 +1,270 @@
+"""A subscriber to a stream of a fleet stays attached when the stream moves, and returns each frame once."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import catstream
+from catstream.box import Box
+from catstream.errors import ServiceError, SilenceError
+from catstream.messages import Answer, Command, End, FleetStatus, Health, StreamStatus, Track
+from catstream.registry import FollowedStream, Place
+from catstream.subscription import wait_until_running
+from catstream.wire.channels import CONTROL, HEALTH, TRACKS
+from catstream.wire.commands import Responder
+from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.keys import allow, allowed, create, public_key, revoke, synchronise
+from catstream.wire.newest import Publisher
+
+STOPPED = End(99, "it was stopped by a command")
+
+
+def track(seq, name=""):
+    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1, object=name)
+
+
+class Stream:
+    """A stream of a fleet, its pipelines, and a subscriber in a thread."""
+
+    def __init__(self, until, pool, stack):
+        self.status = FleetStatus("site", 1.7e9, {"cam-7": StreamStatus("cam-7", "starting", source="walk.mp4")})
+        self._until, self._pool, self._stack = until, pool, stack
+
+    def update(self, **changes):
+        """What the registry says of the stream from now on."""
+        self.status.streams["cam-7"] = replace(self.status.streams["cam-7"], **changes)
+
+    def runs(self, keys="", text="", **changes):
+        """The tracks of a new pipeline of the stream, which runs now."""
+        place = Endpoint.parse(text or str(self._stack.enter_context(private_folder())), keys)
+        publisher = self._stack.enter_context(Publisher(TRACKS, place))
+        token = self.status.streams["cam-7"].token + 1
+        self.update(**{"state": "running", "endpoint": str(place), "token": token} | changes)
+        return publisher
+
+    def send(self, publisher, *messages):
+        """Send once the subscriber is connected to this pipeline."""
+        self._until(lambda: b"" in publisher._subscribed, publisher.serve_late_joiners)
+        for message in messages:
+            publisher.send(message)
+
+    def watched(self, subscription):
+        """Everything that the subscription returns until it ends."""
+        return self._pool.submit(list, subscription)
+
+
+@pytest.fixture
+def stream(until):
+    with ExitStack() as stack, ThreadPoolExecutor(1) as pool:
+        yield Stream(until, pool, stack)
+
+
+def test_a_subscription_goes_on_where_its_stream_moved_and_returns_repeated_frames_once(stream, managing):
+    with managing(stream.status):
+        first = stream.runs()
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+            watched = stream.watched(tracks)
+            stream.send(first, *(track(seq, name) for seq in range(1, 6) for name in ("anna", "ben")), STOPPED)
+            second = stream.runs()
+            stream.send(second, *(track(seq, name) for seq in range(3, 9) for name in ("anna", "ben")), STOPPED)
+            stream.update(state="ended", endpoint="")
+            assert watched.result(60) == [track(seq, name) for seq in range(1, 9) for name in ("anna", "ben")]
+            assert (tracks.missed, tracks.end) == (99 - 9, STOPPED)
+
+
+def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, managing):
+    with managing(stream.status):
+        first = stream.runs()
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+            watched = stream.watched(tracks)
+            stream.send(first, track(1), track(2))
+            first.close()  # its node dies
+            second = stream.runs()
+            stream.send(second, track(9), track(10), End(11, "the source has ended"))
+            stream.update(state="ended")
+            assert [each.seq for each in watched.result(60)] == [1, 2, 9, 10]
+            assert tracks.missed == 6
+
+
+def test_a_subscription_goes_on_without_the_manager_and_follows_the_stream_once_there_is_one_again(stream, managing):
+    with ExitStack() as manager:
+        manager.enter_context(managing(stream.status))
+        first = stream.runs()
+        with catstream.subscribe("fleet://site/cam-7", "tracks", timeout=60) as tracks:
+            watched = stream.watched(tracks)
+            stream.send(first, track(1))
+            manager.close()
+            stream.send(first, track(2), STOPPED)
+            second = stream.runs()
+            with managing(stream.status):
+                stream.send(second, track(3))
+                del stream.status.streams["cam-7"]
+                assert watched.result(60) == [track(1), track(2), track(3)]
+            assert tracks.end.reason == "the stream cam-7 was removed from the fleet site"
+
+
+def test_a_subscription_waits_for_a_stream_that_runs_nowhere_yet(stream, managing):
+    stream.update(state="unplaced", trouble="cam-7 needs a node with site=north")
+    with managing(stream.status), catstream.subscribe("fleet://cam-7", "tracks", timeout=0.1) as tracks:
+        with pytest.raises(SilenceError, match=r"it is unplaced: cam-7 needs a node with site=north$"):
+            next(tracks)
+        tracks.timeout = 60
+        watched = stream.watched(tracks)
+        stream.send(stream.runs(), track(1), STOPPED)
+        stream.update(state="ended")
+        assert watched.result(60) == [track(1)]
+
+
+def test_the_frames_of_a_stream_that_began_anew_are_all_returned(stream, managing):
+    with managing(stream.status):
+        first = stream.runs()
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+            watched = stream.watched(tracks)
+            stream.send(first, track(1), track(2))
+            first.close()
+            stream.send(stream.runs(source="run.mp4"), track(1), track(2), STOPPED)
+            stream.update(state="ended")
+            assert [each.seq for each in watched.result(60)] == [1, 2, 1, 2]
+
+
+def test_an_event_loop_follows_a_stream_too(stream, managing):
+    async def watched(tracks):
+        return [each async for each in tracks]
+
+    with managing(stream.status):
+        first = stream.runs()
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+            result = stream._pool.submit(lambda: asyncio.run(watched(tracks)))
+            stream.send(first, track(1), STOPPED)
+            stream.send(stream.runs(), track(1), track(2), STOPPED)
+            stream.update(state="ended")
+            assert result.result(60) == [track(1), track(2)]
+
+
+def test_a_stream_that_does_not_exist_or_has_ended_is_not_waited_for(stream, managing):
+    with managing(stream.status):
+        with pytest.raises(ServiceError, match="site has no stream 'cam-8': its streams are cam-7"):
+            catstream.subscribe("fleet://cam-8", "tracks")
+        stream.update(state="ended")
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+            assert list(tracks) == []
+            assert tracks.end.reason == "the stream cam-7 has ended"
+
+
+def test_the_endpoint_of_a_running_stream_is_that_of_its_pipeline(stream, managing):
+    with managing(stream.status):
+        tracks = stream.runs()
+        with Publisher(HEALTH, tracks._endpoint, "detector") as health:
+            health.send(Health("detector", 0.0))
+            waiting = stream._pool.submit(wait_until_running, "fleet://cam-7", "", 60)
+            stream._until(waiting.done, health.serve_late_joiners)
+        assert str(waiting.result()) == stream.status.streams["cam-7"].endpoint
+
+
+@contextmanager
+def steered(endpoint, until):
+    """A detector that carries out each command; gives those that it received."""
+    received = []
+
+    def turn():
+        for command in responder.receive_all(0.01):
+            received.append(command.verb)
+            responder.answer(Answer(command.id, True, "done"))
+
+    with Responder[Command, Answer](CONTROL, endpoint) as responder:
+        yield lambda done: until(done, turn), received
+
+
+def test_each_command_goes_where_the_stream_runs(stream, managing, until):
+    with managing(stream.status), ThreadPoolExecutor(1) as pool:
+        places = [stream.runs()._endpoint]
+        with catstream.control("fleet://cam-7", timeout=60) as control:
+            with steered(places[0], until) as (serve, first):
+                serve(pool.submit(control.pause).done)
+            places.append(stream.runs()._endpoint)
+            with steered(places[1], until) as (serve, second):
+                serve(pool.submit(control.resume).done)
+        assert (first, second, control.source) == (["pause"], ["resume"], "walk.mp4")
+
+
+def test_a_client_of_the_fleet_may_do_at_each_stream_what_its_role_says_until_it_is_revoked(
+    stream, managing, fleet_keys, folder, tcp
+):
+    create(folder / "stream")
+    synchronise(folder / "stream", allowed(fleet_keys))
+    allow(fleet_keys, "carl", "watch", output=folder / "carl")  # the stream does not know him yet
+    anna, carl, server = str(folder / "anna"), str(folder / "carl"), public_key(folder / "stream")
+    with managing(stream.status, "", str(fleet_keys)):
+        pipeline = stream.runs(str(folder / "stream"), tcp, server=server)
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60, keys=anna) as tracks:
+            watched = stream.watched(tracks)
+            stream.send(pipeline, track(1), STOPPED)
+            with Responder[Command, Answer](CONTROL, pipeline._endpoint):
+                with (
+                    catstream.control("fleet://cam-7", timeout=60, keys=anna) as control,
+                    pytest.raises(ServiceError, match="does not let this key take part in control"),
+                ):
+                    control.stop()
+                with (
+                    catstream.subscribe("fleet://cam-7", "tracks", timeout=60, keys=carl) as rejected,
+                    pytest.raises(ServiceError, match="does not let this key take part in tracks"),
+                ):
+                    next(rejected)
+            revoke(fleet_keys, "anna")
+            synchronise(folder / "stream", allowed(fleet_keys))
+            stream.update(token=7)  # the pipeline was started again: she connects again
+            with pytest.raises(ServiceError, match="does not let this key take part"):
+                watched.result(60)
+
+
+class _Script:
+    """A registry whose answers a test decides; None if its manager is down."""
+
+    def __init__(self):
+        self.answer = self._status(0, "running")
+
+    @staticmethod
+    def _status(token, state):
+        endpoint = Endpoint.parse(f"run-{token}") if state == "running" else None
+        return Place(StreamStatus("cam-7", state, endpoint=str(endpoint or ""), token=token), endpoint)
+
+    def place(self, _):
+        return self.answer
+
+    def request(self, _):
+        pass
+
+    def receive(self, _):
+        return None if self.answer is None else ("site", self.answer)
+
+
+STEPS = st.lists(st.sampled_from(["move", "stop", "down", "end of the pipeline"]), max_size=20)
+
+
+@given(STEPS, st.sampled_from(["ended", "removed"]))
+def test_only_the_registry_ends_a_stream_whatever_its_pipelines_and_its_manager_do(steps, last):
+    registry, token = _Script(), 0
+    followed = FollowedStream(registry, "cam-7")
+    for step in steps:
+        if step == "end of the pipeline":
+            followed.pipeline_ended(STOPPED)
+        elif step == "move":
+            token += 1
+            registry.answer = _Script._status(token, "running")
+        else:
+            registry.answer = None if step == "down" else _Script._status(token, "moving")
+        moved = followed.has_moved()
+        assert moved == (step == "move")
+        assert (followed.end, followed.place.status.token) == (None, token)
+    registry.answer = _Script._status(token, last) if last == "ended" else None
+    if last == "removed":
+        registry.receive = lambda _: ("site", None)
+    assert not followed.has_moved()
+    assert followed.end is not None
