@@ -31,7 +31,6 @@ from starlette.types import Lifespan
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages import Answer
 from catstream.names import check_name
-from catstream.steering import Control
 from catstream.video.annotate import draw_preview
 from catstream.web import metrics
 from catstream.web.feed import Feed
@@ -191,9 +190,7 @@ def _command(body: bytes | None) -> _Command:
 
 def _execute(feed: Feed, command: _Command) -> Answer:
     """Send a command and wait for its answer."""
-    if feed.place is None:
-        raise SilenceError("no pipeline is connected: the command was not sent")
-    with Control(feed.place) as pipeline:
+    with feed.control() as pipeline:
         if command.box is not None:
             return pipeline.set_box(command.box, object=command.object, keep=command.keep)
         if command.verb == "forget":

@@ -11,6 +11,7 @@ from time import monotonic
 from catstream.errors import CatstreamError
 from catstream.messages import End
 from catstream.registry import locate
+from catstream.steering import Control
 from catstream.subscription import AnyMessage, Subscription
 from catstream.web.dashboard import SILENCE_SECONDS, Dashboard
 from catstream.web.viewers import Viewers
@@ -61,6 +62,10 @@ class Feed:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
+
+    def control(self) -> Control:
+        """Connect to the pipeline to send commands."""
+        return Control(self.place or self._endpoint, keys=self._keys)
 
     async def run(self) -> None:
         """Connect, and reconnect after each loss, until cancelled."""
