@@ -11,7 +11,8 @@ import pytest
 from click.testing import CliRunner, _NamedTextIOWrapper
 
 from catstream.cli import group
-from catstream.messages import Answer
+from catstream.messages import Answer, FleetStatus, StreamStatus
+from catstream.registry import RegistryServer
 from catstream.wire.channels import CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import meeting_place, private_folder
@@ -95,3 +96,42 @@ def test_a_pipeline_can_be_selected_by_its_source(pipeline, tmp_path, monkeypatc
     assert (walk, street) == (["pause"] * 3, ["stop"])
     assert "no pipeline of yours follows 'other.mp4'" in str(said("stop", "--source", "other.mp4").exception)
     assert said("stop", "--source", "walk.mp4", "--endpoint", tmp_path).exit_code == 2
+
+
+def test_a_stream_of_a_fleet_can_be_selected_by_its_name(pipeline):
+    place, heard = pipeline("/films/walk.mp4")
+    pipeline("/films/other.mp4")
+    stream = StreamStatus("cam-7", "running", source="/films/walk.mp4", endpoint=str(place), token=1)
+    site = FleetStatus("site", 0.0, {"cam-7": stream})
+    over = Event()
+
+    def serve():
+        while not over.is_set():
+            registry.turn(0.01)
+
+    with RegistryServer("", "", lambda: site) as registry, ThreadPoolExecutor(1) as pool:
+        serving = pool.submit(serve)
+        try:
+            for words in (["--stream", "cam-7"], ["--stream", "cam-7", "--fleet", "site"]):
+                result = said("pause", *words)
+                assert (result.exit_code, result.stderr) == (0, f"pipeline: /films/walk.mp4 at {place}\n")
+            assert said("resume", "--endpoint", "fleet://site/cam-7").exit_code == 0
+            assert heard == ["pause", "pause", "resume"]
+            assert "no stream 'cam-8': its streams are cam-7" in str(said("stop", "--stream", "cam-8").exception)
+        finally:
+            over.set()
+            serving.result(20)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--fleet", "site"], "give the name of its stream, too (--stream NAME)"),
+        (["--stream", "cam-7", "--endpoint", "run"], "give one"),
+        (["--stream", "cam-7", "--source", "walk.mp4"], "give one of them"),
+    ],
+)
+def test_a_pipeline_is_selected_in_one_way(words, reason):
+    result = said("stop", *words)
+    assert result.exit_code == 2
+    assert reason in result.stderr
