@@ -210,10 +210,8 @@ class Log:
             with contextlib.suppress(FileNotFoundError):  # removed by the holder since the log was listed
                 newest = self._undamaged(sorted(numbers, reverse=True))
                 head = newest[1] if newest else _EMPTY
-                is_state = head.kind == "state"
-                found = (
-                    newest if is_state else self._undamaged([old for old in reversed(head.states) if old in numbers])
-                )
+                before = [number for number in reversed(head.states) if number in numbers]
+                found = newest if head.kind == "state" else self._undamaged(before)
                 state = Generation(found[0], dict(found[1].files), dict(found[1].facts)) if found else None
                 return numbers, head, state
         raise self._busy("read")
@@ -299,9 +297,7 @@ class Claim:
             if not self._is_written(number):
                 return False
         valid = max(self._log.numbers()) == number if unsure else self._log.exists(self.token)
-        if not valid:
-            with contextlib.suppress(StoreError):
-                self._log.remove(number)  # the newer holder had removed the object of this number
+        if not valid:  # the object stays: a newer holder may continue from it
             raise self._fence("another process")
         self._advance(number, states)
         return True

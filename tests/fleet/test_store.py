@@ -94,10 +94,11 @@ def test_a_holder_is_fenced_although_the_claims_after_its_own_were_removed(store
     paused = store.claim("cam-7", "node-1")
     for turn in range(5):
         newest = store.claim("cam-7", f"node-{turn}")
-    with pytest.raises(FencedError):
-        paused.write(STATE, {})
     newest.write(STATE, {"frame": 1})
+    with pytest.raises(FencedError):
+        paused.write(STATE, {"frame": 2})
     assert store.newest("cam-7").facts == {"frame": 1}
+    assert store.claim("cam-7", "node-2").state.facts == {"frame": 1}
     assert len(numbers(store)) == 4  # three claims, one state
 
 
