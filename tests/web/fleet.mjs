@@ -35,9 +35,9 @@ try {
   await page.goto(url);
   await page.waitForSelector(".cards li", patience);
   await page.waitForSelector(".picture.loaded", patience);
+  await until(() => document.querySelector("#state").textContent.trim() === "1 in trouble");
   await page.evaluate(axe);
   say("all", await shown());
-  say("state", await page.locator("#state").innerText());
   say("nodes", await page.locator("#nodes tbody button").allInnerTexts());
   await check("all");
   await page.keyboard.press("/");

@@ -127,7 +127,7 @@ def test_metrics_are_documented_with_their_labels(fleet, page, until):
 def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams(
     fleet, manager, serve_fleet, until, monkeypatch
 ):
-    monkeypatch.setattr(fleet_feed, "_TIMEOUT_SECONDS", 0.2)
+    monkeypatch.setattr(fleet_feed, "_TIMEOUT_SECONDS", 1.0)
     fleet.stream("cam-7")
     page = serve_fleet()
     shown(page, until)

@@ -105,6 +105,13 @@ def test_the_page_loads_nothing_from_other_hosts_and_has_no_inline_script(page):
         "trees.js",
         "surprising.js",
         "svg.js",
+        "dom.js",
+        "fleet.css",
+        "fleet.js",
+        "streams.js",
+        "pictures.js",
+        "search.js",
+        "nodes.js",
     ],
 )
 def test_each_file_of_the_page_has_its_content_type(page, name):

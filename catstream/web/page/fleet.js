@@ -1,5 +1,6 @@
 // Passes updates of the server to the parts of the page of a fleet.
 
+import { write } from "./dom.js";
 import { Nodes } from "./nodes.js";
 import { Pictures } from "./pictures.js";
 import { Search } from "./search.js";
@@ -19,6 +20,7 @@ let silent = null; // time since which the server does not answer
 function showMatching() {
   const shown = streams.filter((card) => search.matches(card));
   const empty = fleet.phase === "running" && !streams.size;
+  $(".find").hidden = !streams.size;
   $(".none").textContent = empty ? "This fleet has no streams. Add some to its file, and apply it with “catstream fleet up”."
     : streams.size && !shown ? `No stream matches ${search.description}.` : "";
 }
@@ -57,10 +59,6 @@ function explanation() {
 function duration(seconds) {
   if (seconds < 120) return `${seconds} s`;
   return seconds < 7200 ? `${Math.floor(seconds / 60)} minutes` : `${Math.floor(seconds / 3600)} hours`;
-}
-
-function write(element, text) {
-  if (element.textContent !== text) element.textContent = text;
 }
 
 function take(parts) {

@@ -1,5 +1,7 @@
 // The table of the nodes: state, cores, labels, streams and trouble of each. The name of a node searches for its streams.
 
+import { add, arrange, write } from "./dom.js";
+
 const TONES = { alive: "present", dead: "absent" };
 const WIDE = matchMedia("(min-width: 75rem)");
 
@@ -10,6 +12,7 @@ export class Nodes {
     this.body = element.querySelector("tbody");
     this.summary = element.querySelector("summary span");
     this.details = element.querySelector("details");
+    this.table = element.querySelector(".scrolled");
     this.details.open = WIDE.matches;
     WIDE.addEventListener("change", () => (this.details.open = WIDE.matches));
   }
@@ -33,20 +36,13 @@ export class Nodes {
 
   add(name) {
     const element = document.createElement("tr");
-    const node = element.insertCell();
-    const button = Object.assign(document.createElement("button"), { type: "button", textContent: name, onclick: () => this.search(name) });
-    const state = Object.assign(document.createElement("span"), { className: "pill" });
-    state.append(Object.assign(document.createElement("span"), { ariaHidden: "true" }), document.createElement("b"));
-    const [labels, trouble] = ["quiet labels", "trouble"].map((className) => Object.assign(document.createElement("p"), { className }));
-    node.append(button, state, labels, trouble);
-    const cores = element.insertCell();
-    const used = document.createElement("span");
-    const share = Object.assign(document.createElement("span"), { className: "share" });
-    share.append(document.createElement("i"));
-    cores.append(used, share);
-    const streams = element.insertCell();
-    cores.className = streams.className = "number";
-    const item = { element, row: {}, name, button, state, labels, trouble, used, bar: share.firstChild, streams };
+    const [node, cores, streams] = ["node", "number", "number"].map((className) => add(element, "td", { className }));
+    const button = add(node, "button", { type: "button", textContent: name, onclick: () => this.search(name) });
+    const state = add(node, "span", { className: "pill" });
+    add(state, "span", { ariaHidden: "true" });
+    const item = { element, row: {}, name, button, state, streams, word: add(state, "b"),
+      labels: add(node, "p", { className: "quiet labels" }), trouble: add(node, "p", { className: "trouble" }),
+      used: add(cores, "span"), bar: add(add(cores, "span", { className: "share" }), "i") };
     this.items.set(name, item);
     return item;
   }
@@ -55,7 +51,7 @@ export class Nodes {
   sort() {
     const level = ({ row }) => (row.state === "dead" ? 2 : row.trouble ? 1 : 0);
     const items = [...this.items.values()].sort((one, other) => level(other) - level(one) || one.name.localeCompare(other.name, "en", { numeric: true }));
-    if (items.some(({ element }, place) => element !== this.body.children[place])) this.body.replaceChildren(...items.map((item) => item.element));
+    arrange(this.body, items.map((item) => item.element));
   }
 
   /** Show how many nodes are alive, and how many cores of all nodes are used. */
@@ -64,14 +60,15 @@ export class Nodes {
     const alive = rows.filter((row) => row.state !== "dead");
     const total = (field) => alive.reduce((sum, row) => sum + row[field], 0);
     const states = alive.length === rows.length ? `${rows.length}` : `${alive.length} of ${rows.length} alive`;
+    this.table.hidden = !rows.length;
     this.summary.textContent = rows.length ? `${states} · ${round(total("used"))} of ${round(total("cores"))} cores used` : "none";
   }
 }
 
-function fill({ element, row, button, state, labels, trouble, used, bar, streams }) {
+function fill({ element, row, button, state, word, labels, trouble, used, bar, streams }) {
   element.dataset.state = row.state;
   state.dataset.state = TONES[row.state] ?? row.state;
-  write(state.lastElementChild, row.state);
+  write(word, row.state);
   write(labels, row.labels.join(" · "));
   button.title = `Show the streams of this node${row.address && `, at ${row.address}`}`;
   write(trouble, row.trouble);
@@ -83,8 +80,4 @@ function fill({ element, row, button, state, labels, trouble, used, bar, streams
 
 function round(cores) {
   return String(Math.round(cores * 10) / 10);
-}
-
-function write(element, text) {
-  if (element.textContent !== text) element.textContent = text;
 }

@@ -1,5 +1,7 @@
 // The list of the objects: colour, name, state, score and model of each, one of them chosen, and a button that drops it.
 
+import { add, arrange, write } from "./dom.js";
+
 export class Objects {
   /** actions: choose(name) is called if another object is chosen; forget(name) if the button of an object is pressed. */
   constructor(element, actions) {
@@ -33,9 +35,7 @@ export class Objects {
     const items = new Map(list.map((one) => [one.name, this.items.get(one.name) ?? this.make(one.name)]));
     this.items = items;
     for (const one of list) this.fill(items.get(one.name), one);
-    const elements = [...items.values()].map((item) => item.element);
-    const shown = this.element.children;
-    if (elements.length !== shown.length || elements.some((element, place) => element !== shown[place])) this.element.replaceChildren(...elements);
+    arrange(this.element, [...items.values()].map((item) => item.element));
   }
 
   /** Choose an object, now or as soon as it is shown. */
@@ -49,11 +49,6 @@ export class Objects {
 
   make(name) {
     const element = document.createElement("li");
-    const add = (parent, tag, more) => {
-      const child = Object.assign(document.createElement(tag), more);
-      parent.append(child);
-      return child;
-    };
     const choose = add(element, "button", { type: "button", className: "choose", onclick: () => this.choose(name) });
     choose.setAttribute("aria-pressed", String(name === this.chosen));
     add(choose, "i", { className: "swatch" });
@@ -71,7 +66,6 @@ export class Objects {
     element.style.setProperty("--colour", one.colour);
     element.dataset.state = one.state;
     share.style.width = `${100 * Math.max(0, Math.min(1, one.score))}%`;
-    const write = (target, text) => target.textContent !== text && (target.textContent = text);
     write(state, one.state);
     write(model, `, model ${one.version}`);
     write(score, one.score.toFixed(2));

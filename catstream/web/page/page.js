@@ -146,7 +146,7 @@ function stateOfAll() {
 function showSource() {
   const source = status.source || "";
   const name = source.includes("://") ? source : source.split("/").filter(Boolean).at(-1) || source;
-  const shown = [stream, /^\d+$/.test(name) ? `camera ${name}` : name || status.endpoint].filter(Boolean).join(", ");
+  const shown = [stream, /^\d+$/.test(name) ? `camera ${name}` : name || (stream ? "" : status.endpoint)].filter(Boolean).join(", ");
   const skipped = status.skipped === null || status.skipped === undefined ? "" : `, ${status.skipped} frames skipped`;
   $("#source").textContent = shown ? `${shown}${skipped}` : "";
   $("#source").title = source && status.endpoint ? `${source}, followed by the pipeline at ${status.endpoint}` : "";

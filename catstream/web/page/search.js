@@ -1,5 +1,7 @@
 // The search field, and the buttons that select the streams in a state. Both are kept in the address of the page.
 
+import { arrange, write } from "./dom.js";
+
 const STATES = ["failed", "unplaced", "running", "waiting", "paused", "starting", "moving", "ended"];
 
 export class Search {
@@ -57,11 +59,10 @@ export class Search {
     const buttons = offered.map(([state, count]) => {
       const button = this.made.get(state) ?? this.make(state);
       const label = `${state === "" ? "all" : state === "trouble" ? "in trouble" : state} ${count}`;
-      if (button.textContent !== label) button.textContent = label;
+      write(button, label);
       return button;
     });
-    const shown = this.buttons.children;
-    if (buttons.length !== shown.length || buttons.some((button, place) => button !== shown[place])) this.buttons.replaceChildren(...buttons);
+    arrange(this.buttons, buttons);
   }
 
   make(state) {

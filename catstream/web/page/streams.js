@@ -1,5 +1,7 @@
 // The cards of the streams: picture, name, state, figures and trouble of each, with a link to its own page.
 
+import { add, write } from "./dom.js";
+
 const WORDS = { waiting: "waiting for a box" };
 const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping", failed: "absent", unplaced: "absent" };
 
@@ -53,17 +55,12 @@ export class Streams {
 
   add(name) {
     const element = document.createElement("li");
-    const picture = make(element, "div", "picture");
-    const image = make(picture, "img");
-    image.alt = "";
-    const title = make(element, "h3");
-    const link = make(title, "a");
-    link.href = `streams/${encodeURIComponent(name)}/`;
-    link.textContent = name;
-    const state = make(element, "p", "pill");
-    make(state, "span").setAttribute("aria-hidden", "true");
-    const item = { element, image, link, state, word: make(state, "b"), card: {}, lines: {} };
-    for (const line of ["trouble", "where", "models", "store"]) item.lines[line] = make(element, "p", line);
+    const image = add(add(element, "div", { className: "picture" }), "img", { alt: "" });
+    const link = add(add(element, "h3"), "a", { href: `streams/${encodeURIComponent(name)}/`, textContent: name });
+    const state = add(element, "p", { className: "pill" });
+    add(state, "span", { ariaHidden: "true" });
+    const item = { element, image, link, state, word: add(state, "b"), card: {}, lines: {} };
+    for (const className of ["trouble", "where", "models", "store"]) item.lines[className] = add(element, "p", { className });
     this.items.set(name, item);
     this.pictures.add(name, item);
     return item;
@@ -75,12 +72,6 @@ export class Streams {
     item.element.remove();
     this.items.delete(name);
   }
-}
-
-function make(parent, tag, className = "") {
-  const child = Object.assign(document.createElement(tag), { className });
-  parent.append(child);
-  return child;
 }
 
 function fill({ element, link, state, word, card, lines }) {
@@ -113,8 +104,4 @@ function stored(limit) {
   if (limit === null) return "nothing stored";
   if (limit <= 60) return `stored < ${limit} s ago`;
   return limit < 7200 ? `stored ${limit / 60 - 1} min ago` : `stored ${Math.floor(limit / 3600)} h ago`;
-}
-
-function write(element, text) {
-  if (element.textContent !== text) element.textContent = text;
 }

@@ -1,5 +1,7 @@
 // The frames with the largest surprise, each cropped around the box of its object.
 
+import { arrange } from "./dom.js";
+
 const AROUND = 2.6; // width of a picture in box widths
 const [WIDTH, HEIGHT] = [304, 205];
 
@@ -26,9 +28,7 @@ export class SurprisingFrames {
       now.set(id, item);
     }
     this.items = now;
-    const items = [...now.values()].map((item) => item.element);
-    const shown = [...this.element.children];
-    if (items.length !== shown.length || items.some((item, index) => item !== shown[index])) this.element.replaceChildren(...items);
+    arrange(this.element, [...now.values()].map((item) => item.element));
   }
 
   make(frame) {
