@@ -3,7 +3,7 @@
 /                           the page of the fleet
 /events                     updates of this page as server-sent events
 /streams/NAME/              the page of a stream, with all paths of `catstream.web.app`
-/streams/NAME/picture.jpg   a small picture of its newest frame
+/streams/NAME/picture.jpg   a small picture of its newest frame; 204 if there is none
 /metrics                    metrics of all streams and nodes for Prometheus
 /healthz                    200 while this server runs
 /readyz                     200 while the fleet answers
@@ -47,21 +47,21 @@ class _Pages:
         return self._feed.viewers.events(self._feed.dashboard.updates)
 
     async def picture(self, request: Request) -> Response:
-        stream = self._feed.stream(request.path_params["name"])
+        name = request.path_params["name"]
+        if (stream := self._feed.stream(name)) is None:
+            return _unknown(name)
         try:
-            jpeg = await self._pictures.get(stream) if stream is not None else None
+            jpeg = await self._pictures.get(stream)
         except CatstreamError as error:
             return PlainTextResponse(f"{error}\n", 503)
-        if jpeg is None:
-            return PlainTextResponse("there is no picture of this stream yet\n", 404)
-        return Response(jpeg, media_type="image/jpeg")
+        return Response(status_code=204) if jpeg is None else Response(jpeg, media_type="image/jpeg")
 
     async def stream(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on to the page of a stream."""
         name = scope["path_params"]["name"]
         app: ASGIApp
         if self._feed.stream(name) is None:
-            app = PlainTextResponse(f"this fleet has no stream {name!r}\n", 404)
+            app = _unknown(name)
         else:
             app = self._streams.open(name) or PlainTextResponse("too many pages of streams are open already\n", 503)
         await app(scope, receive, send)
@@ -76,6 +76,10 @@ class _Pages:
         if self._feed.dashboard.phase == "running":
             return PlainTextResponse("ok\n")
         return PlainTextResponse("the fleet does not answer\n", 503)  # the reason has its address, and needs the token
+
+
+def _unknown(name: str) -> Response:
+    return PlainTextResponse(f"this fleet has no stream {name!r}\n", 404)
 
 
 def fleet_site(fleet: str = "", keys: str = "") -> Site:

@@ -68,7 +68,7 @@ try {
   await page.evaluate(axe);
   say("silent", await page.locator("#message").innerText());
   await check("silent");
-  say("errors", wrong);
+  say("errors", wrong.filter((text) => !/404/.test(text))); // a picture may be gone when it is asked for
 } finally {
   await browser.close();
 }

@@ -40,7 +40,7 @@ export class Pictures {
     this.pending += 1;
     try {
       const response = await fetch(`streams/${encodeURIComponent(item.name)}/picture.jpg`);
-      if (!response.ok) return;
+      if (response.status !== 200) return; // there is none yet
       const before = item.image.src;
       item.image.src = URL.createObjectURL(await response.blob());
       await item.image.decode();
