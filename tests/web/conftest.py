@@ -87,10 +87,11 @@ def serve(folder):
 
 
 class Fleet:
-    """A fleet of made-up streams and nodes, which a test changes by their names."""
+    """A fleet of made-up streams and nodes, which a test changes by their names; without keys on this machine."""
 
     def __init__(self):
-        self.name = f"fleet-{uuid4().hex[:12]}"
+        self.name = self.address = f"fleet-{uuid4().hex[:12]}"
+        self.listen = self.keys = self.keys_of_client = ""
         self.streams, self.nodes = {}, {}
 
     def stream(self, name, state="running", **more):
@@ -114,7 +115,7 @@ def manager(fleet):
     over = Event()
 
     def serve():
-        with RegistryServer("", "", fleet.status) as server:
+        with RegistryServer(fleet.listen, fleet.keys, fleet.status) as server:
             begun.set()
             while not over.is_set():
                 server.turn(0.01)
@@ -134,7 +135,7 @@ def serve_fleet(fleet, manager):  # noqa: ARG001  # it answers
     with ExitStack() as stack:
 
         def start(**options):
-            server = Server(fleet_site(fleet.name), port=0, **options)
+            server = Server(fleet_site(fleet.address, fleet.keys_of_client), port=0, **options)
             stack.enter_context(server.in_background())
             return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
 
@@ -142,21 +143,29 @@ def serve_fleet(fleet, manager):  # noqa: ARG001  # it answers
 
 
 @pytest.fixture
-def camera(folder, rng):
-    """A pipeline that sends the pictures of its frames; one turn of it."""
+def camera_at(rng):
+    """Makes pipelines that send pictures of frames: a function that is one turn of it."""
     image = cv2.imencode(".jpg", rng.integers(0, 255, (360, 640, 3), np.uint8))[1].tobytes()
     boxes, frame = {"anna": Box(4.0, 3.0, 200.0, 100.0)}, iter(range(1 << 30))
     with ExitStack() as stack:
-        publishers = [
-            stack.enter_context(Publisher(PREVIEWS, Endpoint.parse(str(folder)))),
-            stack.enter_context(Publisher(HEALTH, Endpoint.parse(str(folder)), "detector")),
-        ]
 
-        def turn():
-            number = next(frame)
-            publishers[0].send(Preview(number, 1280, 720, boxes, image))
-            publishers[1].send(Health("detector", 1.0, {"sent": float(number)}, source="walk.mp4"))
-            for publisher in publishers:
-                publisher.serve_late_joiners()
+        def make(endpoint, source="walk.mp4"):
+            pictures = stack.enter_context(Publisher(PREVIEWS, endpoint))
+            health = stack.enter_context(Publisher(HEALTH, endpoint, "detector"))
 
-        yield turn
+            def turn():
+                number = next(frame)
+                pictures.send(Preview(number, 1280, 720, boxes, image))
+                health.send(Health("detector", 1.0, {"sent": float(number)}, source=source))
+                for publisher in (pictures, health):
+                    publisher.serve_late_joiners()
+
+            return turn
+
+        yield make
+
+
+@pytest.fixture
+def camera(camera_at, folder):
+    """One turn of a pipeline in `folder` that sends pictures."""
+    return camera_at(Endpoint.parse(str(folder)))

@@ -17,6 +17,8 @@ from catstream.cli.fleet_view import view
 from catstream.web import fleet_feed, fleet_pictures, fleet_streams
 from catstream.web.feed import Feed
 from catstream.web.fleet_streams import StreamPages
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.keys import allow, allowed, create, public_key, synchronise
 
 TOKEN = "correct-horse-battery"
 PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events", "/streams/cam-7/picture.jpg"]
@@ -39,6 +41,24 @@ def first_update(page, path="/events"):
 def shown(page, until):
     """The first update of a page once the registry has answered."""
     return until(lambda: (told := first_update(page)).get("order") and told)
+
+
+def source(page):
+    """The source that the page of the stream shows."""
+    return first_update(page, "/streams/cam-7/events").get("status", {}).get("source")
+
+
+@pytest.fixture
+def keyed(fleet, folder, tcp):
+    """Gives the fleet keys and a port, a client, and a stream with keys of its own, of which this is the folder."""
+    keys, stream = folder / "keys", folder / "stream"
+    create(keys)
+    create(stream)
+    allow(keys, "anna", "watch", output=folder / "anna")
+    synchronise(stream, allowed(keys))
+    fleet.listen, fleet.address = tcp, tcp.removeprefix("tcp://")
+    fleet.keys, fleet.keys_of_client = str(keys), str(folder / "anna")
+    return stream
 
 
 def asked(page, path, turn):
@@ -109,8 +129,29 @@ def test_the_page_of_a_stream_is_below_that_of_the_fleet(fleet, page, camera, fo
     assert index.url.path == "/streams/cam-7/"
     for file in re.findall(r'(?:src|href)="(page/[^"]+)"', index.text):
         assert page.get(f"/streams/cam-7/{file}").status_code == 200
-    until(lambda: first_update(page, "/streams/cam-7/events").get("status", {}).get("source") == "walk.mp4", camera)
+    until(lambda: source(page) == "walk.mp4", camera)
     assert page.get("/streams/cam-8/").status_code == 404
+
+
+def test_the_page_of_a_stream_follows_it_to_another_node(fleet, page, camera_at, folder, until, monkeypatch):
+    monkeypatch.setattr("catstream.web.feed.SILENCE_SECONDS", 1.0)
+    for node in ("north", "south"):
+        (folder / node).mkdir()
+        fleet.stream("cam-7", node=node, endpoint=str(folder / node))
+        turn = camera_at(Endpoint.parse(str(folder / node)), source=f"walk.mp4 at {node}")
+        shown(page, until)
+        until(lambda node=node: source(page) == f"walk.mp4 at {node}", turn)
+
+
+def test_a_stream_with_a_key_of_its_own_is_shown_with_the_keys_of_the_client(
+    fleet, keyed, serve_fleet, camera_at, until
+):
+    endpoint = Endpoint.parse(fleet.listen, str(keyed))
+    fleet.stream("cam-7", endpoint=fleet.listen, server=public_key(keyed))
+    page, turn = serve_fleet(), camera_at(endpoint)
+    shown(page, until)
+    assert asked(page, "/streams/cam-7/picture.jpg", turn).headers["content-type"] == "image/jpeg"
+    until(lambda: source(page) == "walk.mp4", turn)
 
 
 def test_metrics_are_documented_with_their_labels(fleet, page, until):
