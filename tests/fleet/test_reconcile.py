@@ -287,12 +287,35 @@ def test_an_overloaded_node_gives_its_smallest_stream_away_and_no_other_one_for_
     assert fleet.turn(10.0) == ["b"]
 
 
+def test_an_overloaded_node_keeps_its_only_stream():
+    fleet = Fleet(Node("n1", 1.0), a=Desired("1", 1.0))
+    fleet.turn()
+    fleet.nodes = {"n1": Node("n1", 1.0, overloaded=True), "n2": Node("n2", 4.0)}
+    assert fleet.turn() == []
+
+
+def test_a_removed_stream_occupies_its_cores_until_it_is_gone():
+    fleet = Fleet(Node("n1", 1.0), b=Desired("1", 1.0))
+    fleet.actors["a"] = Actor("n1", "1", "stopping", 0.0, cores=1.0)
+    assert fleet.turn() == []
+    del fleet.actors["a"]
+    assert fleet.turn() == ["n1"]
+
+
+def test_a_pin_ends_if_the_source_cannot_be_opened_there():
+    fleet = Fleet(Node("n1", 1.0), Node("n2", 2.0), a=Desired("1", 1.0, pinned="n2"))
+    fleet.unopenable = {"n2"}
+    assert fleet.turn() == ["n2"]
+    assert fleet.plan(0.5).unpinned == ["a"]
+
+
 def test_a_stream_that_ended_is_started_again_only_if_it_is_changed():
     fleet = Fleet(Node("n1", 2.0), Node("n2", 2.0), a=Desired("1", 1.0))
     fleet.turn()
     fleet.actors["a"] = replace(fleet.actors["a"], phase="ended")
     assert fleet.turn() == []
     fleet.change_node("n1", alive=False)
+    fleet.actors.clear()
     assert fleet.turn() == []
     fleet.change("a", digest="2")
     assert fleet.turn() == ["n2"]
