@@ -286,3 +286,15 @@ def test_after_a_claim_no_older_holder_adds_a_state_and_nothing_acknowledged_is_
         Fencing,
         settings=settings(max_examples=60, stateful_step_count=20, deadline=None),
     )
+
+
+def test_a_fenced_holder_does_not_remove_the_state_that_a_newer_one_continues_from(monkeypatch):
+    """It was paused between the creation of a state and the check of its claim."""
+    monkeypatch.setattr(log, "_CLAIMS", 1)
+    history = Fencing()
+    history.there_is_a_holder()
+    history.pause(0, "write", "exists", 0)
+    history.act(1, "claim", "done")
+    history.resume(0, "done")
+    assert isinstance(history.processes[0].result, FencedError)
+    history.the_newest_state_has_all_durable_writes_and_continues_the_newest_claim()
