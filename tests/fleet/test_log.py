@@ -298,3 +298,14 @@ def test_a_fenced_holder_does_not_remove_the_state_that_a_newer_one_continues_fr
     history.resume(0, "done")
     assert isinstance(history.processes[0].result, FencedError)
     history.the_newest_state_has_all_durable_writes_and_continues_the_newest_claim()
+
+
+def test_a_repeated_write_is_fenced_although_its_number_is_free_again():
+    """The answer to the first write was lost; a newer holder continued from it, and removed it later."""
+    history = Fencing()
+    history.there_is_a_holder()
+    history.act(0, "write", "lost")
+    history.claim_and_write(1)
+    history.write(1, 2)
+    history.write(0, 1)
+    assert isinstance(history.processes[0].result, FencedError)
