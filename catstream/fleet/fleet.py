@@ -30,7 +30,7 @@ from catstream.messages import FleetStatus
 
 __all__ = ["Fleet"]
 
-_ANSWER_SECONDS = 60.0  # limit for the manager to answer, and to start before that
+_ANSWER_SECONDS = (20.0, 60.0)  # limits for the manager to answer, and to start before that
 _DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
 _TURN_SECONDS = 0.2
 
@@ -196,28 +196,35 @@ class Fleet:
         else:
             connect(self._address, self._token_file)
 
-    def _ask(self, method: str, *arguments: object, seconds: float = _ANSWER_SECONDS, **options: object) -> Any:
-        """Call a method of the manager, and wait for its answer."""
-        if self._manager is None:
-            self._connect()
-        import ray
+    def _ask(self, method: str, *arguments: object, **options: object) -> Any:
+        """Call a method of the manager, and wait for its answer. A head that has started again is connected to again."""
         from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 
-        try:
-            if self._manager is None:
+        why = ""
+        for seconds in _ANSWER_SECONDS:
+            try:
+                return self._call(method, seconds, *arguments, **options)
+            except RayTaskError as error:
+                if isinstance(error.cause, CatstreamError):
+                    raise error.cause from None
+                raise
+            except (RayError, GetTimeoutError) as error:
+                why = str(error).partition("\n")[0] or type(error).__name__
+                self.close()
+        raise FleetError(f"the manager of {self.name} does not answer ({why}): is its head running?")
+
+    def _call(self, method: str, seconds: float, *arguments: object, **options: object) -> Any:
+        import ray
+
+        if self._manager is None:
+            self._connect()
+            try:
                 self._manager = ray.get_actor(actor_name(self.name, "manager"), namespace=NAMESPACE)
-            return ray.get(getattr(self._manager, method).remote(*arguments, **options), timeout=seconds)
-        except RayTaskError as error:
-            if isinstance(error.cause, CatstreamError):
-                raise error.cause from None
-            raise
-        except ValueError:
-            raise FleetError(
-                f"there is no fleet {self.name!r} on this cluster: start it with catstream fleet up"
-            ) from None
-        except (RayError, GetTimeoutError) as error:
-            why = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise FleetError(f"the manager of {self.name} does not answer ({why}): is its head running?") from None
+            except ValueError:
+                raise FleetError(
+                    f"there is no fleet {self.name!r} on this cluster: start it with catstream fleet up"
+                ) from None
+        return ray.get(getattr(self._manager, method).remote(*arguments, **options), timeout=seconds)
 
 
 def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:
