@@ -309,3 +309,12 @@ def test_a_repeated_write_is_fenced_although_its_number_is_free_again():
     history.write(1, 2)
     history.write(0, 1)
     assert isinstance(history.processes[0].result, FencedError)
+
+
+def test_a_failed_write_leaves_no_number_free_for_a_later_claim():
+    history = Fencing()
+    history.there_is_a_holder()
+    history.act(0, "write", "failed")
+    history.act(1, "claim", "done")
+    history.write(0, 1)
+    assert isinstance(history.processes[0].result, FencedError)
