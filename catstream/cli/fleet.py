@@ -23,7 +23,7 @@ from catstream.registry import Registry
 __all__ = ["fleet"]
 
 #: Subcommand -> module that holds it, where it is not this one; the module is imported when it is called.
-_ELSEWHERE = {"head": "fleet_nodes", "node": "fleet_nodes", "view": "fleet_view"}
+_ELSEWHERE = {"head": "fleet_nodes", "node": "fleet_nodes", "view": "fleet_view", "merge": "fleet_merge"}
 
 _SUMMARIES = {
     "up": "Start the streams of a file, or apply its changes.",
@@ -34,6 +34,7 @@ _SUMMARIES = {
     "move": "Move a stream to a node.",
     "drain": "Give all streams of a node away.",
     "logs": "Print what a stream has logged.",
+    "merge": "Merge what several streams have learned of an object.",
     "down": "Stop all streams, and end the fleet.",
     "head": "Keep the head of a cluster running on this machine.",
     "node": "Keep a node of a cluster running on this machine.",

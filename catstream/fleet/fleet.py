@@ -24,9 +24,11 @@ from catstream.extras import require_extra
 from catstream.fleet.cluster import HEAD_RESOURCE, NAMESPACE, connect, disconnect
 from catstream.fleet.local import LocalFleet
 from catstream.fleet.manager import Manager, actor_name
+from catstream.fleet.merge import Merged, merge_streams
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.learned import Learned
 from catstream.messages import FleetStatus
+from catstream.names import UNNAMED, check_name
 
 __all__ = ["Fleet"]
 
@@ -145,6 +147,22 @@ class Fleet:
         """The last lines that a stream logged on its node."""
         answer: list[str] = self._ask("logs", name, lines)
         return answer
+
+    def merge(self, *names: str, object: str = UNNAMED) -> Merged:
+        """Merge what streams have learned of an object; the streams that follow it then search for it by the result.
+
+        Parameters
+        ----------
+        names : str
+            The streams; by default all that have learned of the object.
+        object : str
+            Name of the object; "" also means the only object of each stream.
+        """
+        spec = FleetSpec.from_json(self._ask("spec"))
+        for name in names:
+            if name not in spec.streams:
+                raise FleetError(f"there is no stream {name!r}: the streams are {', '.join(spec.streams) or 'none'}")
+        return merge_streams(spec.store, names or spec.streams, check_name(object), named=bool(names))
 
     def down(self) -> None:
         """Stop all streams after their state was stored, and the manager; on this machine alone, the nodes too."""

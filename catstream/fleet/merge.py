@@ -1,0 +1,199 @@
+"""Merges what the streams of a fleet have learned of one object: a reduction of saved models in pairs, as Ray tasks.
+
+Frames are counted once. A saved model contains the origins of its trees, one for each stream of frames; a model that
+shares an origin with another one has learned from the same frames, so only one of them is merged. Merging again, or in
+another order, therefore changes nothing. The order of the pairs changes the merged trees only
+within the bound of the coreset: see `catstream.learned.merge`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from catstream import state
+from catstream.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError
+from catstream.fleet.store import Store
+from catstream.job import Job
+from catstream.learned import Learned, merge
+
+__all__ = ["Merged", "Part", "apart", "merge_in_pairs", "merge_models", "merge_streams", "saved_part"]
+
+Model = TypeVar("Model")
+
+#: The last merged model, among the names of the streams.
+_EARLIER = "the last merge"
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What decides whether a saved model is merged.
+
+    origins  of its trees, one for each stream of frames that they contain
+    rows     training rows that were inserted into its trees
+    """
+
+    origins: frozenset[str]
+    rows: int
+
+    @classmethod
+    def of(cls, learned: Learned) -> Part:
+        """The part of a saved model."""
+        return cls(frozenset(learned.origins), sum(tree.rows_seen for tree in learned.trees.values()))
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """A merged model, which is in the store.
+
+    model    the content of its file
+    streams  that it was merged from; the last merged model may be among them
+    left     streams whose frames are in one of those already, or that share frames with one of those
+    """
+
+    model: bytes
+    streams: tuple[str, ...]
+    left: tuple[str, ...]
+
+
+def apart(parts: Mapping[str, Part]) -> list[str]:
+    """Return the names of parts that share no origin, with as many origins as possible, and then as many rows.
+
+    Two choices are compared: the parts with the most origins first, as a merged model has them, and those with the
+    fewest first. So newer states of the streams take the place of an earlier merge, unless that has seen a stream more.
+
+    Examples
+    --------
+    >>> door, yard, both = Part(frozenset("a"), 90), Part(frozenset("b"), 20), Part(frozenset("ab"), 70)
+    >>> apart({"door": door, "yard": yard, "both": both})
+    ['door', 'yard']
+    >>> apart({"door": door, "both": both})
+    ['both']
+    """
+    choices = []
+    for sign in (-1, 1):  # first the parts with the most origins, which a merged model has, then those with the fewest
+        order = sorted(
+            parts.items(), key=lambda item: (sign * len(item[1].origins), -item[1].rows, sorted(item[1].origins))
+        )
+        choices.append(_disjoint(parts, [name for name, _ in order]))
+    return max(choices, key=lambda names: _seen(parts, names))
+
+
+def _disjoint(parts: Mapping[str, Part], order: Iterable[str]) -> list[str]:
+    """The names of parts of which each shares no origin with those before it."""
+    chosen: list[str] = []
+    for name in order:
+        if not any(parts[name].origins & parts[other].origins for other in chosen):
+            chosen.append(name)
+    return chosen
+
+
+def _seen(parts: Mapping[str, Part], names: Iterable[str]) -> tuple[int, int]:
+    """Number of origins and of rows of several parts."""
+    return sum(len(parts[name].origins) for name in names), sum(parts[name].rows for name in names)
+
+
+def merge_in_pairs(models: Sequence[Model], join: Callable[[Model, Model], Model]) -> Model:
+    """Merge models two by two until one is left, in as few rounds as possible.
+
+    Examples
+    --------
+    >>> merge_in_pairs(["a", "b", "c", "d", "e"], lambda one, other: f"({one}{other})")
+    '(((ab)(cd))e)'
+    """
+    while len(models) > 1:
+        pairs = [join(one, other) for one, other in zip(models[::2], models[1::2], strict=False)]
+        models = [*pairs, *models[len(models) - len(models) % 2 :]]
+    return models[0]
+
+
+def merge_models(models: Iterable[bytes]) -> bytes:
+    """Merge saved models of one object in this process; frames that several of them contain are counted once.
+
+    Raises
+    ------
+    FleetError
+        If there is none.
+    SettingsError
+        If their settings or the names of their objects differ.
+    """
+    read = {str(number): model for number, model in enumerate(models)}
+    if not read:
+        raise FleetError("there is no saved model to merge: give at least one")
+    parts = {name: Part.of(Learned.from_bytes(model, "a saved model")) for name, model in read.items()}
+    return merge_in_pairs([read[name] for name in apart(parts)], _joined)
+
+
+def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -> Merged:
+    """Merge the newest states of streams as tasks of the connected cluster, and store the model if it is a new one.
+
+    Parameters
+    ----------
+    url : of the store
+    streams : their names
+    name : the object
+    named : whether each stream has to know the object. Otherwise the streams that do not are left out, and the last
+        merged model is merged too, because its streams may have been removed
+
+    Raises
+    ------
+    FleetError
+        If a stream does not know the object, or none does.
+    SettingsError
+        If the settings of two streams differ.
+    StoreError
+        If the store cannot be reached.
+    """
+    import ray
+    from ray.exceptions import RayTaskError
+
+    remote: Any = ray.remote
+    load, join = remote(num_returns=2)(saved_part), remote(_joined)
+    refs: dict[str, Any] = {stream: load.remote(url, stream, name, named=named) for stream in streams}
+    store = Store(url)
+    earlier = before.files["model"] if (before := store.get_model(name)) is not None else None
+    if earlier is not None and not named:
+        refs[_EARLIER] = ray.put(Part.of(Learned.from_bytes(earlier, _EARLIER))), ray.put(earlier)
+    try:
+        found = {stream: ray.get(part) for stream, (part, _) in refs.items()}
+        parts = {stream: part for stream, part in found.items() if part is not None}
+        if not parts:
+            raise FleetError(f"no stream has learned of {name or 'the object'!r} yet: see catstream fleet status")
+        chosen = apart(parts)
+        merged: bytes = ray.get(merge_in_pairs([refs[stream][1] for stream in chosen], join.remote))
+    except RayTaskError as error:
+        raise (error.cause if isinstance(error.cause, CatstreamError) else error) from None
+    if merged != earlier:  # the streams that follow the object get each new model
+        store.put_model(name, merged, {"streams": chosen})
+    return Merged(merged, tuple(chosen), tuple(stream for stream in parts if stream not in chosen))
+
+
+def saved_part(url: str, stream: str, name: str, *, named: bool) -> tuple[Part, bytes] | tuple[None, None]:
+    """Return what the newest state of a stream in the store has learned of an object; None twice if it has nothing.
+
+    Raises
+    ------
+    FleetError
+        If it has nothing, although the stream was `named`.
+    """
+    try:
+        if (newest := Store(url).newest(stream)) is None:
+            raise FleetError("there is no state of it in the store yet")
+        with tempfile.TemporaryDirectory(prefix="catstream-merge-") as folder:
+            state.restore(Path(folder), newest.files)
+            learned = state.learned(Path(folder), Job.load(Path(folder)).settings, name)
+    except StoreError:
+        raise
+    except (ObjectError, ServiceError) as error:
+        if named:
+            raise FleetError(f"stream {stream}: {error}") from None
+        return None, None
+    return Part.of(learned), learned.to_bytes()
+
+
+def _joined(one: bytes, other: bytes) -> bytes:
+    """Two saved models merged."""
+    return merge([Learned.from_bytes(model, "the saved model of a stream") for model in (one, other)]).to_bytes()

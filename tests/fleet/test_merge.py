@@ -1,0 +1,162 @@
+"""Merging the saved models of streams: each frame counts once, in any order, within the bound of the coreset."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from catstream.box import Box, Window
+from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
+from catstream.compression.reduce import energy
+from catstream.errors import FleetError
+from catstream.features.layout import row_length
+from catstream.fleet.merge import Part, apart, merge_in_pairs, merge_models, saved_part
+from catstream.fleet.store import Store
+from catstream.heads import APPEARANCE, EXTENT
+from catstream.job import Job
+from catstream.learned import Learned, merge
+from catstream.messages import DetectorState, Features, ObjectFeatures, TrainingRows
+from catstream.settings import Settings
+from catstream.state import files
+
+SETTINGS = Settings(coreset={"size": 4})
+BOX = Box(1.0, 2.0, 30.0, 40.0)
+WINDOW = Window(0.0, 0.0, 40.0, 50.0)
+
+parts = st.dictionaries(
+    st.text("abcdef", min_size=1), st.builds(Part, st.frozensets(st.integers(0, 5), min_size=1), st.integers(0, 9))
+)
+
+
+def stream(seed, frames=12):
+    """The features of an object in some frames: rows of the object around 1, and of a background around -1."""
+    rng = np.random.default_rng(seed)
+    labels = np.repeat(np.float32([1, 0]), 4)
+    for _ in range(frames):
+        rows = rng.normal(scale=0.2, size=(8, row_length())).astype(np.float32) + np.where(labels[:, None], 1, -1)
+        training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
+        yield ObjectFeatures(BOX, training, DetectorState(0, "confident", WINDOW, WINDOW, WINDOW))
+
+
+def learned(seed, frames=12, before=None):
+    compressor = Compressor(SETTINGS, "anna") if before is None else before.compressor(SETTINGS, "anna")
+    for frame, features in enumerate(stream(seed, frames)):
+        compressor.take(frame, features, compressor.version + 1)
+    return Learned.of(compressor, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def models():
+    """What five streams have learned."""
+    return [learned(seed, frames=8 + seed) for seed in range(5)]
+
+
+@given(parts)
+def test_the_parts_that_are_merged_share_no_frames_and_no_other_one_could_be_added(given_parts):
+    chosen = apart(given_parts)
+    origins = [given_parts[name].origins for name in chosen]
+    together = frozenset().union(*origins)
+    assert len(together) == sum(map(len, origins))
+    assert all(each.origins & together for each in given_parts.values())
+
+
+@given(parts, st.randoms())
+def test_the_choice_does_not_depend_on_the_order_and_repeats_itself(given_parts, random):
+    shuffled = list(given_parts)
+    random.shuffle(shuffled)
+    chosen = apart(given_parts)
+    assert [given_parts[name] for name in apart({name: given_parts[name] for name in shuffled})] == [
+        given_parts[name] for name in chosen
+    ]
+    origins = frozenset().union(*(given_parts[name].origins for name in chosen))
+    merged = Part(origins, sum(given_parts[name].rows for name in chosen))
+    if chosen:
+        assert apart(given_parts | {"merged": merged}) == ["merged"]
+
+
+@given(st.integers(1, 300))
+def test_pairs_are_merged_in_as_few_rounds_as_possible_each_model_once(count):
+    depth, numbers = merge_in_pairs(
+        [(0, [number]) for number in range(count)], lambda one, other: (max(one[0], other[0]) + 1, one[1] + other[1])
+    )
+    assert numbers == list(range(count))
+    assert depth == (count - 1).bit_length()
+
+
+def coreset(tree):
+    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
+
+
+@settings(max_examples=10)
+@given(seeds=st.lists(st.integers(0, 4), min_size=2, max_size=5, unique=True), seed=st.integers(0, 99))
+def test_merged_in_pairs_the_trees_keep_the_frames_of_all_within_the_bound_as_merged_at_once(models, seeds, seed):
+    chosen = [models[number] for number in seeds]
+    pairs = Learned.from_bytes(merge_models([model.to_bytes() for model in chosen]), "merged")
+    once = merge(chosen)
+    assert set(pairs.origins) == set(once.origins)
+    basis = np.linalg.qr(np.random.default_rng(seed).normal(size=(row_length(), 3)))[0].astype(np.float32)
+    rows = [each.training[APPEARANCE].rows[:4] for s in seeds for each in stream(s, 8 + s)]
+    truth = energy(np.vstack(rows) @ basis)
+    for tree in (pairs.trees["object"], once.trees["object"]):
+        assert tree.rows_seen == sum(map(len, rows))
+        kept, slack = energy(coreset(tree) @ basis), 1e-5 * truth
+        assert truth - tree.dropped_energy - slack <= kept <= truth + slack
+
+
+def test_merging_again_or_with_what_was_merged_before_changes_nothing(models):
+    data = [model.to_bytes() for model in models[:3]]
+    whole = merge_models(data)
+    assert merge_models([*data, whole]) == merge_models([whole]) == merge_models([whole, whole]) == whole
+    assert merge_models([*data, data[1]]) == merge_models(data[::-1]) == whole
+
+
+def test_of_two_states_of_one_stream_the_later_one_counts_and_so_does_one_that_continued():
+    early, late, other = learned(7, 6), learned(7, 12), learned(8)
+    assert Learned.from_bytes(merge_models([early.to_bytes(), late.to_bytes()]), "").origins == late.origins
+    both = learned(9, before=early)
+    found = Learned.from_bytes(merge_models([late.to_bytes(), both.to_bytes(), other.to_bytes()]), "")
+    assert set(found.origins) == {*both.origins, *other.origins}
+    with pytest.raises(FleetError, match="no saved model to merge"):
+        merge_models([])
+
+
+def test_newer_states_of_the_streams_take_the_place_of_what_was_merged_before():
+    before = merge_models([learned(seed, 6).to_bytes() for seed in (1, 2)])
+    newer = [learned(seed, 12) for seed in (1, 2)]
+    again = Learned.from_bytes(merge_models([before, *(each.to_bytes() for each in newer)]), "")
+    assert Part.of(again) == Part.of(merge(newer))
+
+
+@pytest.fixture
+def store(tmp_path):
+    """A store with a state of the stream door, which knows anna."""
+    folder = tmp_path / "state"
+    (folder / "trees").mkdir(parents=True)
+    Job("door.mp4", settings=SETTINGS).save(folder)
+    forest = Forest(SETTINGS)
+    for frame, features in enumerate(stream(3)):
+        forest.take(Features(frame + 1, frame, 0.0, {"anna": features}))
+    CheckpointStore(folder / "trees").save(forest)
+    (tmp_path / "store").mkdir()
+    url = (tmp_path / "store").as_uri()
+    Store(url).claim("door", "here").write(files(folder), {})
+    return url
+
+
+def test_the_part_of_a_stream_is_what_its_newest_state_has_learned(store):
+    part, data = saved_part(store, "door", "anna", named=True)
+    assert Learned.from_bytes(data, "").origins == learned(3).origins
+    assert part == Part.of(learned(3))
+    assert (
+        saved_part(store, "door", "ben", named=False) == saved_part(store, "yard", "anna", named=False) == (None, None)
+    )
+    for stream_name, name, why in [
+        ("door", "ben", "stream door: there is no object 'ben'"),
+        ("yard", "anna", "stream yard: there is no state of it in the store yet"),
+    ]:
+        with pytest.raises(FleetError, match=why):
+            saved_part(store, stream_name, name, named=True)
