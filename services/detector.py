@@ -130,10 +130,11 @@ class DetectorLoop:
 
     def resume(self) -> None:
         """Continue after the last message that all receivers have stored."""
-        kalman.prepare()  # while the others answer
         models: dict[str, Model] = {}
         commands = self._commands
         positions = [self._position(sender) for sender in self._outputs.senders]
+        if any(position.seq for position in positions):  # a model may contain the motion
+            kalman.prepare()
         while not agree(positions, models, commands.desired):
             if (model := self._models.receive(_TURN_SECONDS)) is not None:
                 models[model.object] = model

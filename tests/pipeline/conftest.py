@@ -6,10 +6,14 @@ import subprocess
 import sys
 from contextlib import ExitStack
 
+import cv2
 import psutil
 import pytest
 
-FRAMES = 60
+from catstream.video.source import open_source
+
+#: Fewer than half a block of centres (`search.motion_frames`): no process imports the Kalman filter.
+FRAMES = 32
 
 
 @pytest.fixture(scope="session")
@@ -17,6 +21,25 @@ def video(demo_video):
     """A short demo video, and the object's box in each of its frames."""
     path, boxes = demo_video(FRAMES)
     return str(path), boxes
+
+
+@pytest.fixture(scope="session")
+def long_video(demo_video):
+    """The same with more frames, for events that take longer."""
+    path, boxes = demo_video(60)
+    return str(path), boxes
+
+
+@pytest.fixture
+def endless(video, tmp_path):
+    """A folder of so many images that no run reaches its end, all of the same frame."""
+    folder = tmp_path / "endless"
+    folder.mkdir()
+    with open_source(video[0]) as source:
+        cv2.imwrite(str(folder / "00000.png"), next(source).image)
+    for number in range(1, 5000):
+        (folder / f"{number:05d}.png").hardlink_to(folder / "00000.png")
+    return str(folder)
 
 
 @pytest.fixture

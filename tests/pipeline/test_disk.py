@@ -51,8 +51,8 @@ DISKS = {
 
 
 @pytest.mark.parametrize(("spoil", "mend", "reason"), DISKS.values(), ids=DISKS)
-def test_a_run_continues_and_reports_a_disk_that_cannot_be_written(video, disk, until, spoil, mend, reason):
-    path, boxes = video
+def test_a_run_continues_and_reports_a_disk_that_cannot_be_written(long_video, disk, until, spoil, mend, reason):
+    path, boxes = long_video
     state, tracks, said = disk / "kept", [], ""
     with Pipeline(path, boxes[0], SETTINGS, state=state) as pipeline:
         for track in pipeline:

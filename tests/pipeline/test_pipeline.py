@@ -92,10 +92,11 @@ def test_three_processes_run_while_it_is_open_and_none_afterwards(run, video, al
 def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):
     path, boxes = video
     tracks, killed, victims = [], [], list(NAMES)
-    with Pipeline(path, boxes[0], SETTINGS) as pipeline:
+    near = Settings(run={"unstored_frames": 4, "lag_frames": 2})  # so few frames pass between two deaths
+    with Pipeline(path, boxes[0], near) as pipeline:
         for track in pipeline:
             tracks.append(track)
-            if track.frame >= 10 and victims and pipeline.restarts == len(killed) and victims[-1] in pipeline.pids:
+            if track.frame >= 3 and victims and pipeline.restarts == len(killed) and victims[-1] in pipeline.pids:
                 killed.append(pipeline.pids[victims.pop()])
                 psutil.Process(killed[-1]).kill()
         pids = pipeline.pids
@@ -105,8 +106,8 @@ def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):
     assert not any(map(alive, [*killed, *pids.values()]))
 
 
-def test_a_part_is_followed_whole_though_the_detector_dies(video):
-    path, boxes = video
+def test_a_part_is_followed_whole_though_the_detector_dies(long_video):
+    path, boxes = long_video
     part = slice(10, 60, 2)
     wanted, tracks = range(len(boxes))[part], []
     with Pipeline(path, boxes[10], SETTINGS, part=part) as pipeline:
@@ -121,17 +122,17 @@ def test_a_part_is_followed_whole_though_the_detector_dies(video):
 
 def test_a_restarted_trainer_continues_to_learn(video, until):
     path, boxes = video
-    with Pipeline(path, boxes[0], SETTINGS) as pipeline:
+    with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 4, "lag_frames": 2})) as pipeline:
         versions = []
         for track in pipeline:
             versions.append(track.model_version)
-            if track.frame == 25:
+            if track.frame == 8:
                 os.kill(pipeline.pids["trainer"], signal.SIGKILL)
             if pipeline.restarts and len(pipeline.pids) == 3:
                 break
         with Subscriber(MODELS, Endpoint.parse(pipeline.endpoint)) as models:
             model = until(lambda: models.receive(0.1))
-    assert model.version > versions[25]
+    assert model.version > versions[8]
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,7 @@ def test_a_late_subscriber_of_a_pipeline_receives_the_last_model(video, until):
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 4})) as pipeline:
         for track in pipeline:
-            if track.frame == 30:
+            if track.frame == 20:
                 break
         # Nobody takes tracks now: with a full window the detector waits, and no newer model comes.
         with Subscriber(MODELS, Endpoint.parse(pipeline.endpoint)) as models:

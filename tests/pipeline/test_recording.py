@@ -19,7 +19,7 @@ def test_no_features_are_missing_and_every_model_is_reproduced_whichever_process
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16}), record=tmp_path / "run.rec") as pipeline:
         for track in pipeline:
-            if track.frame == 25:
+            if track.frame == 10:
                 for victim in ("compressor", "detector"):
                     os.kill(pipeline.pids[victim], signal.SIGKILL)
     recording = Recording(tmp_path / "run.rec")
@@ -37,8 +37,8 @@ def test_a_recording_that_is_there_is_not_written_over(video, tmp_path):
         Pipeline(path, boxes[0], record=tmp_path / "run.rec")
 
 
-def test_a_run_continues_if_its_recording_cannot_be_written(video, tmp_path, monkeypatch):
-    path, boxes = video
+def test_a_run_continues_if_its_recording_cannot_be_written(long_video, tmp_path, monkeypatch):
+    path, boxes = long_video
     preload = tmp_path / "sitecustomize.py"
     preload.write_text("import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (5 << 20, resource.RLIM_INFINITY))")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
