@@ -215,7 +215,7 @@ class Fleet:
             connect(self._address, self._token_file)
 
     def _ask(self, method: str, *arguments: object, **options: object) -> Any:
-        """Call a method of the manager, and wait for its answer. A head that has started again is connected to again."""
+        """Call a method of the manager, and wait for its answer; connects again if the head has started again."""
         from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 
         why = ""

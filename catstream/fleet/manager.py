@@ -295,6 +295,9 @@ class Manager:
                     self._stop(action)
                 else:
                     self._start(action)
+            for name in plan.memory.ended.keys() & self._running.keys():
+                if self._running[name].phase == "ended":
+                    self._stop(Stop(name, "its source has ended"))
             self._forget_states()
             if time.monotonic() - self._saved > _SAVE_SECONDS:
                 self._save()

@@ -1,7 +1,7 @@
 """Decides on which node each stream of a fleet runs: a pure function of the streams, their needs and the nodes.
 
-A stream that runs and may stay, stays. The others are placed by best fit: each gets the node with the least free cores
-that are enough. Pinned streams come first, then those that run on a node that they have to leave, those that need more
+A stream that runs and may stay, stays. Each of the others gets the node with the most free cores, so that the death of a
+node stops few streams, and each has room to need more. Pinned streams come first, then those that run on a node that they have to leave, those that need more
 labels, and those that need more cores. No stream is placed on a node beyond the node's cores.
 """
 
@@ -93,7 +93,7 @@ def place(tasks: Iterable[Task], nodes: Iterable[Node], settling: Collection[str
     >>> nodes = [Node("north-1", 4.0, {"site": "north"}), Node("south-1", 2.0)]
     >>> placement = place([Task("cam-7", 0.5, {"site": "north"}), Task("cam-8", 1.0), Task("cam-9", 8.0)], nodes)
     >>> placement.where
-    {'cam-7': 'north-1', 'cam-8': 'south-1'}
+    {'cam-7': 'north-1', 'cam-8': 'north-1'}
     >>> placement.unplaced
     {'cam-9': 'cam-9 needs 8 cores, and the largest node, north-1, has 4: give it fewer cores, or add a larger node'}
     """
@@ -146,7 +146,7 @@ class _Room:
         return pinned is None or pinned is node or not self._takes(pinned, task)
 
     def best(self, task: Task) -> Node | None:
-        """The node for a stream that has to be placed: the pinned one, or the best fit; None if there is none."""
+        """The node for a stream that has to be placed: the pinned one, or the emptiest; None if there is none."""
         options = [node for node in self.usable if self._takes(node, task)]
         tried = {name: number for number, name in enumerate(task.unopened, 1)}
         return min(
@@ -155,7 +155,7 @@ class _Room:
                 node.name != task.pinned,
                 tried.get(node.name, 0),
                 node.overloaded,
-                self.free[node.name],
+                -self.free[node.name],
                 node.name,
             ),
             default=None,

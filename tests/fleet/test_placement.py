@@ -163,3 +163,9 @@ def test_a_refusal_names_the_first_few_of_many_nodes():
     nodes = [Node(f"n{number}", 4.0) for number in range(100)]
     text = objection(Task("cam-7", 2.0), nodes, dict.fromkeys((node.name for node in nodes), 0.25))
     assert "n4 has 0.25 of 4 and 95 more: give it fewer cores" in text
+
+
+def test_streams_are_spread_over_the_nodes():
+    tasks = [Task(f"cam-{number}", 0.5) for number in range(6)]
+    where = place(tasks, [Node("n1", 8.0), Node("n2", 8.0), Node("n3", 8.0)]).where
+    assert sorted(where.values()) == ["n1", "n1", "n2", "n2", "n3", "n3"]

@@ -245,7 +245,7 @@ def test_a_changed_stream_is_stopped_first_and_then_started():
 
 
 def test_the_streams_of_a_dead_node_are_started_elsewhere_in_the_same_turn():
-    fleet = Fleet(Node("n1", 1.0), Node("n2", 2.0), a=Desired("1", 1.0))
+    fleet = Fleet(Node("n1", 2.0), Node("n2", 1.0), a=Desired("1", 1.0))
     assert fleet.turn() == ["n1"]
     fleet.change_node("n1", alive=False)
     assert [action.reason for action in fleet.plan(0.5).actions] == ["n1 died"]
@@ -254,7 +254,7 @@ def test_the_streams_of_a_dead_node_are_started_elsewhere_in_the_same_turn():
 
 
 def test_a_pin_holds_until_its_node_drains_and_is_then_given_up():
-    fleet = Fleet(Node("n1", 1.0), Node("n2", 2.0), a=Desired("1", 1.0))
+    fleet = Fleet(Node("n1", 2.0), Node("n2", 1.0), a=Desired("1", 1.0))
     fleet.turn()
     fleet.change("a", pinned="n2")
     assert fleet.turn() == ["a"]
