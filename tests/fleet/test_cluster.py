@@ -20,8 +20,12 @@ from catstream.errors import FleetError, UnreachableError
 from catstream.fleet import cluster, keeper, probe
 from catstream.fleet.local import LocalFleet
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "fleet"
-FAULTS, PORTS = (runpy.run_path(str(BENCHMARKS / f"{name}.py")) for name in ("nodes", "ports"))
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(sys, "path", [str(BENCHMARKS / "fleet"), str(BENCHMARKS), *sys.path])  # as Python has it for a script
+    FAULTS, PORTS, STRANGERS = (
+        runpy.run_path(str(BENCHMARKS / "fleet" / f"{name}.py")) for name in ("nodes", "ports", "strangers")
+    )
 
 
 @pytest.fixture
@@ -257,3 +261,23 @@ def test_a_node_that_was_killed_is_dead_at_once(fleet, until):
         assert "fragile" not in fleet.names
     finally:
         fleet.stop_node("fragile")
+
+
+@pytest.mark.parametrize("token", [None, "0" * 64], ids=["without a token", "with a wrong token"])
+def test_a_stranger_on_this_machine_is_refused_at_every_port(fleet, token):
+    calls = [
+        *("NodeInfoGcsService/GetAllNodeInfo", "InternalKVGcsService/InternalKVKeys", "JobInfoGcsService/AddJob"),
+        *("ActorInfoGcsService/RegisterActor", "NodeManagerService/RequestWorkerLease", "CoreWorkerService/PushTask"),
+        *("NodeManagerService/ShutdownRaylet", "ObjectManagerService/Pull"),
+    ]
+    refused = set()
+    for port in (port for name in ("head", "node-1") for port in PORTS["listening"](fleet, name)):
+        for call in calls:
+            status, size = STRANGERS["grpc"](port.address, port.number, f"/ray.rpc.{call}", token)
+            assert size == 0, (port, call)
+            assert status in ("16", "12", ""), (port, call)  # refused, no such service, no gRPC at all
+            refused |= {call} if status == "16" else set()
+        if "RuntimeEnv" in port.process:
+            status, size = STRANGERS["web"](port.address, port.number, "/get_or_create_runtime_env", token)
+            assert (status in ("401", "403"), size) == (True, 0)
+    assert refused >= {*calls[:5], *calls[6:]}  # a worker's port is there only if an actor runs
