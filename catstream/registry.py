@@ -16,6 +16,7 @@ the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet://STR
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -23,7 +24,7 @@ from time import monotonic
 from typing import Self, TypeVar
 from uuid import uuid4
 
-from catstream.errors import ServiceError, SilenceError
+from catstream.errors import ProtocolError, ServiceError, SilenceError
 from catstream.messages import End, FleetStatus, Listing, NodeStatus, Question, StreamStatus
 from catstream.schema import LONGEST_LIST
 from catstream.wire.channels import REGISTRY
@@ -41,6 +42,8 @@ __all__ = [
     "fleet_and_stream",
     "locate",
 ]
+
+_log = logging.getLogger(__name__)
 
 Status = TypeVar("Status", StreamStatus, NodeStatus)
 
@@ -336,7 +339,10 @@ class RegistryServer:
         if questions:
             status = self._status()
             for question in questions:
-                self._responder.answer(_listing(question, status))
+                try:
+                    self._responder.answer(_listing(question, status))
+                except ProtocolError as error:  # other questions may be about streams whose state is valid
+                    _log.error("A question was not answered: %s", error)
         return len(questions)
 
     def close(self) -> None:

@@ -41,6 +41,15 @@ def test_a_long_description_of_a_problem_is_shortened_and_the_rest_arrives(manag
         assert len(registry.streams().streams["cam-7"].trouble) < 1100
 
 
+def test_a_state_that_no_message_may_have_does_not_end_the_registry(managing):
+    damaged = StreamStatus("cam-8", "running", rate=float("nan"))
+    with managing(replace(SITE, streams={"cam-7": CAM, "cam-8": damaged})), Registry(timeout=0.3) as registry:
+        with pytest.raises(SilenceError):
+            registry.streams()
+        registry.timeout = 20
+        assert registry.place("cam-7").status == CAM
+
+
 def test_a_stream_that_does_not_exist_is_an_error_with_the_names_of_all(managing):
     with (
         managing(SITE),
