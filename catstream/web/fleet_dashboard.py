@@ -121,8 +121,8 @@ def node_row(node: NodeStatus) -> Card:
         "state": node.state,
         "trouble": node.trouble,
         "address": node.address,
-        "cores": round(node.cores, 1),
-        "used": round(node.used, 1),
+        "cores": round(node.cores, 2),
+        "used": round(node.used, 2),
         "labels": [f"{name}={value}" for name, value in sorted(node.labels.items())],
         "streams": node.streams,
     }

@@ -34,7 +34,7 @@ function showState() {
   else if (fleet.phase === "silent") [state, words] = ["silent", "fleet silent"];
   else if (fleet.phase === "waiting") words = "waiting";
   else if (troubled) [state, words] = ["absent", `${troubled} in trouble`];
-  else if (streams.size) [state, words] = [running ? "present" : "waiting", `${running} of ${streams.size} running`];
+  else if (streams.size) [state, words] = [running ? "present" : "waiting", `${running === streams.size ? "" : `${running} of `}${streams.size} running`];
   $("#state").dataset.state = state;
   write($("#state b"), words);
   write($("#source"), fleet.name && `fleet ${fleet.name}`);

@@ -79,5 +79,5 @@ function fill({ element, row, button, state, word, labels, trouble, used, bar, s
 }
 
 function round(cores) {
-  return String(Math.round(cores * 10) / 10);
+  return String(Math.round(cores * 100) / 100);
 }
