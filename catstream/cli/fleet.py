@@ -80,14 +80,16 @@ def fleet() -> None:
 def with_manager(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that select a fleet by its manager; the command gets them as keywords of `Fleet`."""
 
-    @click.option("--name", default="", metavar="NAME", help="Name of the fleet; not needed if only one runs here.")
+    @click.option(
+        "--name", "fleet_name", default="", metavar="NAME", help="Name of the fleet; not needed if only one runs here."
+    )
     @click.option("--address", default="", metavar="HOST:PORT", help="Head of a cluster; default: this machine alone.")
     @click.option(
         "--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Token of the cluster, with --address."
     )
     @wraps(command)
-    def wrapped(name: str, address: str, token_file: Path | None, **options: object) -> None:
-        command(of={"name": name, "address": address, "token_file": token_file}, **options)
+    def wrapped(fleet_name: str, address: str, token_file: Path | None, **options: object) -> None:
+        command(of={"name": fleet_name, "address": address, "token_file": token_file}, **options)
 
     return wrapped
 
