@@ -1,7 +1,7 @@
 """Injects a random schedule of faults into a fleet on three nodes, and checks that no stream and no row is lost.
 
-Nodes are killed or frozen with all of their processes, also two at once; the head is killed; the link between a node and
-the store is cut; nobody can reach the store. The store is a real S3 server. Three streams are live, and three are short
+Nodes are killed or frozen with all of their processes, also two at once; the head is killed; the link between a node
+and the store is cut; nobody can reach the store, which is a real S3 server. Three streams are live, and three are short
 films in lockstep: whenever a film ends, its trees must be equal, bit for bit, to those of a run in one process without
 faults, and it begins anew. Recovery is the time from a fault to the second frame that a stream tracks afterwards.
 """

@@ -1,8 +1,9 @@
 """Decides on which node each stream of a fleet runs: a pure function of the streams, their needs and the nodes.
 
-A stream that runs and may stay, stays. Each of the others gets the node with the most free cores, so that the death of a
-node stops few streams, and each has room to need more. Pinned streams come first, then those that run on a node that they have to leave, those that need more
-labels, and those that need more cores. No stream is placed on a node beyond the node's cores.
+A stream that runs and may stay, stays. Each of the others gets the node with the most free cores, so that the death of
+a node stops few streams, and each has room to need more. Pinned streams come first, then those that run on a node that
+they have to leave, those that need more labels, and those that need more cores. No stream is placed on a node beyond
+the node's cores.
 """
 
 from __future__ import annotations
