@@ -120,8 +120,6 @@ def _frame(kind: int, flags: int, stream: int, body: bytes) -> bytes:
 
 def survives_sync(host: str, port: Port, token: str) -> str:
     """What becomes of the process at a port after a call of `SYNC` without a token."""
-    if "RuntimeEnv" in port.process:
-        return ""
     status, _ = grpc(host, port.number, SYNC, None)
     sleep(0.5)
     alive = grpc(host, port.number, "/grpc.health.v1.Health/Check", token)[0] == "0"
@@ -147,10 +145,11 @@ def on_this_machine() -> Table:
             token = cluster.read_token(fleet.token_file)
             found = [(name, port) for name in ("node-1", "head") for port in listening(fleet, name)]
             rows = [_row("127.0.0.1", name, port, token) for name, port in found]
-            syncs = {
-                port: survives_sync("127.0.0.1", port, token)
-                for _, port in sorted(found, key=lambda each: each[1].process != "gcs_server")  # Ray ends as a whole
-            }
+            order = ["ray::Actor", "raylet", "gcs_server"]  # the end of the head is the end of its actor
+            asked = [(name, port) for name, port in found if name == "node-1" or port.process != "raylet"]
+            asked = [each for each in asked if each[1].process in order]
+            asked.sort(key=lambda each: (order.index(each[1].process), answers_friends("127.0.0.1", each[1], token)))
+            syncs = {port: survives_sync("127.0.0.1", port, token) for _, port in asked}
             del actor
             cluster.disconnect()
         finally:
@@ -158,7 +157,7 @@ def on_this_machine() -> Table:
     return Table(
         "A fleet on this machine: calls that were not refused",
         ("node", "listens at", "process", "calls", "without a token", "wrong token", "right token", "StartSync"),
-        [(*row, syncs[port]) for row, (_, port) in zip(rows, found, strict=True)],
+        [(*row, syncs.get(port, "")) for row, (_, port) in zip(rows, found, strict=True)],
         "grpc.health says that the process is alive, grpc.reflection names the services of Ray. StartSync was called "
         "last, without a token; the keeper starts Ray again",
     )

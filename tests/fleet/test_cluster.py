@@ -281,3 +281,14 @@ def test_a_stranger_on_this_machine_is_refused_at_every_port(fleet, token):
             status, size = STRANGERS["web"](port.address, port.number, "/get_or_create_runtime_env", token)
             assert (status in ("401", "403"), size) == (True, 0)
     assert refused >= {*calls[:5], *calls[6:]}  # a worker's port is there only if an actor runs
+
+
+@pytest.mark.usefixtures("fleet")
+def test_ray_opens_no_port_for_its_client_or_its_dashboard_whatever_is_installed():
+    check = (
+        "from catstream.fleet import launch; launch._close_ports(); from ray._private import utils; "
+        "from ray.scripts import scripts; "
+        "print(scripts.get_ray_client_dependency_error(), utils.get_dashboard_dependency_error(), sep='|')"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=True)
+    assert done.stdout == "a fleet does not use it|a fleet does not use it\n"
