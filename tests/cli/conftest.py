@@ -16,7 +16,14 @@ from catstream.cli import main
 
 @pytest.fixture(scope="session")
 def video(demo_video):
-    """A short demo video, and the box in its first frame as `--box` takes it."""
+    """A short demo video of 32 frames, and the box in its first frame as `--box` takes it."""
+    path, boxes = demo_video(32)
+    return str(path), ",".join(map(str, boxes[0]))
+
+
+@pytest.fixture(scope="session")
+def long_video(demo_video):
+    """The same of 60 frames, for events that take longer."""
     path, boxes = demo_video(60)
     return str(path), ",".join(map(str, boxes[0]))
 

@@ -24,11 +24,11 @@ def recorded(whole_run):
 
 def test_the_content_of_a_recording_is_reported(whole_run):
     errors = (whole_run / "stderr").read_text()
-    assert "recording: rec, 60 features, " in errors
+    assert "recording: rec, 32 features, " in errors
     assert "none missing" in errors
     recording = Recording(whole_run / "rec")
-    assert [features.seq for features in recording.features()] == list(range(1, 61))
-    assert recording.end.totals == {"sent": 60, "stored": 60}
+    assert [features.seq for features in recording.features()] == list(range(1, 33))
+    assert recording.end.totals == {"sent": 32, "stored": 32}
     assert (recording.missing[Features], recording.missing[Track]) == (0, 0)
     lesson = learn(recording, recording.settings)
     assert lesson.identical == recording.counts[Model] > 5
@@ -82,8 +82,8 @@ def test_a_recording_is_watched_like_a_pipeline(recorded, catstream, tmp_path):
     output, errors = watcher.communicate(timeout=60)
     assert player.wait(60) == 0
     tracks = [json.loads(line)["frame"] for line in output.splitlines()]
-    assert tracks == list(range(60 - len(tracks), 60))
-    assert f"{60 - len(tracks)} missed" in errors
+    assert tracks == list(range(32 - len(tracks), 32))
+    assert f"{32 - len(tracks)} missed" in errors
     assert ": the source has ended" in errors
 
 
@@ -92,8 +92,8 @@ def holds_tracks(path):
     return path.exists() and path.stat().st_size > 0 and Recording(path).counts[Track] > 0
 
 
-def test_the_messages_of_a_pipeline_are_recorded_by_another_process(video, catstream, tmp_path):
-    source, box = video
+def test_the_messages_of_a_pipeline_are_recorded_by_another_process(long_video, catstream, tmp_path):
+    source, box = long_video
     settings, paths = (
         Settings(run={"unstored_frames": 1, "endpoint": str(tmp_path)}),
         [tmp_path / "whole.rec", tmp_path / "stopped.rec"],

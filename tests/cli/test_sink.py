@@ -20,8 +20,8 @@ from catstream.wire.newest import Publisher
 FILES = ["tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet"]
 
 
-def test_tracks_are_written_to_files_and_stay_there(video, catstream, tmp_path):
-    source, box = video
+def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_path):
+    source, box = long_video
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     with Pipeline(source, [float(side) for side in box.split(",")], Settings(run={"unstored_frames": 1})) as pipeline:
         sinks = {}

@@ -52,7 +52,7 @@ def wreck(video, tmp_path_factory):
     results = ["--output", place / "out", "--video", "--state", place / "kept"]
     process = subprocess.Popen([*command, *map(str, results), *OFTEN], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
-    while not (len(checkpoints(place / "kept")) > 1 and len(frames(place / "out")) >= 20):
+    while not (len(checkpoints(place / "kept")) > 1 and len(frames(place / "out")) >= 6):
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline, "no checkpoints came"
         time.sleep(0.01)
@@ -72,13 +72,13 @@ def killed(wreck):
 def test_a_run_whose_processes_were_all_killed_resumes_without_a_difference(killed, whole_run, said, tmp_path):
     kept, out = killed / "kept", killed / "out"
     before = len(frames(out))
-    assert before < 60
+    assert before < 32
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
     for file in RESULTS:
         assert (out / file).read_bytes() == (whole_run / "out" / file).read_bytes()
-    assert "60 messages sent, 60 stored" in errors
-    assert CheckpointStore(kept / TREES).load(Settings()).seq == 60
+    assert "32 messages sent, 32 stored" in errors
+    assert CheckpointStore(kept / TREES).load(Settings()).seq == 32
     code, output, errors = said("save", tmp_path / "one", "--state", kept)
     assert code == 0, errors
     saved = Learned.load(tmp_path / "one")
@@ -86,7 +86,7 @@ def test_a_run_whose_processes_were_all_killed_resumes_without_a_difference(kill
     assert saved.model.version == CheckpointStore(kept / TREES).load(Settings()).version
     code, _, errors = said("track", "--resume", kept)
     assert code == 0, errors
-    assert frames(out) == list(range(60)), "a run that is complete gets no row more"
+    assert frames(out) == list(range(32)), "a run that is complete gets no row more"
 
 
 def test_rows_left_incomplete_by_a_power_failure_are_removed_and_written_again(killed, whole_run, said):
@@ -97,12 +97,12 @@ def test_rows_left_incomplete_by_a_power_failure_are_removed_and_written_again(k
     code, _, errors = said("track", "--resume", killed / "kept")
     assert code == 0, errors
     for file in RESULTS:
-        assert len((out / file).read_text().splitlines()) == 60 + (file == "demo.csv")
-    assert (out / "demo.csv").read_text().splitlines()[:8] == (
-        (whole_run / "out" / "demo.csv").read_text().splitlines()[:8]
+        assert len((out / file).read_text().splitlines()) == 32 + (file == "demo.csv")
+    assert (out / "demo.csv").read_text().splitlines()[:4] == (
+        (whole_run / "out" / "demo.csv").read_text().splitlines()[:4]
     )
     with open_source(out / "demo.mp4") as film:
-        assert sum(1 for _ in film) == 60, "the video is drawn again, whole"
+        assert sum(1 for _ in film) == 32, "the video is drawn again, whole"
 
 
 def test_a_damaged_checkpoint_is_reported_and_the_previous_one_is_used(killed, whole_run, said):
@@ -139,7 +139,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
     assert code == 1, errors
     assert "a pipeline that runs keeps its state" in errors
     assert running.wait(120) == 0
-    assert frames(out) == list(range(60))
+    assert frames(out) == list(range(32))
 
 
 def test_settings_that_are_given_again_change_and_all_others_stay(video, said, monkeypatch, tmp_path):
@@ -208,8 +208,8 @@ def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_who
     assert ids == {(str(frame + 1), number) for frame in range(16) for number in ("1", "2")}
 
 
-def test_a_terminal_that_is_lost_ends_a_run_like_ctrl_c(video, catstream, until, tmp_path):
-    source, box = video
+def test_a_terminal_that_is_lost_ends_a_run_like_ctrl_c(long_video, catstream, until, tmp_path):
+    source, box = long_video
     heeded = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
     command = [
         "track",

@@ -41,8 +41,8 @@ def resting(video):
         yield running
 
 
-def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(video, catstream):
-    with pipeline(video) as running:
+def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(long_video, catstream):
+    with pipeline(long_video) as running:
         place = ["--endpoint", running.endpoint]
         features = catstream("watch", "features", "--count", 3, *place)
         tracks = catstream("watch", "tracks", "--json", *place)
