@@ -410,9 +410,9 @@ def described(status: StreamStatus) -> str:
     """The state of a stream, for a message to the user.
 
     >>> described(StreamStatus("cam-7", "unplaced", trouble="cam-7 needs a node with site=north"))
-    'it is unplaced: cam-7 needs a node with site=north'
+    'its state is unplaced: cam-7 needs a node with site=north'
     """
-    return f"it is {status.state}{': ' if status.trouble else ''}{status.trouble}"
+    return f"its state is {status.state}{': ' if status.trouble else ''}{status.trouble}"
 
 
 def locate(endpoint: str | Endpoint, keys: str = "", source: str = "", *, timeout: float = 5.0) -> Endpoint:

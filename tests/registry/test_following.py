@@ -113,7 +113,7 @@ def test_a_subscription_goes_on_without_the_manager_and_follows_the_stream_once_
 def test_a_subscription_waits_for_a_stream_that_runs_nowhere_yet(stream, managing):
     stream.update(state="unplaced", trouble="cam-7 needs a node with site=north")
     with managing(stream.status), catstream.subscribe("fleet://cam-7", "tracks", timeout=0.1) as tracks:
-        with pytest.raises(SilenceError, match=r"it is unplaced: cam-7 needs a node with site=north$"):
+        with pytest.raises(SilenceError, match=r"its state is unplaced: cam-7 needs a node with site=north$"):
             next(tracks)
         tracks.timeout = 60
         watched = stream.watched(tracks)

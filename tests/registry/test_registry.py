@@ -63,7 +63,7 @@ def test_a_stream_that_does_not_run_has_no_endpoint(managing):
     idle = replace(SITE, streams={"cam-7": StreamStatus("cam-7", "unplaced", trouble="cam-7 needs site=north")})
     with managing(idle), Registry() as registry:
         assert registry.place("cam-7").endpoint is None
-        with pytest.raises(ServiceError, match="cam-7 runs nowhere, it is unplaced: cam-7 needs site=north"):
+        with pytest.raises(ServiceError, match="cam-7 runs nowhere, its state is unplaced: cam-7 needs site=north"):
             locate("fleet://cam-7")
 
 
