@@ -6,66 +6,21 @@ the same records.
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
-from textwrap import fill
-from typing import Any, NamedTuple
 
 from groups import CHECK, TUNED
-from table import Cell, Table, text
+from scale_page import SCALE
+from sections import DOCS, Page, Record, Section, Shown, every, filled, records, select, written
+from table import Cell, Table
 
-__all__ = ["PAGES", "README", "RECORDS", "Page", "Shown", "readme", "records", "shown", "written"]
+__all__ = ["PAGES", "README", "readme", "shown"]
 
-_ROOT = Path(__file__).parents[1]
-RECORDS = Path(__file__).parent / "results"
-_DOCS = _ROOT / "docs"
-README = _ROOT / "README.md"
+README = Path(__file__).parents[1] / "README.md"
 _MARKS = re.compile(r"(<!-- results: .*? -->\n).*?(<!-- /results -->)", re.DOTALL)
-
-Record = Mapping[str, Any]
-
-
-class Shown(NamedTuple):
-    """A record on the page: its file in `benchmarks/results`, and the tables made from it."""
-
-    record: str
-    tables: Callable[[Record], Iterable[Table]]
-
-
-class Section(NamedTuple):
-    """A part of the page: its heading, an introduction to its tables, and the tables."""
-
-    heading: str
-    introduction: str | Callable[[Mapping[str, Record]], str]
-    parts: tuple[Shown, ...]
-
-
-class Page(NamedTuple):
-    """A page of results: its file, its title, an introduction, and the sections."""
-
-    path: Path
-    title: str
-    introduction: str
-    sections: tuple[Section, ...]
-
-
-def records() -> dict[str, Record]:
-    """Return all records by name."""
-    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(RECORDS.glob("*.json"))}
-
-
-def written(page: Page, found: Mapping[str, Record]) -> str:
-    """Return the text of a page."""
-    parts = [f"# {page.title}", _filled(page.introduction)]
-    for section in page.sections:
-        blocks = [_block(found[name], tables) for name, tables in section.parts]
-        introduction = section.introduction if isinstance(section.introduction, str) else section.introduction(found)
-        parts += [f"## {section.heading}", _filled(introduction), "```console\n" + "\n".join(blocks) + "\n```"]
-    return "\n\n".join(parts) + "\n"
 
 
 def shown() -> set[str]:
@@ -76,33 +31,6 @@ def shown() -> set[str]:
 def readme(found: Mapping[str, Record], page: str) -> str:
     """Return the README with the figures between its marks."""
     return _MARKS.sub(lambda marks: f"{marks[1]}{_figures(found)}\n{marks[2]}", page)
-
-
-def _block(record: Record, tables: Callable[[Record], Iterable[Table]]) -> str:
-    machine = record["machine"]
-    made = f"{record['date']}, commit {record['commit']}, {machine['cores']} cores of {machine['processor']}"
-    settings = f", {len(record['settings'])} settings differ from the defaults" if record["settings"] else ""
-    return f"$ {record['command']}  # {made}{settings}\n" + "\n\n".join(map(text, tables(record)))
-
-
-def select(number: int = 0, *, columns: Sequence[str] = (), without: str = "") -> Callable[[Record], Iterator[Table]]:
-    """Return a function that selects table `number` of a record, with these columns, without the rows of a pattern."""
-
-    def chosen(record: Record) -> Iterator[Table]:
-        table = record["tables"][number]
-        places = [table["columns"].index(column) for column in columns or table["columns"]]
-        kept = [row for row in table["rows"] if not (without and re.match(without, " ".join(map(str, row))))]
-        yield Table(
-            "", [table["columns"][place] for place in places], [[row[place] for place in places] for row in kept]
-        )
-
-    return chosen
-
-
-def every(record: Record) -> Iterator[Table]:
-    """Select all tables of a record."""
-    for number in range(len(record["tables"])):
-        yield from select(number)(record)
 
 
 def merged(record: Record) -> Iterator[Table]:
@@ -255,15 +183,11 @@ def _figures(found: Mapping[str, Record]) -> str:
     ours, theirs = (accuracy["mean"][name] for name in ("catstream", "csrt"))
     rates = {row[0]: row[1] for table in speed["tables"] if table["title"] == _PEERS for row in table["rows"]}
     sequences = len({row["name"] for row in accuracy["sequences"]})
-    return _filled(f"""
+    return filled(f"""
         On {sequences} public sequences, the area under the success plot (AUC) is **{ours["auc"]:.3f}**; that of
         OpenCV's CSRT is {theirs["auc"]:.3f} (`{accuracy["command"]}`). The defaults were chosen on 20 of the sequences;
         [Results](docs/results.md) lists the others separately. On one core, catstream processes
         **{rates["catstream"]:.0f} frames/s**, and CSRT {rates["csrt"]:.0f} (`{speed["command"]}`).""")
-
-
-def _filled(paragraph: str) -> str:
-    return fill(" ".join(paragraph.split()), 120, break_long_words=False, break_on_hyphens=False)
 
 
 _HEAD = """
@@ -383,8 +307,9 @@ MORE = (
 )
 
 PAGES = (
-    Page(_DOCS / "results.md", "Results", _HEAD, SECTIONS),
-    Page(_DOCS / "more-results.md", "More results", _MORE_HEAD, MORE),
+    Page(DOCS / "results.md", "Results", _HEAD, SECTIONS),
+    Page(DOCS / "more-results.md", "More results", _MORE_HEAD, MORE),
+    SCALE,
 )
 
 
@@ -392,4 +317,6 @@ if __name__ == "__main__":
     found = records()
     for page in PAGES:
         page.path.write_text(written(page, found), encoding="utf-8")
+        for path, plot in page.plots(found).items():
+            path.write_text(plot, encoding="utf-8")
     README.write_text(readme(found, README.read_text(encoding="utf-8")), encoding="utf-8")

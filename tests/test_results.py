@@ -14,16 +14,17 @@ BENCHMARKS = ROOT / "benchmarks"
 sys.path.append(str(BENCHMARKS))
 
 import page  # noqa: E402
+import sections  # noqa: E402
 from groups import CHECK, TUNED  # noqa: E402
 
 SCRIPTS = {
     path.relative_to(ROOT).as_posix() for path in BENCHMARKS.rglob("*.py") if "publish(figures" in path.read_text()
 }
-FOUND = page.records()
+FOUND = sections.records()
 EVERY_RECORD = pytest.mark.parametrize("record", FOUND.values(), ids=FOUND.keys())
 
 
-def measured_by(record: page.Record) -> str:
+def measured_by(record: sections.Record) -> str:
     """The benchmark, or the verb, that wrote a record."""
     program, name = record["command"].split()[:2]
     return name if program == "python" else f"{program} {name}"
@@ -32,7 +33,9 @@ def measured_by(record: page.Record) -> str:
 @pytest.mark.parametrize("one", page.PAGES, ids=lambda one: one.path.name)
 def test_a_page_is_the_one_that_the_records_give(one):
     shown = one.path.read_text(encoding="utf-8")
-    assert shown == page.written(one, FOUND) == page.written(one, page.records()), "it is old: run `make results`"
+    assert shown == sections.written(one, FOUND) == sections.written(one, sections.records()), (
+        "it is old: run `make results`"
+    )
     assert shown.count("\n") <= 200
 
 
@@ -47,6 +50,13 @@ def test_every_benchmark_has_a_record_and_every_record_its_place_on_a_page():
         "benchmarks/results: see docs/benchmarks.md"
     )
     assert FOUND.keys() == page.shown(), "benchmarks/page.py does not show a record, or shows one that is not there"
+
+
+@pytest.mark.parametrize("one", page.PAGES, ids=lambda one: one.path.name)
+def test_the_plots_of_a_page_are_those_that_the_records_give(one):
+    for path, plot in one.plots(FOUND).items():
+        assert path.read_text(encoding="utf-8") == plot, f"{path.name} is old: run `make results`"
+        assert f"images/{path.name}" in one.path.read_text(encoding="utf-8")
 
 
 @EVERY_RECORD
@@ -67,4 +77,4 @@ def test_the_tuning_set_is_reported_separately():
     names = {row["name"] for row in FOUND["accuracy"]["sequences"]}
     assert (len(TUNED), len(CHECK), len(TUNED & CHECK)) == (20, 15, 3)
     assert names >= TUNED | CHECK
-    assert "The defaults were chosen on the first 20" in page.written(page.PAGES[0], FOUND)
+    assert "The defaults were chosen on the first 20" in sections.written(page.PAGES[0], FOUND)
