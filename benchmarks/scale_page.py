@@ -220,8 +220,8 @@ def _failures(found: Records) -> str:
         loses none, because it continues from the frame of its last state. What was learned since this state is
         lost, or learned again from a file.
 
-        Streams are placed on the fullest machine with enough free cores, so a few machines start many of them. On the
-        emptiest machines, the last stream would be back after {words(placing[1][4])} s instead of
+        Streams go to the machine with the most free cores, so all machines share the starts. If they went to the
+        fullest machine with enough of them, the last stream would be back after {words(placing[1][4])} s instead of
         {words(placing[0][4])} s.
 
         The second table has a year of random failures. The {words(cell(found, _BUILT, 1000, "machines"))} machines of
@@ -244,7 +244,7 @@ _BEYOND = """
       store of your own, divide the streams among several fleets.
 
     - **KubeRay, if you run Kubernetes.** It replaces machines and pods that fail, and keeps the head's storage on a
-      volume. It does not make a head larger: each RayCluster has one.
+      volume. It does not make a head larger: each RayCluster has one. See [Deploy a fleet](how-to/fleet-deploy.md).
 
     - **A larger head does not help**: the manager uses one core. A faster core does."""
 

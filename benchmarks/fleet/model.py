@@ -115,7 +115,7 @@ class Site:
     report         seconds between two reports of a stream that sends its status
     pages          open pages of all streams; each asks for all of them once per second
     questions      questions per second and stream, from subscribers that look a stream up
-    fullest_first  whether a stream goes to the fullest machine on which it fits, or else to the emptiest
+    fullest_first  whether a stream goes to the fullest machine with enough free cores, or else to the emptiest
     heads          independent heads; each has an equal part of the cameras
     """
 
@@ -133,7 +133,7 @@ class Site:
     report: float = 5.0
     pages: int = 2
     questions: float = 0.01
-    fullest_first: bool = True
+    fullest_first: bool = False
     heads: int = 1
 
 

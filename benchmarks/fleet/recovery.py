@@ -87,8 +87,8 @@ def simulate(size: Size, faults: Iterable[NodesLost | HeadLost | StoreLost], see
 def assigned(streams: Iterable[int], free: Mapping[int, int], *, fullest_first: bool) -> dict[int, int]:
     """Give each stream a node; those without room are left out.
 
-    With `fullest_first`, the nodes are those that `catstream.fleet.placement.place` chooses for streams that need
-    equally many cores.
+    Without `fullest_first`, the nodes are those that `catstream.fleet.placement.place` chooses for streams that need
+    equally many cores, on nodes of one size.
 
     Parameters
     ----------

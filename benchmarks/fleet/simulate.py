@@ -75,7 +75,7 @@ def head_parts(costs: Costs, cameras: Sequence[int]) -> Table:
 
 
 def scenarios(size: Size) -> dict[str, list[NodesLost | HeadLost | StoreLost]]:
-    """Return the faults of each scenario; the first machines are full, so they are the ones that are lost."""
+    """Return the faults of each scenario."""
     hours = _WATCHED
     rack = NodesLost(_AT, range(size.site.rack), hours)
     return {
@@ -209,10 +209,10 @@ def course(costs: Costs, cameras: Sequence[int], seed: int) -> Table:
 
 
 def placing(costs: Costs, cameras: Sequence[int], seed: int) -> Table:
-    """A rack's recovery if streams go to the fullest machine with room, and if they go to the emptiest one."""
+    """A rack's recovery if streams go to the emptiest machine, and if they go to the fullest one with room."""
     rows = []
     for number in cameras:
-        for name, fullest in (("the fullest", True), ("the emptiest", False)):
+        for name, fullest in (("the emptiest", False), ("the fullest", True)):
             size = Size(number, costs, Site(fullest_first=fullest))
             rows.append((number, name, *_spread(simulate(size, scenarios(size)["a rack"], seed, _WATCHED))))
     return Table("Placement and recovery", ("cameras", "on", "p50 s", "p99 s", "last s"), rows)

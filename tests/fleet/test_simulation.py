@@ -41,9 +41,10 @@ def test_the_same_seed_gives_the_same_outcome():
 
 
 def test_each_stream_of_a_lost_machine_comes_back_once_and_no_other_stops():
-    size = small(3 * small().slots)
-    found = simulate(size, [NodesLost(AT, range(1), END)], 0, END)
-    assert (len(found.down), len(found.unlearnt), found.waiting) == (size.slots, size.slots, 0)
+    found = simulate(small(), [NodesLost(AT, range(1), END)], 0, END)
+    share = 100 / small().machines
+    assert share - 1 < len(found.down) == len(found.unlearnt) < share + 1
+    assert found.waiting == 0
 
 
 def test_a_stream_that_waits_in_no_queue_takes_as_long_as_its_steps():
@@ -87,7 +88,7 @@ def test_streams_are_placed_as_the_manager_places_them(free, streams):
     nodes = [Node(f"{number:02}", float(room)) for number, room in enumerate(free)]
     tasks = [Task(f"{number:02}", 1.0) for number in range(streams)]
     expected = {int(name): int(node) for name, node in place(tasks, nodes).where.items()}
-    assert assigned(range(streams), dict(enumerate(free)), fullest_first=True) == expected
+    assert assigned(range(streams), dict(enumerate(free)), fullest_first=False) == expected
 
 
 @given(st.integers(1, 50_000), st.integers(1, 50_000))
