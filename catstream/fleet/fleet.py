@@ -170,12 +170,18 @@ class Fleet:
         if self._local is None or self._local.running:
             while self._ask("close") and time.monotonic() < deadline:
                 time.sleep(_TURN_SECONDS)
-            import ray
-
-            ray.kill(self._manager)
+            self.end_manager()
         if self._local is not None:
             self.close()
             self._local.stop()
+
+    def end_manager(self) -> None:
+        """End the manager, and leave streams and nodes as they are; `up` starts another one."""
+        import ray
+
+        self._ask("spec")  # it is connected then
+        ray.kill(self._manager)
+        self._manager = None
 
     def close(self) -> None:
         """Disconnect; the fleet goes on."""

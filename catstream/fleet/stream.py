@@ -241,6 +241,7 @@ class Stream:
                     endpoint=pipeline.endpoint,
                     server=public_key(self._keys) if self._place.address else "",
                     token=claim.token,
+                    began=self._began(claim),
                     lost_frames=int(facts.get("lost_frames", 0)),
                     lost_seconds=float(facts.get("lost_seconds", 0.0)),
                 )
@@ -260,6 +261,12 @@ class Stream:
             self._write(claim)
         with self._lock:
             self._pipeline = None
+
+    def _began(self, claim: Claim) -> int:
+        """The token of the first pipeline since the frames count from 0, if there were others before it; 0 otherwise."""
+        if claim.state is not None:
+            return int(claim.state.facts["began"])
+        return claim.token if claim.token > 1 else 0
 
     def _made(self, claim: Claim) -> Pipeline:
         """The pipeline, which continues from the state of the claim if there is one."""
@@ -345,6 +352,7 @@ class Stream:
             "seq": seq,
             "frame": status.frame,
             "rate": max(status.rate, self._rates.rate, self._pipeline.rate if self._pipeline is not None else 0.0),
+            "began": status.began,
             "lost_frames": status.lost_frames,
             "lost_seconds": status.lost_seconds,
             "objects": sorted(self._spec.boxes.keys() | self._spec.models.keys()),

@@ -35,7 +35,7 @@ def fleet(tmp_path_factory) -> Iterator[LocalFleet]:
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "fleet"
     folder.mkdir(exist_ok=True)
-    shared, runtime = LocalFleet(folder), Path("/tmp") / f"cs-{sha256(bytes(folder)).hexdigest()[:8]}"
+    shared, runtime = LocalFleet(folder), runtime_of(folder)
     with _user(folder / f"{os.getpid()}.user") as mine:
         with _locked(folder / "lock"), pytest.MonkeyPatch.context() as patch:
             runtime.mkdir(mode=0o700, exist_ok=True)
@@ -48,6 +48,16 @@ def fleet(tmp_path_factory) -> Iterator[LocalFleet]:
             if not any(_is_used(path) for path in folder.glob("*.user") if path != mine):
                 shared.stop()
                 shutil.rmtree(runtime)
+
+
+@pytest.fixture(scope="session")
+def runtime(fleet) -> Path:
+    """The folder in which the processes of the fleet leave the notes by which others find them."""
+    return runtime_of(fleet.folder)
+
+
+def runtime_of(folder: Path) -> Path:
+    return Path("/tmp") / f"cs-{sha256(bytes(folder)).hexdigest()[:8]}"
 
 
 @contextmanager
