@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import NamedTuple
@@ -102,7 +101,7 @@ def painted(found: list[Sequence], scenes: int, frames: int) -> Iterator[Scene]:
         cameras = []
         for number in range(_CAMERAS + 1):
             other = found[(scene * (_CAMERAS + 1) + number) % len(found)]
-            image = next(islice(other.frames(len(other) // 2), 1))
+            image = next(iter(other.frames(0)))
             background = cv2.resize(image, _SIZE).astype(np.float32)
             folder = scratch() / f"painted-{scene}-{number}"
             _paint(folder, background, frames, rng, empty=number == _CAMERAS)
