@@ -45,6 +45,12 @@ def means_only(record: Record) -> Iterator[Table]:
     yield from select(without="(?!mean|±)")(record)
 
 
+def across(record: Record) -> Iterator[Table]:
+    """Select all tables but the first one, which has a row for each scene."""
+    for number in range(1, len(record["tables"])):
+        yield from select(number)(record)
+
+
 def recognised(record: Record) -> Iterator[Table]:
     """Select all tables but the last one, which has a row for each object."""
     for number in range(len(record["tables"]) - 1):
@@ -220,6 +226,13 @@ _SAVED = """
     are learned from the first third of a sequence; `stranger` is the share of frames of other sequences in which a box
     is reported. Both were measured on ten short sequences that are not on the check list: see
     [Saved models](how-to/saved-models.md)."""
+_ACROSS = """
+    An object is learned at three cameras and searched for at a fourth one, by the model of the first camera, by those
+    that a fleet merges in pairs, and by one tree that has seen the frames of all three. The cameras are four parts of a
+    long sequence, or rendered scenes with four backgrounds in four lights. `recall` is the share of frames in which the
+    box overlaps the true one by half, `wrong` the share with another box, and `stranger` the share of frames of a
+    camera without the object in which a box is reported. See [The same object at several
+    cameras](how-to/fleet.md#the-same-object-at-several-cameras)."""
 _FOUND = """
     Every fourth object is learned from the first third of its sequence, and searched in frames of the rest and of all
     other sequences. A sighting is right if it overlaps the object by half; the average precision counts all others as
@@ -303,6 +316,7 @@ MORE = (
     Section("Frequent directions", _REDUCTION, (Shown("reduction", every),)),
     Section("Summaries", _SUMMARIES, (Shown("summary", every),)),
     Section("Saved models", _SAVED, (Shown("merge", merged), Shown("saved_models", means_only))),
+    Section("Across cameras", _ACROSS, (Shown("across_cameras", across),)),
     Section("Objects found again", _FOUND, (Shown("instance", recognised),)),
 )
 

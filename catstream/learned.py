@@ -163,7 +163,7 @@ class Learned:
                 raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")
             learned = cls._of(arrays, metadata)
             learned._check()
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        except (AttributeError, LookupError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{name} is not a saved model ({error}): `catstream save` writes one") from None
         width = len(learned.model.weights)
         if width != row_length():

@@ -236,3 +236,5 @@ def test_a_file_without_any_of_its_parts_is_an_error(learned):
             Learned.from_bytes(storage.encode(rest, metadata), "one")
         with pytest.raises(ProtocolError, match="not a saved model"):
             Learned.from_bytes(storage.encode(rest | {name: np.float32([[np.nan]])}, metadata), "one")
+        with pytest.raises(ProtocolError, match="not a saved model"):
+            Learned.from_bytes(storage.encode(rest | {name: np.float32(1)}, metadata), "one")
