@@ -30,9 +30,9 @@ QUICK = Settings(teaching={"copies": 0}, coreset={"size": 8}, run={"objects_most
 
 
 @cache
-def saved():
+def saved(size=8):
     """A saved model of the object at the first of the boxes."""
-    tracker = MultiTracker(QUICK)
+    tracker = MultiTracker(QUICK.but({"coreset.size": size}))
     tracker.init(IMAGE, {"": BOXES[0]})
     for _ in range(9):
         tracker.update(IMAGE)
@@ -188,6 +188,12 @@ def test_two_boxes_for_two_objects_begin_them_in_one_frame(handler):
         (Command("1", "set-box", BOXES[0], object="carl"), "3 objects are more than 2: follow fewer"),
         (Command("1", "set-box", BOXES[0], object="an na"), "'an na' is not a name: expected 1 to 64 letters"),
         (Command("1", "set-box", BOXES[1], object="anna"), "outside the frame"),
+        (Command("1", "search", object="anna", model=b"torn"), "the file is not an undamaged file of catstream"),
+        (
+            Command("1", "search", object="anna", model=saved(16).to_bytes()),
+            "learned with coreset.size=16, this run has",
+        ),
+        (Command("1", "search", object="carl", model=saved().to_bytes()), "3 objects are more than 2: follow fewer"),
     ],
     ids=lambda value: f"{value.verb} {value.object}" if isinstance(value, Command) else "",
 )
