@@ -12,7 +12,7 @@ import pytest
 
 from catstream import storage
 from catstream.errors import ServiceError
-from catstream.state import locked
+from catstream.state import files, locked, restore
 
 
 @pytest.fixture
@@ -53,3 +53,16 @@ def test_two_processes_that_ask_whether_a_file_is_locked_do_not_see_each_other(t
             fcntl.flock(asking, fcntl.LOCK_UN)
         assert storage.lock(owner.fileno())
         assert storage.is_locked(one.fileno())
+
+
+def test_the_files_of_a_state_are_restored_with_the_models_that_are_searched_for_and_the_newest_checkpoint(tmp_path):
+    names = ["desired_state.json", "job.safetensors", "searched_models/0af3.safetensors", "trees/000002.safetensors"]
+    for name in [*names, "trees/000001.safetensors", "log", "searched_models/.part"]:
+        (tmp_path / "old" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "old" / name).write_text(name)
+    content = files(tmp_path / "old")
+    assert sorted(content) == names
+    restore(tmp_path / "new", content)
+    assert all((tmp_path / "new" / name).read_text() == name for name in names)
+    with pytest.raises(ServiceError, match="is not a file of the state"):
+        restore(tmp_path / "new", {"searched_models/../x.safetensors": b""})
