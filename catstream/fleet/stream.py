@@ -263,7 +263,7 @@ class Stream:
             self._pipeline = None
 
     def _began(self, claim: Claim) -> int:
-        """The token of the first pipeline since the frames count from 0, if there were others before it; 0 otherwise."""
+        """Token of the pipeline with which frames began to count from 0; 0 if it was the first one of the stream."""
         if claim.state is not None:
             return int(claim.state.facts["began"])
         return claim.token if claim.token > 1 else 0
