@@ -2,8 +2,8 @@
 
 Frames are counted once. A saved model contains the origins of its trees, one for each stream of frames; a model that
 shares an origin with another one has learned from the same frames, so only one of them is merged. Merging again, or in
-another order, therefore changes nothing. The order of the pairs changes the merged trees only
-within the bound of the coreset: see `catstream.learned.merge`.
+another order, therefore changes nothing. The order of the pairs changes the merged trees only within the bound of the
+coreset: see `catstream.learned.merge`.
 """
 
 from __future__ import annotations
