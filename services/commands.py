@@ -107,8 +107,7 @@ class CommandHandler:
         if box is None:
             raise BoxError("no box was given")
         at, of_name = f"at {box} in frame {detectors.seq}", f" {name}" if name else ""
-        known, begun = detectors.detectors.get(name), self.desired.objects_at(detectors.seq)
-        if command.keep and known is not None and known.model.version and self.desired.objects[name] is begun.get(name):
+        if command.keep and self._has_model(name):
             return detectors.correct(name, frame, box, time), f"the same object{of_name} continues {at}"
         if name not in self.desired.objects:
             check_count(len(self.desired.objects) + 1, detectors.settings.run.objects_most)
@@ -116,6 +115,11 @@ class CommandHandler:
         article = "another" if name in self.desired.objects else "the"
         self.desired = self.desired.begun(name, box, result[0].seq)
         return result, f"{article} object{of_name} begins {at}"
+
+    def _has_model(self, name: str) -> bool:
+        """Whether a model was trained of an object; another one, which begins with the next frame, has none yet."""
+        known, begun = self._detectors.detectors.get(name), self.desired.objects_at(self._detectors.seq)
+        return known is not None and known.model.version > 0 and self.desired.objects.get(name) is begun.get(name)
 
     def reject_boxes(self, reason: str) -> list[Answer]:
         """Reject the boxes that wait for a frame, because there is none."""

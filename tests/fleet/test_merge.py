@@ -14,7 +14,7 @@ from catstream.compression.forest import Forest
 from catstream.compression.reduce import energy
 from catstream.errors import FleetError
 from catstream.features.layout import row_length
-from catstream.fleet.merge import Part, apart, merge_in_pairs, merge_models, saved_part
+from catstream.fleet.merge import Part, apart, merge_in_pairs, merge_models, merge_streams, saved_part
 from catstream.fleet.store import Store
 from catstream.heads import APPEARANCE, EXTENT
 from catstream.job import Job
@@ -135,30 +135,59 @@ def test_newer_states_of_the_streams_take_the_place_of_what_was_merged_before():
 
 @pytest.fixture
 def store(tmp_path):
-    """A store with a state of the stream door, which knows anna."""
-    folder = tmp_path / "state"
+    """A store with the states of three streams, which know anna."""
+    (tmp_path / "store").mkdir()
+    for seed, name in enumerate(["door", "yard", "hall"]):
+        put_state(tmp_path, name, seed)
+    return store_of(tmp_path)
+
+
+def store_of(folder):
+    return (folder / "store").as_uri()
+
+
+def put_state(tmp_path, name, seed, frames=12):
+    """Put the state of a stream into the store after some frames."""
+    folder = tmp_path / f"{name}-{frames}"
     (folder / "trees").mkdir(parents=True)
-    Job("door.mp4", settings=SETTINGS).save(folder)
+    Job(f"{name}.mp4", settings=SETTINGS).save(folder)
     forest = Forest(SETTINGS)
-    for frame, features in enumerate(stream(3)):
+    for frame, features in enumerate(stream(seed, frames)):
         forest.take(Features(frame + 1, frame, 0.0, {"anna": features}))
     CheckpointStore(folder / "trees").save(forest)
-    (tmp_path / "store").mkdir()
-    url = (tmp_path / "store").as_uri()
-    Store(url).claim("door", "here").write(files(folder), {})
-    return url
+    Store(store_of(tmp_path)).claim(name, "here").write(files(folder), {})
 
 
 def test_the_part_of_a_stream_is_what_its_newest_state_has_learned(store):
-    part, data = saved_part(store, "door", "anna", named=True)
-    assert Learned.from_bytes(data, "").origins == learned(3).origins
-    assert part == Part.of(learned(3))
-    assert (
-        saved_part(store, "door", "ben", named=False) == saved_part(store, "yard", "anna", named=False) == (None, None)
-    )
+    part, data = saved_part(store, "hall", "anna", named=True)
+    assert Learned.from_bytes(data, "").origins == learned(2).origins
+    assert part == Part.of(learned(2))
     for stream_name, name, why in [
         ("door", "ben", "stream door: there is no object 'ben'"),
-        ("yard", "anna", "stream yard: there is no state of it in the store yet"),
+        ("gate", "anna", "stream gate: there is no state of it in the store yet"),
     ]:
+        assert saved_part(store, stream_name, name, named=False) == (None, None)
         with pytest.raises(FleetError, match=why):
             saved_part(store, stream_name, name, named=True)
+
+
+@pytest.mark.usefixtures("fleet")
+def test_the_nodes_merge_the_states_in_the_store_and_only_a_new_model_is_stored(store, tmp_path):
+    streams = ["door", "yard", "hall", "gate"]
+    merged = merge_streams(store, streams, "anna", named=False)
+    assert set(merged.streams) == {"door", "yard", "hall"}
+    assert merged.model == merge_models([learned(seed).to_bytes() for seed in range(3)])
+    first = Store(store).get_model("anna")
+    assert first.files["model"] == merged.model
+    again = merge_streams(store, streams, "anna", named=False)
+    assert again.model == merged.model
+    assert set(again.left) == {"door", "yard", "hall"}
+    assert Store(store).get_model("anna", first.number) is None
+    for seed, name in enumerate(merged.streams):
+        put_state(tmp_path, name, streams.index(name), 14 + seed)
+    assert set(merge_streams(store, streams, "anna", named=False).streams) == set(merged.streams)
+    assert Store(store).get_model("anna").number > first.number
+    with pytest.raises(FleetError, match="stream gate: there is no state of it in the store yet"):
+        merge_streams(store, ["door", "gate"], "anna", named=True)
+    with pytest.raises(FleetError, match="no stream has learned of 'ben' yet"):
+        merge_streams(store, streams, "ben", named=False)
