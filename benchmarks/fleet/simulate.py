@@ -28,6 +28,7 @@ CAMERAS = (1000, 3000, 10_000, 30_000, 100_000)
 YEAR = 365 * 86400.0
 _DAY = 86400.0
 _AT, _WATCHED = 61.3, 1800.0  # time of the faults of a scenario, and its end, in seconds
+_YOUNG_STATE = 1e6  # bytes, of a stream that has tracked for a minute
 _MOST = 300_000  # cameras up to which limits are searched
 #: Seconds in which the streams of a machine (99 of 100) and of a rack (all of them) have to be back.
 MACHINE_BACK, RACK_BACK = 15.0, 60.0
@@ -193,11 +194,11 @@ def breaking(costs: Costs, prices: Prices, seed: int) -> Table:
 
 
 def course(costs: Costs, cameras: Sequence[int], seed: int) -> Table:
-    """Share of a lost rack's streams that are back, over time, of the smallest, a middle and the largest fleet."""
+    """Share of a lost rack's streams that are back, over time, for three sizes of a fleet."""
     seconds = [float(second) for second in range(0, 121, 2)]
     columns: dict[str, list[float]] = {}
     for variant in ("as built", "both, 10 heads"):
-        for number in (cameras[0], cameras[len(cameras) // 2], cameras[-1]):
+        for number in (cameras[0], cameras[len(cameras) // 2], cameras[-2]):
             size = Size(number, costs, replace(Site(), **VARIANTS[variant]))
             found = simulate(size, scenarios(size)["a rack"], seed, _WATCHED)
             down, lost = np.sort(found.down), max(len(found.unlearnt), 1)
@@ -218,6 +219,25 @@ def placing(costs: Costs, cameras: Sequence[int], seed: int) -> Table:
     return Table("Placement and recovery", ("cameras", "on", "p50 s", "p99 s", "last s"), rows)
 
 
+def check(costs: Costs, found: Mapping[str, Any]) -> Table:
+    """The recoveries of the fleet of `faults.py`, simulated, beside those that it measured."""
+    site = Site(cores=2, fill=0.6, rack=1, spare=0.0, pages=0)
+    size = Size(6, replace(costs, state=_YOUNG_STATE), site)
+    runs = [record for record in found.values() if "benchmarks/fleet/faults.py" in record["command"]]
+    measured = {row[0]: row for record in runs for row in record["tables"][0]["rows"]}
+    rows = []
+    for name, silent in (("node killed", False), ("node frozen", True)):
+        outcomes = [
+            simulate(size, [NodesLost(_AT + seed / 7, range(1), _WATCHED, silent)], seed, _WATCHED)
+            for seed in range(50)
+        ]
+        down = [seconds for outcome in outcomes for seconds in outcome.down]
+        real = measured.get(name, (name, None, None, None))
+        rows.append((name, *map(float, np.percentile(down, (50, 99))), real[2], real[3]))
+    columns = ("fault", "p50 s, simulated", "p99 s", "p50 s, measured", "p99 s")
+    return Table("Three nodes and six streams on one machine", columns, rows)
+
+
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     found = records()
     costs, prices = Costs.read(found), Prices()
@@ -232,6 +252,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     if not options.quick:
         yield breaking(costs, prices, options.seed)
     yield course(costs, cameras, options.seed)
+    yield check(costs, found)
 
 
 if __name__ == "__main__":
