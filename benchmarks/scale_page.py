@@ -241,8 +241,8 @@ _BEYOND = """
 
     - **Several heads, one for each site.** A stream needs a machine that can reach its camera, so fleets have borders
       already: give each site a `fleet.toml`, a head and a store of its own. Nothing is shared, so all figures of this
-      page hold for each; a site that fails takes no other with it. To merge an object of several fleets, copy its saved models
-      and use `catstream merge`.
+      page hold for each; a site that fails takes no other with it. To merge an object of several fleets, copy its
+      saved models and use `catstream merge`.
 
     - **A faster store, or several.** S3 grows with its load by prefix, and each stream has a prefix of its own. For a
       store of your own, divide the streams among several fleets.
@@ -280,7 +280,10 @@ SECTIONS = (
     Section(
         "What was measured, and what was assumed",
         _measured,
-        (Shown("fleet_costs", lambda record: _tables(record, 0, 1, without=_FEWER)), Shown("scale", select(0))),
+        (
+            Shown("fleet_costs", lambda record: _tables(record, 0, 1, without=_FEWER)),
+            Shown("scale", select(0, without="fullest_first|pushed|heads|connection")),
+        ),
     ),
 )
 
