@@ -188,10 +188,11 @@ def _money(found: Records) -> str:
 _MANAGER = """
         ![Share of one core of the manager against the number of cameras](images/scale-head.svg)
 
-        The manager is one Python process, so it has one core. A turn is what it does for all streams before it can
-        start one: it observes, decides and answers. Up to half a second a turn costs nothing but processor; beyond,
-        everything waits for it. Decisions are made by `reconcile`, whose cost grows with the streams, and with the
-        streams times the machines if many have to be placed."""
+        The manager is one Python process, so it has one core. A turn is all that it does for the streams before it can
+        start one: it observes, decides and answers. While a turn takes longer than half a second, everything waits for
+        it. A decision costs more with more streams, and with more machines if many streams have to be placed. The
+        registry collects the state of all streams for each answer, and an answer lists at most 256, so the cost of a
+        page grows with the square of the number of streams."""
 
 
 _FEWER = "(3000|30000|listing_read|listing_bytes) |100000 a "  # rows that are in the record only
@@ -282,7 +283,7 @@ SECTIONS = (
         _measured,
         (
             Shown("fleet_costs", lambda record: _tables(record, 0, 1, without=_FEWER)),
-            Shown("scale", select(0, without="fullest_first|pushed|heads|connection")),
+            Shown("scale", select(0, without="fullest_first|pushed|heads|connection|get")),
         ),
     ),
 )
