@@ -12,6 +12,7 @@ nor the token, see `catstream.subscribe`.
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Iterable
@@ -35,6 +36,8 @@ __all__ = ["Fleet"]
 _ANSWER_SECONDS = (20.0, 60.0)  # limits for the manager to answer, and to start before that
 _DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
 _TURN_SECONDS = 0.2
+
+_log = logging.getLogger(__name__)
 
 
 class Fleet:
@@ -166,14 +169,22 @@ class Fleet:
 
     def down(self) -> None:
         """Stop all streams after their state was stored, and the manager; on this machine alone, the nodes too."""
-        deadline = time.monotonic() + _DOWN_SECONDS
-        if self._local is None or self._local.running:
-            while self._ask("close") and time.monotonic() < deadline:
-                time.sleep(_TURN_SECONDS)
-            self.end_manager()
+        try:
+            if self._local is None or self._local.running:
+                self._stop_streams()
+        except FleetError as error:
+            if self._local is None:
+                raise
+            _log.warning("%s: the streams end with their last states in the store", error)
         if self._local is not None:
             self.close()
             self._local.stop()
+
+    def _stop_streams(self) -> None:
+        deadline = time.monotonic() + _DOWN_SECONDS
+        while self._ask("close") and time.monotonic() < deadline:
+            time.sleep(_TURN_SECONDS)
+        self.end_manager()
 
     def end_manager(self) -> None:
         """End the manager, and leave streams and nodes as they are; `up` starts another one."""

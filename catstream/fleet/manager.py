@@ -39,7 +39,9 @@ Models = dict[tuple[str, str], bytes]
 
 _TURN_SECONDS = 0.05  # between two looks at the questions of the registry
 _RECONCILE_SECONDS = 0.5
+_RECENT_SECONDS = 0.3  # for which the registry answers with the same state
 _ANSWER_SECONDS = 10.0  # limit for a stream to answer
+_SILENT_SECONDS = 120.0  # after which a stream that does not answer counts as dead, on a busy machine too
 _SAVE_SECONDS = 60.0  # between two copies of the measured cores in the store
 _MODELS_SECONDS = 10.0  # between two looks at the merged models
 _SKIPS_SECONDS = 5.0  # interval of the share of skipped frames
@@ -65,6 +67,7 @@ class _Running:
     """The actor of a stream, as the manager sees it.
 
     asked     the call for its report that was not answered yet
+    answered  moment of its last answer
     stopping  the call that ends it
     kill      moment at which it is killed if it does not end
     dead      whether its process has died
@@ -79,6 +82,7 @@ class _Running:
     since: float = field(default_factory=time.monotonic)
     report: Report | None = None
     asked: Any = None
+    answered: float = field(default_factory=time.monotonic)
     stopping: Any = None
     kill: float = math.inf
     dead: bool = False
@@ -151,7 +155,7 @@ class Manager:
         self._last: dict[str, StreamStatus] = {}  # the last report of each stream
         self._starts: dict[str, int] = {}
         self._clients: dict[str, Client] = {}
-        self._trouble = ""
+        self._recent = FleetStatus(name, 0.0)
         self._saved = self._clients_due = self._models_due = 0.0
         self._closing = False
         self._adopt()
@@ -265,7 +269,7 @@ class Manager:
 
     def _run(self, listen: str) -> None:
         due = time.monotonic()
-        with RegistryServer(listen, str(self._keys or ""), self.status) as registry:
+        with RegistryServer(listen, str(self._keys or ""), self._recent_status) as registry:
             while True:
                 registry.turn(_TURN_SECONDS)
                 if time.monotonic() >= due:
@@ -274,6 +278,12 @@ class Manager:
                         self._turn()
                     except Exception:  # the next turn may succeed; the streams do not need the manager
                         _log.exception("A turn of the manager failed.")
+
+    def _recent_status(self) -> FleetStatus:
+        """The state of at most a third of a second ago: a large fleet is read in many parts, and by many clients."""
+        if time.time() - self._recent.time > _RECENT_SECONDS:
+            self._recent = self.status()
+        return self._recent
 
     def _turn(self) -> None:
         """Observe, decide, and carry out."""
@@ -327,7 +337,7 @@ class Manager:
                 try:
                     answer = ray.get(waiting)
                     if running.stopping is None:
-                        running.report, running.asked = answer, None
+                        running.report, running.asked, running.answered = answer, None, time.monotonic()
                         self._measure(name, answer.status)
                 except RayError as error:
                     _log.warning("%s on %s: %s", name, running.node, str(error).splitlines()[0])
@@ -335,6 +345,10 @@ class Manager:
             node = self._nodes.get(running.node)
             gone = node is None or not node.alive
             late = time.monotonic() > running.kill
+            if not gone and time.monotonic() - running.answered > _SILENT_SECONDS and running.stopping is None:
+                _log.warning("%s on %s has not answered for %.0f s, and is ended", name, running.node, _SILENT_SECONDS)
+                self._kill(running)
+                running.dead = True
             if gone or late or (running.stopping is not None and ready):
                 self._kill(running)
                 del self._running[name]
@@ -412,7 +426,7 @@ class Manager:
                 if (found := self._store.get_model(followed, self._models.get(followed, 0))) is not None:
                     self._models[followed] = found.number
         except StoreError as error:
-            self._trouble = str(error)
+            _log.warning("the merged models cannot be read: %s", error)
         for name, running in self._running.items():
             for followed in streams[name].follow if name in streams and running.phase == "running" else ():
                 if (newest := self._models.get(followed, 0)) > running.given.get(followed, 0):
@@ -425,7 +439,7 @@ class Manager:
             try:
                 self._store.remove(name)
             except StoreError as error:
-                self._trouble = str(error)
+                _log.warning("the state of %s is not removed yet: %s", name, error)
                 return
             self._record = replace(self._record, forgotten=self._record.forgotten - {name})
 
@@ -434,9 +448,7 @@ class Manager:
         self._saved = time.monotonic()
         try:
             self._store.put_fleet(self._record.to_json())
-            self._trouble = ""
         except StoreError as error:
-            self._trouble = str(error)
             _log.warning("the desired state cannot be stored: %s", error)
 
     # What is desired and observed, as `reconcile` takes it.
