@@ -262,6 +262,11 @@ def connect(address: str, token_file: Path) -> None:
     host, port = private_address(address)
     if _connected(f"{host}:{port}"):
         return
+    if "ray" in sys.modules and os.environ.get("RAY_AUTH_MODE") != "token":
+        raise FleetError(
+            "Ray was imported before the fleet, without a token: use the fleet first, or start the program with "
+            "RAY_AUTH_MODE=token"
+        )
     found = probe(address, token_file)
     _check_versions(found)
     if not any(Path(entry["socket"]).exists() for entry in found):
@@ -282,16 +287,7 @@ def connect(address: str, token_file: Path) -> None:
         try:
             ray.init(address, namespace=NAMESPACE, log_to_driver=False, logging_level=logging.ERROR)
         except (ray.exceptions.RayError, ConnectionError, RuntimeError, ValueError) as error:
-            raise FleetError(_refusal(address, error)) from None
-
-
-def _refusal(address: str, error: Exception) -> str:
-    if isinstance(error, sys.modules["ray"].exceptions.AuthenticationError):
-        return (
-            "Ray was imported before the fleet, without a token: import catstream.fleet first, or start the program "
-            "with RAY_AUTH_MODE=token"
-        )
-    return f"cannot connect to the fleet at {address}: {_first_line(str(error))}"
+            raise FleetError(f"cannot connect to the fleet at {address}: {_first_line(str(error))}") from None
 
 
 def _connected(address: str) -> bool:

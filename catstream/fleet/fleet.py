@@ -36,6 +36,7 @@ __all__ = ["Fleet"]
 _ANSWER_SECONDS = (20.0, 60.0)  # limits for the manager to answer, and to start before that
 _DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
 _TURN_SECONDS = 0.2
+_MANAGER = actor_name("", "manager")  # how the names of the managers end
 
 _log = logging.getLogger(__name__)
 
@@ -188,9 +189,9 @@ class Fleet:
 
     def end_manager(self) -> None:
         """End the manager, and leave streams and nodes as they are; `up` starts another one."""
+        self._ask("spec")  # it is connected then
         import ray
 
-        self._ask("spec")  # it is connected then
         ray.kill(self._manager)
         self._manager = None
 
@@ -233,6 +234,7 @@ class Fleet:
 
     def _ask(self, method: str, *arguments: object, **options: object) -> Any:
         """Call a method of the manager, and wait for its answer; connects again if the head has started again."""
+        self._connect()  # before Ray is imported, which reads its variables then
         from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 
         why = ""
@@ -253,6 +255,7 @@ class Fleet:
 
         if self._manager is None:
             self._connect()
+            self.name = self.name or self._only_fleet()
             try:
                 self._manager = ray.get_actor(actor_name(self.name, "manager"), namespace=NAMESPACE)
             except ValueError:
@@ -260,6 +263,19 @@ class Fleet:
                     f"there is no fleet {self.name!r} on this cluster: start it with catstream fleet up"
                 ) from None
         return ray.get(getattr(self._manager, method).remote(*arguments, **options), timeout=seconds)
+
+    def _only_fleet(self) -> str:
+        """The name of the only fleet of the connected cluster."""
+        from ray.util import list_named_actors
+
+        actors = [each["name"] for each in list_named_actors(all_namespaces=True) if each["namespace"] == NAMESPACE]
+        names: list[str] = sorted(each.removesuffix(_MANAGER) for each in actors if each.endswith(_MANAGER))
+        if len(names) != 1:
+            help_ = (
+                f"say which (--name), there are {', '.join(names)}" if names else "start one with catstream fleet up"
+            )
+            raise FleetError(f"{len(names)} fleets run on the cluster at {self._address}: {help_}")
+        return names[0]
 
 
 def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:

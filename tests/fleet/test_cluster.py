@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -238,6 +239,30 @@ def test_a_fleet_is_found_again_by_its_folder(fleet):
 def test_a_process_uses_one_fleet_at_a_time(token):
     with pytest.raises(FleetError, match="one fleet at a time"):
         cluster.connect("10.0.0.1:6400", token)
+
+
+def test_ray_that_was_imported_without_a_token_is_refused_at_once(token, monkeypatch):
+    monkeypatch.setattr(cluster, "_connected", lambda _: False)
+    monkeypatch.setitem(sys.modules, "ray", import_module("ray"))
+    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
+    with pytest.raises(FleetError, match="Ray was imported before the fleet"):
+        cluster.connect("10.0.0.1:6400", token)
+
+
+def test_a_command_connects_before_it_imports_ray(token):
+    program = f"""
+import sys
+from catstream.errors import FleetError
+from catstream.fleet import fleet
+
+def connect(*_):
+    raise FleetError("ray" if "ray" in sys.modules else "nothing was imported")
+
+fleet.connect = connect
+fleet.Fleet(name="site", address="10.0.0.1:6400", token_file={str(token)!r}).move("cam-7", "north-1")
+"""
+    done = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=False)
+    assert "FleetError: nothing was imported" in done.stderr
 
 
 def test_a_wrong_token_is_refused_by_the_head(fleet, token):
