@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import socket
 import subprocess
 import sys
@@ -323,22 +324,23 @@ from catstream.wire.channels import RESULTS
 from catstream.wire.endpoint import Endpoint
 with Receiver(RESULTS, Endpoint.parse(sys.argv[1]), Position(), 1) as receiver:
     print("ready", flush=True)
+    receiver._socket.poll()
+    print("arrived", flush=True)
     sys.stdin.readline()
     time.sleep(1.5)
-    print(receiver.receive(1).seq)
+    print(receiver.receive(60).seq)
 """
 
 
-def test_a_receiver_with_a_full_queue_survives_its_sender(endpoint):
+def test_a_receiver_with_a_full_queue_survives_its_sender(endpoint, until):
     command = [sys.executable, "-c", BUSY_RECEIVER, str(endpoint)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as busy:
         assert busy.stdout.readline() == "ready\n"
         with Sender(RESULTS, endpoint, 8) as sender:
             for seq in range(1, 9):
                 sender.send(tracks(seq))
-            for _ in range(5):
-                sender.poll(0.1)
-        assert busy.communicate("gone\n", timeout=60)[0] == "1\n"
+            until(lambda: select.select([busy.stdout], [], [], 0)[0], lambda: sender.poll(0.1))
+        assert busy.communicate("gone\n", timeout=60)[0] == "arrived\n1\n"
     assert busy.returncode == 0
 
 
