@@ -138,6 +138,7 @@ class Stream:
         self._store_trouble = self._failure = ""
         self._source_failed = self._fenced = False
         self._seq = 0
+        self._present: set[str] = set()  # objects that the last frame shows
         self._stack = ExitStack()
         self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-stream-")))
         self._keys = self._folder / "keys"
@@ -177,13 +178,8 @@ class Stream:
                 synchronise(self._keys, clients)
 
     def search(self, followed: str) -> None:
-        """Search for an object by the newest merged model of it in the store."""
-        pipeline = self._pipeline
-        if pipeline is not None:
-            try:
-                self._search(pipeline, followed, followed)
-            except CatstreamError as error:
-                _log.warning("%s does not search for %s: %s", self._spec.name, followed, error)
+        """Search for an object by the newest merged model of it in the store, once it is not present."""
+        threading.Thread(target=self._search_when_absent, args=(followed,), name="search", daemon=True).start()
 
     def stop(self) -> None:
         """End the pipeline, and store its last state; returns when that is done."""
@@ -316,6 +312,16 @@ class Stream:
         for name in sorted(self._spec.models.keys() - before):
             self._search(pipeline, given_model(self._spec.name, name), name)
 
+    def _search_when_absent(self, followed: str) -> None:
+        while not self._stop.wait(_TURN_SECONDS):
+            pipeline = self._pipeline
+            if pipeline is not None and followed not in self._present:
+                try:
+                    self._search(pipeline, followed, followed)
+                except CatstreamError as error:
+                    _log.warning("%s does not search for %s: %s", self._spec.name, followed, error)
+                return
+
     def _search(self, pipeline: Pipeline, stored: str, name: str) -> None:
         """Search for an object by a saved model in the store."""
         if (model := self._store.get_model(stored)) is None:
@@ -334,6 +340,7 @@ class Stream:
                 newest = next(iter(tracks.values()))
                 models = {name: track.model_version for name, track in tracks.items()}
                 self._seq = newest.seq
+                self._present = {name for name, track in tracks.items() if track.box is not None}
                 status = replace(status, frame=newest.frame, models=models)
             state = _HOLDING.get(pipeline.holding, "running" if self._seq else "starting")
             skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
