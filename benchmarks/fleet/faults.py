@@ -26,7 +26,6 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 
 from arena import Link
 from chaos import fingerprint, quantiles, undisturbed
-from nodes import freeze_node, kill_node, thaw_node
 from table import Table, command, publish
 
 from catstream.box import Box
@@ -36,6 +35,7 @@ from catstream.fleet.fleet import Fleet
 from catstream.fleet.local import LocalFleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
+from catstream.loadtest.nodes import freeze_node, kill_node, thaw_node
 from catstream.messages import FleetStatus, StreamStatus
 from catstream.registry import Registry
 from catstream.settings import Settings

@@ -54,6 +54,8 @@ class Fleet:
         HOST:PORT of the head of a cluster. Empty for a fleet on this machine alone, which `up` starts.
     token_file : path
         File with the token of the cluster, with an address. Whoever has it can run any code on the cluster.
+    folder : path
+        Folder of a fleet on this machine; by default the one of its name in $XDG_STATE_HOME/catstream/fleets.
 
     Raises
     ------
@@ -71,12 +73,13 @@ class Fleet:
         name: str = "",
         address: str = "",
         token_file: str | os.PathLike[str] | None = None,
+        folder: str | os.PathLike[str] | None = None,
     ) -> None:
         require_extra("fleet")
         self._spec = spec if isinstance(spec, FleetSpec) or spec is None else FleetSpec.load(Path(spec))
         self.name = name or (self._spec.name if self._spec is not None else "")
         self._address, self._token_file = address, Path(token_file) if token_file is not None else None
-        self._local = None if address else self._local_fleet()
+        self._local = None if address else LocalFleet(Path(folder)) if folder is not None else self._local_fleet()
         self._manager: Any = None
 
     def up(self, *, nodes: int | None = None, cores: float | None = None) -> list[str]:

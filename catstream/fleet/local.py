@@ -99,6 +99,7 @@ class LocalFleet:
             self._keep(began, {name: self._node(name, cores or 0.0, {}) for name in missing})
         except BaseException:
             self._stop(began)
+            self._end_children(began.values())
             raise
 
     def start_node(self, name: str, cores: float, labels: dict[str, str] | None = None) -> None:
@@ -183,6 +184,13 @@ class LocalFleet:
             for name, pid in pids.items():
                 if holder(name, self.folder) == pid:
                     _signal(pid, signal.SIGKILL)  # Ray ends with its keeper
+
+    def _end_children(self, pids: Iterable[int]) -> None:
+        """End background processes that were started just now and do not hold their lock yet, and wait for them."""
+        left = [pid for pid in pids if not _has_ended(pid)]
+        for pid in left:
+            _signal(pid, signal.SIGTERM)
+        _wait(lambda: all(map(_has_ended, left)), _END_SECONDS)
 
     def _last_line(self, name: str) -> str:
         lines = (self.folder / "logs" / f"{name}.log").read_text(errors="replace").strip().splitlines()

@@ -43,6 +43,18 @@ class Observations:
             and self.tracks[-1][1].model_version >= self.first_motion_version
         )
 
+    def add(self, moment: float, message: object) -> None:
+        """Add a message that arrived at a moment."""
+        match message:
+            case Track(object=""):
+                self.tracks.append((moment, message))
+            case Model(object=""):
+                self.models.append((moment, message.frame))
+                if message.motion is not None:
+                    self.first_motion_version = self.first_motion_version or message.version
+            case Health():
+                self.health.append((moment, message))
+
 
 class Observer(threading.Thread):
     """A thread that subscribes to the pipelines until `end` is called.
@@ -66,16 +78,7 @@ class Observer(threading.Thread):
                 for channel in _CHANNELS
             }
             for (number, _), moment, message in arrivals(readers, self._ended.is_set):
-                match message:
-                    case Track(object=""):
-                        self.observations[number].tracks.append((moment, message))
-                    case Model(object=""):
-                        observations = self.observations[number]
-                        observations.models.append((moment, message.frame))
-                        if message.motion is not None:
-                            observations.first_motion_version = observations.first_motion_version or message.version
-                    case Health():
-                        self.observations[number].health.append((moment, message))
+                self.observations[number].add(moment, message)
 
     def end(self) -> None:
         self._ended.set()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from os import getpid
@@ -11,7 +11,7 @@ from time import monotonic
 
 import numpy as np
 
-from catstream.errors import ServiceError
+from catstream.errors import CatstreamError, ServiceError
 from catstream.loadtest.camera import Camera
 from catstream.loadtest.chaos import Chaos, Kill
 from catstream.loadtest.latencies import Latencies
@@ -21,12 +21,13 @@ from catstream.loadtest.plan import Plan
 from catstream.loadtest.stream import Stream
 from catstream.loadtest.subscribers import Subscribers
 from catstream.loadtest.usage import REST, Usage, UsageReading, summary
+from catstream.messages import StreamStatus
 from catstream.video.broadcast import Schedule
 
-__all__ = ["Recovery", "Result", "Status", "run"]
+__all__ = ["LEAD_SECONDS", "Monitor", "Recovery", "Result", "Status", "recovery", "run", "wait_until"]
 
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
-_LEAD_SECONDS = 0.5  # from the end of the start to the first frame
+LEAD_SECONDS = 0.5  # from the end of the start to the first frame
 _GRACE_SECONDS = 3.0  # to wait for the track of the last frame
 _NO_KILL_SECONDS = 5.0  # no kills this long before the last frame, so that killed processes can recover
 _READING_SECONDS = 0.5  # between two readings of processor and memory use
@@ -65,6 +66,7 @@ class Result:
     frozen       seconds for which the frozen subscribers were stopped
     camera_late  largest delay in seconds of a frame that the camera itself caused
     errors       errors of failed streams
+    statuses     last state of each stream of a fleet; empty if there is no fleet
     interrupted  whether the run was interrupted
     """
 
@@ -79,6 +81,7 @@ class Result:
     frozen: float
     camera_late: float
     errors: list[str] = field(default_factory=list)
+    statuses: list[StreamStatus] = field(default_factory=list)
     interrupted: bool = False
 
     @property
@@ -95,6 +98,11 @@ class Result:
     def other_load(self) -> float:
         """Mean number of cores that were busy with processes outside the load test."""
         return summary(self.usage[REST])["cores"] if REST in self.usage else 0.0
+
+    @property
+    def killed_nodes(self) -> int:
+        """Number of kills of nodes; the streams that one kill hit have the same moment."""
+        return len({recovery.kill.moment for recovery in self.recoveries}) if self.plan.kill_nodes else 0
 
     @property
     def missed_share(self) -> float:
@@ -121,8 +129,17 @@ def run(plan: Plan, camera: Camera, report_status: Callable[[Status], None] = la
     streams = [Stream(number, url, camera.boxes, plan.settings) for number, url in enumerate(camera.urls)]
     with ExitStack() as stack:
         observer, groups = _started(plan, streams, stack, report_status)
-        schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS, plan.rate, plan.frames))
-        monitor = _Monitor(plan, camera, streams, groups, observer)
+        schedules = camera.play(Schedule(monotonic() + LEAD_SECONDS, plan.rate, plan.frames))
+        chaos = Chaos(plan.settings.run.seed) if plan.chaos else None
+        last_kill = schedules[-1].due(plan.frames - 1) - _NO_KILL_SECONDS
+
+        def turn() -> bool:
+            if chaos is not None and monotonic() < last_kill:
+                chaos.step(streams)
+            return any(stream.is_alive() for stream in streams)
+
+        kills = chaos.kills if chaos is not None else []
+        monitor = Monitor(plan, camera, observer.observations, kills, turn, lambda: _pids(streams, groups))
         interrupted = False
         try:
             monitor.run(schedules, report_status)
@@ -149,7 +166,7 @@ def run(plan: Plan, camera: Camera, report_status: Callable[[Status], None] = la
         seconds=min(due) / plan.rate,
         streams=figures,
         restarts=sum(stream.restarts for stream in streams),
-        recoveries=[_recovery(kill, observer.observations[kill.stream]) for kill in monitor.kills],
+        recoveries=[recovery(kill, observer.observations[kill.stream]) for kill in kills],
         usage=monitor.usage.readings,
         received=[count for group in groups for count in group.received()],
         missed=[count for group in groups for count in group.missed()],
@@ -164,75 +181,91 @@ def _started(
     plan: Plan, streams: list[Stream], stack: ExitStack, report_status: Callable[[Status], None]
 ) -> tuple[Observer, list[Subscribers]]:
     """Start the pipelines, wait for their first models, then connect the subscribers; the stack ends all of them."""
+
+    def errors() -> list[CatstreamError | None]:
+        return [stream.error for stream in streams]
+
     for stream in streams:
         stack.callback(stream.stop)
         stream.start()
     stack.callback(_ask_to_stop, streams)
-    _wait_until(lambda: all(stream.ready.is_set() for stream in streams), streams, "starting processes", report_status)
+    wait_until(lambda: all(stream.ready.is_set() for stream in streams), errors, "starting processes", report_status)
     keys = plan.settings.run.keys
     observer = Observer([stream.endpoint for stream in streams], keys)
     observer.start()
     stack.callback(observer.end)
     seen = observer.observations
-    _wait_until(lambda: all(each.warmed_up for each in seen), streams, "learning the first models", report_status)
+    wait_until(lambda: all(each.warmed_up for each in seen), errors, "learning the first models", report_status)
     counts = {"readers": plan.subscribers, "slow": plan.slow - plan.frozen, "frozen": plan.frozen}
     groups = [stack.enter_context(Subscribers(stream.endpoint, keys=keys, **counts)) for stream in streams]
-    _wait_until(lambda: all(group.connected for group in groups), streams, "attaching subscribers", report_status)
+    wait_until(lambda: all(group.connected for group in groups), errors, "attaching subscribers", report_status)
     for group in groups:
         group.freeze()
     return observer, groups
 
 
-class _Monitor:
-    """Runs the loop during the schedule: readings of the processes, kills, and status reports."""
+class Monitor:
+    """Runs the loop during the schedule: readings of the processes, and status reports.
+
+    Parameters
+    ----------
+    observations : of each stream, while they are made
+    kills : the kills so far
+    turn : called about twenty times a second; returns whether to go on: false if all streams have failed
+    pids : ids of the processes by name, without the camera and this process
+
+    Attributes
+    ----------
+    usage : readings of the processes
+    """
 
     def __init__(
-        self, plan: Plan, camera: Camera, streams: list[Stream], groups: list[Subscribers], observer: Observer
+        self,
+        plan: Plan,
+        camera: Camera,
+        observations: list[Observations],
+        kills: list[Kill],
+        turn: Callable[[], bool],
+        pids: Callable[[], dict[str, list[int]]],
     ) -> None:
-        self._plan, self._camera, self._streams, self._crowds = plan, camera, streams, groups
-        self._seen = observer.observations
-        self._chaos = Chaos(plan.settings.run.seed) if plan.chaos else None
+        self._plan, self._camera, self._seen, self._kills = plan, camera, observations, kills
+        self._turn, self._pids = turn, pids
         self._last_reading = 0.0
         self.usage = Usage()
-
-    @property
-    def kills(self) -> list[Kill]:
-        return self._chaos.kills if self._chaos else []
 
     def run(self, schedules: list[Schedule], report_status: Callable[[Status], None]) -> None:
         """Run until the last frame is tracked or its grace time is over, or all streams have failed."""
         frames, last = self._plan.frames, schedules[-1].due(self._plan.frames - 1)
-        while (now := monotonic()) < last + _GRACE_SECONDS and any(stream.is_alive() for stream in self._streams):
+        while (now := monotonic()) < last + _GRACE_SECONDS and self._turn():
             if now > last and all(map(self._all_tracked, self._seen, schedules)):
                 break
             if now - self._last_reading >= _READING_SECONDS:
                 self._last_reading = now
-                self.usage.read(now, self._pids())
-            if self._chaos and now < last - _NO_KILL_SECONDS:
-                self._chaos.step(self._streams)
+                own = {"camera": [self._camera.pid], "this process": [getpid()]}
+                self.usage.read(now, self._pids() | own)
             passed = min(max(now - schedules[0].start, 0.0), self._plan.duration)
             latest = max(
                 observations.tracks[-1][0] - (observations.tracks[-1][1].pts or 0.0) for observations in self._seen
             )
             received = sum(len(observations.tracks) for observations in self._seen)
-            killed = f", {len(self.kills)} killed" if self._chaos else ""
+            killed = (
+                f", {len({kill.moment for kill in self._kills})} killed"
+                if self._plan.chaos or self._plan.kill_nodes
+                else ""
+            )
             figures = f"{received} tracks, the last {1000 * latest:.0f} ms after its frame{killed}"
-            report_status(Status(f"{frames * len(self._streams)} frames", passed / self._plan.duration, figures))
+            report_status(Status(f"{frames * len(self._seen)} frames", passed / self._plan.duration, figures))
             time.sleep(_LOOP_SECONDS)
 
     def _all_tracked(self, observations: Observations, schedule: Schedule) -> bool:
         newest = observations.tracks[-1][1].pts
         return newest is not None and schedule.number(newest) >= self._plan.frames - 1
 
-    def _pids(self) -> dict[str, list[int]]:
-        pids = {
-            f"{name} {number}": [pid]
-            for number, stream in enumerate(self._streams)
-            for name, pid in stream.pids.items()
-        }
-        pids |= {"camera": [self._camera.pid], "this process": [getpid()]}
-        readers = [pid for group in self._crowds for pid in group.pids]
-        return pids | ({"subscribers": readers} if readers else {})
+
+def _pids(streams: list[Stream], groups: list[Subscribers]) -> dict[str, list[int]]:
+    pids = {f"{name} {number}": [pid] for number, stream in enumerate(streams) for name, pid in stream.pids.items()}
+    readers = [pid for group in groups for pid in group.pids]
+    return pids | ({"subscribers": readers} if readers else {})
 
 
 def _ask_to_stop(streams: list[Stream]) -> None:
@@ -241,15 +274,18 @@ def _ask_to_stop(streams: list[Stream]) -> None:
         stream.ask_to_stop()
 
 
-def _wait_until(
-    condition: Callable[[], bool], streams: list[Stream], activity: str, report_status: Callable[[Status], None]
+def wait_until(
+    condition: Callable[[], bool],
+    errors: Callable[[], Iterable[CatstreamError | None]],
+    activity: str,
+    report_status: Callable[[Status], None],
 ) -> None:
     """Wait for a condition of the start. Raises the error of a stream that failed."""
     deadline = monotonic() + _START_TIMEOUT_SECONDS
     while not condition():
-        for stream in streams:
-            if stream.error is not None:
-                raise stream.error
+        for error in errors():
+            if error is not None:
+                raise error
         if monotonic() > deadline:
             raise ServiceError(
                 f"{activity} took more than {_START_TIMEOUT_SECONDS:.0f} s: this machine is too slow or too busy, "
@@ -259,7 +295,8 @@ def _wait_until(
         time.sleep(_LOOP_SECONDS)
 
 
-def _recovery(kill: Kill, observations: Observations) -> Recovery:
+def recovery(kill: Kill, observations: Observations) -> Recovery:
+    """Compute the recovery of a stream from a kill."""
     track = next((moment for moment, track in observations.tracks if (track.pts or 0.0) > kill.moment), None)
     model = next((moment for moment, _ in observations.models if moment > kill.moment), None)
     return Recovery(kill, *(None if moment is None else moment - kill.moment for moment in (track, model)))

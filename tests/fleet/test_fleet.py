@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 
 import catstream
@@ -12,10 +9,8 @@ from catstream.errors import FleetError
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
+from catstream.loadtest.nodes import kill_node
 from catstream.video.live_demo import first_box
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks" / "fleet"))
-from nodes import kill_node
 
 FRAMES = 32
 LIVE = "demo:1?rate=10"

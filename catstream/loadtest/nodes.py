@@ -1,4 +1,4 @@
-"""Faults of whole nodes of a local fleet: a node is killed, frozen or thawed with all of its processes at once."""
+"""Kills, stops and continues all processes of one node of a local fleet at once."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from catstream.errors import FleetError
 from catstream.fleet.keeper import holder
 from catstream.fleet.local import LocalFleet
 
+__all__ = ["freeze_node", "kill_node", "processes", "thaw_node"]
+
 
 def kill_node(fleet: LocalFleet, name: str) -> None:
-    """Kill the node `name`, or the `head`, as a power cut would: keeper, Ray, actors, pipelines."""
-    freeze_node(fleet, name)  # nobody is left to start a process, or to say goodbye
+    """Kill all processes of the node `name`, or of the `head`: keeper, Ray, actors and pipelines."""
+    freeze_node(fleet, name)  # none of them can start another process, or end in order
     for pid in processes(fleet, name):
         _signal(pid, signal.SIGKILL)
 
