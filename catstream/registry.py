@@ -193,6 +193,11 @@ class Registry:
             self._requester = Requester[Question, Listing](REGISTRY, self._endpoint)
 
     def _remote(self, fleet: str) -> Endpoint:
+        if self._keys is None and not fleet.startswith(("127.", "[::1]:")):
+            raise ServiceError(
+                f"the fleet at {fleet} asks for keys: make them on its head (catstream keys allow FOLDER/keys NAME "
+                "--output DIR), and give them (--keys DIR)"
+            )
         return Endpoint.parse(f"tcp://{fleet}", self._keys or "")
 
     def _local(self, fleet: str) -> tuple[str, Endpoint]:
@@ -206,7 +211,10 @@ class Registry:
             which = f"no fleet {fleet!r} of yours" if fleet else "no fleet of yours"
             listed = f"; there is {', '.join(sorted(known))}" if known else ""
             raise ServiceError(f"{which} is running: start it (catstream fleet up), or give HOST:PORT of one{listed}")
-        raise ServiceError(f"{len(known)} fleets are running: say which (--fleet): {', '.join(sorted(known))}")
+        names = ", ".join(sorted(known))
+        raise ServiceError(
+            f"{len(known)} fleets are running: say which (--fleet NAME, or fleet://NAME/STREAM): {names}"
+        )
 
     def _with_keys(self, endpoint: Endpoint) -> Endpoint:
         return endpoint if self._keys is None else replace(endpoint, keys=self._keys)

@@ -197,7 +197,8 @@ class Manager:
         """Add a stream to those that there are, or change the one of its name."""
         with self._lock:
             streams = self._record.spec.streams | {spec.name: spec}
-            return self.apply(replace(self._record.spec, streams=streams).to_json(), models)
+            lines = self.apply(replace(self._record.spec, streams=streams).to_json(), models)
+            return [line for line in lines if line.startswith(f"{spec.name}:")]
 
     def remove(self, names: list[str], *, forget: bool) -> list[str]:
         """Remove streams; their state stays in the store, unless it is to be forgotten."""
@@ -206,9 +207,10 @@ class Manager:
                 self._check_stream(name)
             left = {name: each for name, each in self._record.spec.streams.items() if name not in names}
             lines = self.apply(replace(self._record.spec, streams=left).to_json())
-            self._record = replace(self._record, forgotten=self._record.forgotten | set(names) if forget else set())
-            self._save()
-            return lines
+            if forget:
+                self._record = replace(self._record, forgotten=self._record.forgotten | set(names))
+                self._save()
+            return [line for line in lines if line.partition(":")[0] in names]
 
     def move(self, name: str, node: str) -> str:
         """Move a stream to a node, where it stays as long as the node can have it."""
@@ -504,13 +506,19 @@ class Manager:
         tasks = []
         for name, each in spec.streams.items():
             running = self._running.get(name)
-            node = running.node if running is not None and running.phase != "stopping" else None
+            stays = running is not None and running.phase != "stopping" and not self._needs_more(each)
+            node = running.node if running is not None and stays else None
             tasks.append(Task(name, self._cores(each), each.labels, node, self._record.pins.get(name)))
         placement = place(tasks, self._observed_nodes())
         if placement.unplaced:
             more = placement.more_nodes
             help_ = f"\n{more} more node{'s' * (more != 1)} as large as the largest would do" if more else ""
             raise FleetError("nothing was changed: " + "\n".join(placement.unplaced.values()) + help_)
+
+    def _needs_more(self, spec: StreamSpec) -> bool:
+        """Whether a stream is given more cores than before."""
+        before = self._record.spec.streams.get(spec.name)
+        return before is not None and spec.cores is not None and spec.cores > self._cores(before)
 
     def _check_stream(self, name: str) -> None:
         if name not in self._record.spec.streams:
@@ -527,7 +535,9 @@ class Manager:
         spec, running = self._record.spec.streams[name], self._running.get(name)
         restarts = max(0, self._starts.get(name, 0) - 1)
         if running is not None and running.report is not None and not running.dead:
-            state: StreamState = "moving" if running.phase == "stopping" else running.report.status.state
+            state: StreamState = running.report.status.state
+            if running.digest != spec.digest or (running.phase == "stopping" and state != "failed"):
+                state = "moving"
             return replace(running.report.status, state=state, restarts=restarts)
         known = self._last.get(name, StreamStatus(name, "starting", source=without_password(spec.source)))
         known = replace(known, endpoint="", server="", rate=0.0, restarts=restarts)
@@ -538,7 +548,8 @@ class Manager:
             return replace(known, state="unplaced", node="", trouble=unplaced)
         if name in self._memory.ended:
             return replace(known, state="ended", node="")
-        return replace(known, state="starting", node="")
+        waits = self._plan is not None and name in self._plan.waiting  # it has failed
+        return replace(known, state="failed" if waits else "starting", node="")
 
     def _node_statuses(self) -> dict[str, NodeStatus]:
         free = self._free()

@@ -119,7 +119,11 @@ def place(tasks: Iterable[Task], nodes: Iterable[Node], settling: Collection[str
 
 def may_host(node: Node, labels: Mapping[str, str]) -> bool:
     """Whether a stream that needs these labels may run on a node: it is alive, does not drain, and has the labels."""
-    return node.alive and not node.draining and all(node.labels.get(key) == value for key, value in labels.items())
+    return node.alive and not node.draining and _has(node, labels)
+
+
+def _has(node: Node, labels: Mapping[str, str]) -> bool:
+    return all(node.labels.get(key) == value for key, value in labels.items())
 
 
 def _order(task: Task) -> tuple[object, ...]:
@@ -199,7 +203,7 @@ def objection(task: Task, nodes: Iterable[Node], free: Mapping[str, float]) -> s
     """
     nodes = list(nodes)
     alive = [node for node in nodes if node.alive]
-    labelled = [node for node in alive if all(node.labels.get(key) == each for key, each in task.labels.items())]
+    labelled = [node for node in alive if _has(node, task.labels)]
     awake = [node for node in labelled if not node.draining]
     if any(task.cores <= free[node.name] + _ROUNDING for node in awake):
         return ""
@@ -208,6 +212,9 @@ def objection(task: Task, nodes: Iterable[Node], free: Mapping[str, float]) -> s
         dead = f" ({_named(nodes)})" if nodes else ""
         return f"{cores}, and no node is alive{dead}: start one with `catstream fleet node`"
     if not labelled:
+        if lost := [node for node in nodes if _has(node, task.labels)]:
+            labels = _labels(task.labels)
+            return f"{task.name} needs a node with {labels}, and none is alive: start {_named(lost)} again"
         return _label_objection(task, alive)
     if not awake:
         return f"{cores}, and all nodes that it may be on are drained ({_named(labelled)}): add a node"

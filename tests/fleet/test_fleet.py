@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 import catstream
@@ -82,7 +84,9 @@ def test_a_stream_of_a_dead_node_continues_elsewhere(site, fleet, until):
 
 
 def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
-    fleet, _ = site
+    fleet, spec = site
+    with pytest.raises(FleetError, match="gate needs 4 cores, and the largest node"):
+        fleet.add(replace(spec.streams["gate"], cores=4.0))
     with pytest.raises(FleetError, match=r"cam-8 needs 4 cores, and the largest node"):
         fleet.add(StreamSpec("cam-8", LIVE, cores=4))
     with pytest.raises(FleetError, match="cam-9 needs a node with site=north"):
@@ -90,6 +94,15 @@ def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
     with pytest.raises(FleetError, match="no stream 'cam-8'"):
         fleet.move("cam-8", "node-1")
     assert set(fleet.status().streams) == {"film", "gate"}
+
+
+def test_a_stream_whose_source_cannot_be_opened_has_failed_until_it_is_changed(site, until):
+    fleet, _ = site
+    fleet.add(StreamSpec("cam-8", "missing.mp4", cores=0.1))
+    until(lambda: (found := fleet.status().streams["cam-8"]).state == "failed" and "missing.mp4" in found.trouble)
+    fleet.add(StreamSpec("cam-8", LIVE, cores=0.1))
+    assert fleet.status().streams["cam-8"].state in ("moving", "starting")
+    fleet.remove("cam-8", forget=True)
 
 
 def test_a_node_that_is_drained_gives_its_streams_away(site, until):

@@ -132,6 +132,11 @@ def test_streams_are_placed_by_best_fit_and_the_largest_first():
             "stream, or add such a node",
         ),
         (
+            Task("cam-7", 1.0, NORTH),
+            [Node("n1", 4.0, NORTH, alive=False), Node("n2", 4.0)],
+            "cam-7 needs a node with site=north, and none is alive: start n1 again",
+        ),
+        (
             Task("cam-7", 1.0, {"sitte": "north"}),
             [Node("n1", 4.0, NORTH)],
             "cam-7 needs a node with sitte=north, and there is none: no node has the label sitte, did you mean site? "
