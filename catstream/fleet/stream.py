@@ -11,7 +11,6 @@ import math
 import os
 import random
 import socket
-import tempfile
 import threading
 import time
 from collections import deque
@@ -40,6 +39,7 @@ from catstream.steering import control
 from catstream.storage import Metadata
 from catstream.video.frames import without_password
 from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import private_folder
 from catstream.wire.keys import Client, create, public_key, synchronise
 
 __all__ = ["Place", "Report", "Stream", "given_model"]
@@ -140,7 +140,7 @@ class Stream:
         self._seq = 0
         self._present: set[str] = set()  # objects that the last frame shows
         self._stack = ExitStack()
-        self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-stream-")))
+        self._folder = self._stack.enter_context(private_folder())
         self._keys = self._folder / "keys"
         self._thread = threading.Thread(target=self._run, name=f"stream {spec.name}", daemon=True)
         self._thread.start()
@@ -283,8 +283,9 @@ class Stream:
             return
         facts = claim.state.facts
         seconds = max(0.0, time.time() - float(facts["time"]))
-        newest = int(facts["seq"]) + math.ceil(seconds * float(facts["rate"])) + _SPARE_FRAMES
-        lost = skip(state, pipeline.settings, newest)
+        newest = int(facts["seq"]) + math.ceil(seconds * max(pipeline.rate, float(facts["rate"]))) + _SPARE_FRAMES
+        stored = newest - skip(state, pipeline.settings, newest)
+        lost = max(0, int(facts["seq"]) - stored) + round(seconds * float(facts["rate"]))
         facts["lost_frames"] = int(facts["lost_frames"]) + lost
         facts["lost_seconds"] = float(facts["lost_seconds"]) + seconds
         _log.warning("%s: %d frames in %.1f s were lost", self._spec.name, lost, seconds)
@@ -358,7 +359,7 @@ class Stream:
             "time": time.time(),
             "seq": seq,
             "frame": status.frame,
-            "rate": max(status.rate, self._rates.rate, self._pipeline.rate if self._pipeline is not None else 0.0),
+            "rate": self._rates.rate,
             "began": status.began,
             "lost_frames": status.lost_frames,
             "lost_seconds": status.lost_seconds,
