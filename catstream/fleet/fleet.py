@@ -173,6 +173,8 @@ class Fleet:
 
     def down(self) -> None:
         """Stop all streams after their state was stored, and the manager; on this machine alone, the nodes too."""
+        if self._local is not None and not (self._local.running or self._local.names):
+            raise FleetError(f"no fleet {self.name!r} of yours runs on this machine: see catstream fleet status")
         try:
             if self._local is None or self._local.running:
                 self._stop_streams()

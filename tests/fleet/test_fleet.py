@@ -111,3 +111,8 @@ def test_a_node_that_is_drained_gives_its_streams_away(site, until):
     fleet.drain(node)
     until(lambda: (found := fleet.status().streams["gate"]).node not in ("", node) and found.state == "running")
     fleet.drain(node, undo=True)
+
+
+def test_a_fleet_that_does_not_run_cannot_be_ended(tmp_path):
+    with pytest.raises(FleetError, match="no fleet 'other' of yours runs"):
+        Fleet(name="other", folder=tmp_path / "other").down()
