@@ -191,8 +191,8 @@ _MANAGER = """
         The manager is one Python process, so it has one core. A turn is all that it does for the streams before it can
         start one: it observes, decides and answers. While a turn takes longer than half a second, everything waits for
         it. A decision costs more with more streams, and with more machines if many streams have to be placed. The
-        registry collects the state of all streams for each answer, and an answer lists at most 256, so the cost of a
-        page grows with the square of the number of streams."""
+        registry collected the state of all streams for each answer when this was measured, and now answers with a state
+        of at most 0.3 s ago: the third limit of the table is too low."""
 
 
 _FEWER = "(3000|30000|listing_read|listing_bytes) |100000 a "  # rows that are in the record only

@@ -249,6 +249,7 @@ class _Keeper:
         (folder / "ray_current_cluster").unlink(missing_ok=True)  # of its predecessor: Ray would not start
         self.cause, self.dying = "", False
         labels = self.labels | {f"{cluster.PREFIX}since": str(int(time.time()))}
+        reading, writing = os.pipe()
         process = subprocess.Popen(
             [
                 *(sys.executable, "-P", "-m", "catstream.fleet.launch", str(os.getpid()), "start", "--block"),
@@ -257,13 +258,13 @@ class _Keeper:
             ],
             env=self.variables,
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
+            stdout=writing,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C is for the keeper; what is left of the group is killed at the end
         )
-        with process:
-            assert process.stdout is not None
-            self._forward_lines(process.stdout.fileno(), lambda: process.poll() is not None or ended.is_set())
+        os.close(writing)
+        with process, os.fdopen(reading, "rb"):
+            self._forward_lines(reading, lambda: process.poll() is not None or ended.is_set())
             _end(process)
         return f"{self.title} died with {_ending(process.returncode)}: {self.cause or 'it printed nothing'}"
 

@@ -73,8 +73,8 @@ def first_box(text: str) -> Box:
     Box(x=184.0, y=88.0, w=57.0, h=58.0)
     """
     chosen = _Parameters.parse(text)
-    box = next(demo.render(1, chosen.size, begin=_BEGINS[chosen.seed % len(_BEGINS)]))[1]
-    assert box is not None, "the object is visible in the first image of each part"
+    first = demo.render(1, chosen.size, begin=_BEGINS[chosen.seed % len(_BEGINS)])  # in which the object is visible
+    (box,) = (box for _, box in first if box is not None)
     return Box(*(float(round(value)) for value in box))
 
 

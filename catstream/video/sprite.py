@@ -25,8 +25,8 @@ def load_photograph(name: str) -> np.ndarray:
     The file is read without an import of scikit-learn, which takes seconds and whose own loader needs Pillow.
     """
     package = find_spec("sklearn")
-    assert package is not None
-    assert package.origin is not None, "scikit-learn is a dependency"
+    if package is None or package.origin is None:
+        raise ImportError("scikit-learn is a dependency of catstream and not installed: pip install scikit-learn")
     path = Path(package.origin).parent / "datasets" / "images" / f"{name}.jpg"
     return np.array(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR), np.float32)
 
