@@ -32,7 +32,8 @@ def test_runtime_and_test_dependencies_are_in_separate_lock_files():
     run, test = pinned("requirements.lock"), pinned("requirements-dev.lock")
     assert names([*project["dependencies"], *extras["view"], *PROJECT["build-system"]["requires"]]) <= set(run)
     assert names(extras["dev"]) <= set(run) | set(test)
-    assert not set(run) & set(test)
+    conditional = set(re.findall(r"^([\w.-]+)==\S+ ;", LOCKS["requirements.lock"], re.MULTILINE))
+    assert set(run) & set(test) <= conditional  # a test may need on every Python what others need on some only
     assert not {"pytest", "mypy", "mkdocs", "pyarrow"} & set(run)
 
 

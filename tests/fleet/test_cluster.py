@@ -20,13 +20,12 @@ from catstream.cli.fleet_nodes import head, node
 from catstream.errors import FleetError, UnreachableError
 from catstream.fleet import cluster, keeper, probe
 from catstream.fleet.local import LocalFleet
+from catstream.loadtest.nodes import kill_node
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 with pytest.MonkeyPatch.context() as patch:
     patch.setattr(sys, "path", [str(BENCHMARKS / "fleet"), str(BENCHMARKS), *sys.path])  # as Python has it for a script
-    FAULTS, PORTS, STRANGERS = (
-        runpy.run_path(str(BENCHMARKS / "fleet" / f"{name}.py")) for name in ("nodes", "ports", "strangers")
-    )
+    PORTS, STRANGERS = (runpy.run_path(str(BENCHMARKS / "fleet" / f"{name}.py")) for name in ("ports", "strangers"))
 
 
 @pytest.fixture
@@ -281,7 +280,7 @@ def test_a_node_that_was_killed_is_dead_at_once(fleet, until):
     try:
         first = next(facts for facts in cluster.nodes() if facts.name == "fragile")
         assert (first.labels, first.alive) == ({"site": "north"}, True)
-        FAULTS["kill_node"](fleet, "fragile")
+        kill_node(fleet, "fragile")
         until(lambda: not next(facts for facts in cluster.nodes() if facts.name == "fragile").alive)
         assert "fragile" not in fleet.names
     finally:

@@ -52,9 +52,17 @@ def sleepers():
 
 
 def children():
-    """Processes of this one, but for the one that Python leaves to tidy up."""
+    """Processes of this one, but for the one that Python leaves to tidy up, and the fleet that other tests share."""
     tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
-    return [child for child in psutil.Process().children(recursive=True) if child.pid != tracker]
+    own = [child for child in psutil.Process().children() if child.pid != tracker and not keeps_a_fleet(child)]
+    return own + [process for child in own for process in child.children(recursive=True)]
+
+
+def keeps_a_fleet(process):
+    try:
+        return "fleet" in process.cmdline()
+    except psutil.Error:  # it has ended
+        return False
 
 
 def test_chaos_records_the_processes_that_it_kills(sleepers):

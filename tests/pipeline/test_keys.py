@@ -62,7 +62,7 @@ def test_a_stranger_at_the_door_of_a_pipeline_is_counted_in_its_health(video, ke
         with subscribe(tcp, "tracks", keys=str(keys.parent / "wrong")) as stranger:
             while not next(health).counters.get("rejected_handshake"):
                 next(tracks, None)
-            assert not stranger._messages.pending()
+            assert not stranger._connection.messages.pending()
 
 
 @pytest.mark.parametrize(

@@ -60,11 +60,11 @@ def told(pipeline, condition):
 
 
 @pytest.fixture(scope="module")
-def saved(video, once):
-    """What was learned in the first part of the video."""
+def saved(long_video, once):
+    """What was learned in the first part of a video."""
 
     def save(folder):
-        path, boxes = video
+        path, boxes = long_video
         with steered(path, boxes[0]) as (pipeline, steering, _):
             next(track for track in pipeline if track.model_version >= 4)
             assert steering.save(folder / "object.safetensors").version >= 4
