@@ -226,6 +226,9 @@ def kill_head(trial: Trial, status: FleetStatus) -> None:
     trial.local.start(0)
     trial.until(lambda status: len(status.streams) == len(LIVE) + len(FILMS), "the registry after the head's return")
     trial.recovery["head killed"].append(monotonic() - begin)
+    trial.until(
+        lambda status: all(_is_up(each) for each in status.streams.values()), "all streams after the head's return"
+    )
     _check_untouched(trial, "head killed", status)
 
 
@@ -299,6 +302,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
                 continue
             faults[place](trial, status)
             print(f"{number} of {len(faults)}: {faults[place].__name__}, {len(trial.wrong)} wrong", file=sys.stderr)
+            print(*trial.wrong[-3:], sep="\n", end="", file=sys.stderr, flush=True)
         trial.until(lambda status: all(status.streams[name].state == "ended" for name in FILMS), "the end of all films")
         trial.settle()
         minutes = (monotonic() - begin) / 60
