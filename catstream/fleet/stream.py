@@ -242,21 +242,34 @@ class Stream:
                     lost_seconds=float(facts.get("lost_seconds", 0.0)),
                 )
             self._change_objects(pipeline, facts)
-            storing = threading.Thread(target=self._keep_storing, args=(claim,), name="store", daemon=True)
+            over = threading.Event()
+            storing = threading.Thread(target=self._keep_storing, args=(claim, over), name="store", daemon=True)
             storing.start()
             stack.callback(storing.join)
-            stack.callback(self._stop.set)
-            for tracks in pipeline.by_frame(_TURN_SECONDS):
-                self._take(pipeline, tracks)
-                if self._stop.is_set():
-                    break
-            else:
-                with self._lock:
-                    self._status = replace(self._status, state="ended")
-        if not self._fenced:
-            self._write(claim)
+            stack.callback(over.set)
+            ended = self._take_all(pipeline)
+        self._write_last(claim, ended=ended)
         with self._lock:
             self._pipeline = None
+
+    def _take_all(self, pipeline: Pipeline) -> bool:
+        """Take the tracks until the source ends, or the stream is to stop; returns whether the source has ended."""
+        for tracks in pipeline.by_frame(_TURN_SECONDS):
+            self._take(pipeline, tracks)
+            if self._stop.is_set():
+                return False
+        return True
+
+    def _write_last(self, claim: Claim, *, ended: bool) -> None:
+        """Store the last state. A stream has ended once that is done, so it is tried again until it is."""
+        while not self._fenced:
+            self._write(claim, ended=ended)
+            if not self._store_trouble:
+                with self._lock:
+                    self._status = replace(self._status, state="ended" if ended else self._status.state)
+                return
+            if not ended or self._stop.wait(self._every):
+                return
 
     def _began(self, claim: Claim) -> int:
         """Token of the pipeline with which frames began to count from 0; 0 if it was the first one of the stream."""
@@ -347,12 +360,12 @@ class Stream:
             skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
             self._status = replace(status, state=state, skipped=skipped)
 
-    def _keep_storing(self, claim: Claim) -> None:
-        """Store the state every few seconds, until the stream stops or another holder has claimed it."""
-        while not self._stop.wait(self._every):
+    def _keep_storing(self, claim: Claim, over: threading.Event) -> None:
+        """Store the state every few seconds until the pipeline is over, or another holder has claimed the stream."""
+        while not over.wait(self._every) and not self._fenced:
             self._write(claim)
 
-    def _write(self, claim: Claim) -> None:
+    def _write(self, claim: Claim, *, ended: bool = False) -> None:
         """Store the newest checkpoint; a store that takes nothing is a trouble, another holder ends the stream."""
         status, seq = self._status, self._seq
         facts: Metadata = {
@@ -364,7 +377,7 @@ class Stream:
             "lost_frames": status.lost_frames,
             "lost_seconds": status.lost_seconds,
             "objects": sorted(self._spec.boxes.keys() | self._spec.models.keys()),
-            "ended": status.state == "ended",
+            "ended": ended,
         }
         trouble = ""
         try:

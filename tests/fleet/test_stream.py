@@ -7,8 +7,9 @@ from contextlib import contextmanager
 import pytest
 
 from catstream.box import Box
+from catstream.errors import StoreError
 from catstream.fleet.spec import StreamSpec
-from catstream.fleet.store import Store
+from catstream.fleet.store import Claim, Store
 from catstream.fleet.stream import Place, Stream
 
 FRAMES = 60
@@ -80,9 +81,6 @@ def test_a_source_that_cannot_be_opened_is_named(store, until, tmp_path):
 
 
 def test_a_stream_goes_on_while_the_store_takes_nothing(spec, store, until, monkeypatch):
-    from catstream.errors import StoreError
-    from catstream.fleet.store import Claim
-
     def fails(*_):
         raise StoreError("the store cannot be reached")
 
@@ -94,3 +92,20 @@ def test_a_stream_goes_on_while_the_store_takes_nothing(spec, store, until, monk
             frame = stream.report().status.frame
             until(lambda: stream.report().status.frame > frame)
         until(lambda: stream.report().status.trouble == "")
+
+
+def test_a_stream_has_ended_only_once_its_last_state_is_stored(spec, store, until, monkeypatch):
+    written, write = [], Claim.write
+
+    def fails_at_first(claim, files, facts):
+        if facts["ended"]:
+            written.append(stream.report().status.state)
+        if len(written) == 1:
+            raise StoreError("the store cannot be reached")
+        write(claim, files, facts)
+
+    monkeypatch.setattr(Claim, "write", fails_at_first)
+    with started(spec, store) as stream:
+        until(lambda: stream.report().status.state == "ended")
+    assert written == ["running", "running"]
+    assert Store(store).newest("cam-7").facts["ended"]
