@@ -1,4 +1,4 @@
-"""Speed of catstream and OpenCV's trackers on the same frames, and by size of the image and of the coreset.
+"""Speed of catstream and OpenCV's trackers on the same frames, the slowest frames, and the size of image and coreset.
 
 CSRT and KCF come with the contrib modules of OpenCV 4: pip install "catstream[peers]".
 """
@@ -9,25 +9,33 @@ import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import cache
 from statistics import median
 
 import cv2
+import numpy as np
 from accuracy import videos
-from journey import travel
+from journey import Journey, travel
 from sequences import named, rendered, video
 from table import Table, command, publish
 from throughput import MODES, steps
 
+from catstream.box import Box
 from catstream.errors import SettingsError
+from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import evaluate, follow
 from catstream.evaluation.peers import Peer
 from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
 PEERS = ("csrt", "kcf", "mil")
-SIZES = ((320, 240), (640, 480), (960, 720), (1280, 720), (1920, 1080))
+SIZES = ((320, 240), (640, 480), (960, 720), (1280, 720), (1920, 1080), (3840, 2160))
+#: Width and height of the smallest box, in pixels.
+TINY = 6
+#: Sizes of the rendered video whose slowest frames are measured, and whether the box is tiny.
+CASES = (((640, 480), False), ((640, 480), True), ((3840, 2160), False))
 CORESETS = (16, 32, 64, 128, 256, 512)
 
 #: Program of a user that prints frames per second without decoding, and a checksum of the boxes.
@@ -51,17 +59,26 @@ ENVIRONMENTS = {
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield own_program(options)
-    yield beside_peers(options)
+    cases, sizes, modes, coresets, frames = CASES, SIZES, MODES, CORESETS, 300
+    if options.quick:  # one run of the pipeline gives a figure for three tables
+        cases, sizes, modes, coresets, frames = CASES[:1], ((640, 480),), ("local",), (Settings().coreset.size,), 8
+    sequences = videos(options)
+    journeys = [sequence_in_pipeline(sequence) for sequence in sequences]
+    trackers, missing = installed()
+    runs = evaluate(sequences, trackers, Settings())
+    own = [run for run in runs if run.tracker == "catstream"]
+    yield beside_peers(sequences, journeys, runs, missing)
+    yield frame_times(own, journeys, cases, frames)
     yield steps([named(options, "TLD_01_david")])
-    sizes, modes, coresets, frames = SIZES, MODES, CORESETS, 300
-    if options.quick:  # one run of the pipeline gives a figure for both tables
-        sizes, modes, coresets, frames = ((640, 480),), ("local",), (Settings().coreset.size,), 8
     rows = [
-        (f"{width}x{height}", *(rate(frames, (width, height), Settings(search={"mode": mode})) for mode in modes))
+        (
+            f"{width}x{height}",
+            *(demo_in_pipeline(frames, (width, height), False, Settings(search={"mode": mode})).rate for mode in modes),
+        )
         for width, height in sizes
     ]
     yield Table("Frames/s against the size of the image", ("pixels", *modes), rows, "three processes, with decoding")
-    rows = [(n, rate(frames, (640, 480), Settings(coreset={"size": n}))) for n in coresets]
+    rows = [(n, demo_in_pipeline(frames, (640, 480), False, Settings(coreset={"size": n})).rate) for n in coresets]
     yield Table(
         "Frames/s against the size of the coreset", ("n", "640x480, local"), rows, "three processes, with decoding"
     )
@@ -90,44 +107,39 @@ def own_program(options: argparse.Namespace) -> Table:
     )
 
 
-def beside_peers(options: argparse.Namespace) -> Table:
-    """Measure all trackers on all sequences on one core, and the pipeline and CSRT on all cores."""
-    trackers, note = ["catstream"], "one core and no decoding, but for the three processes, which use all cores"
+def installed() -> tuple[list[str], str]:
+    """Return the trackers that this OpenCV has, after catstream, and a line for each one that is missing."""
+    trackers, missing = ["catstream"], ""
     for name in PEERS:
         try:
             Peer(name)
             trackers.append(name)
         except SettingsError as error:  # the message has the install command
-            note += f"\n{error}"
-    sequences = videos(options)
-    journeys = [
-        travel(
-            video(sequence),
-            sequence.boxes[0],
-            Settings(),
-            part=slice(sequence.begin, sequence.begin + len(sequence)),
-        )
-        for sequence in sequences
-    ]
+            missing += f"\n{error}"
+    return trackers, missing
+
+
+def beside_peers(sequences: list[Sequence], journeys: list[Journey], runs: list[EvaluationRun], missing: str) -> Table:
+    """Compare all trackers on one core, and the pipeline and CSRT on all cores."""
     pipeline = sum(len(journey.boxes) - 1 for journey in journeys) / sum(
         journey.moments[-1] - journey.moments[0] for journey in journeys
     )
-    runs = evaluate(sequences, trackers, Settings())
     own = [run for run in runs if run.tracker == "catstream"]
     rows: list[tuple[object, ...]] = []
-    for tracker in trackers:
+    for tracker in dict.fromkeys(run.tracker for run in runs):
         others = [run for run in runs if run.tracker == tracker]
         ratios = [ours.fps / theirs.fps for ours, theirs in zip(own, others, strict=True)]
         rate = together(others)
         rows.append((tracker, rate, together(own) / rate, median(ratios), min(ratios), pipeline / rate))
     rows.append(("catstream, three processes", pipeline, together(own) / pipeline, None, None, 1.0))
-    if "csrt" in trackers:
+    if any(run.tracker == "csrt" for run in runs):
         cv2.setNumThreads(os.cpu_count() or 1)
         threaded = together([follow("csrt", Settings(), sequence) for sequence in sequences])
         cv2.setNumThreads(1)
         rows.append(("csrt, all cores", threaded, together(own) / threaded, None, None, pipeline / threaded))
     columns = ("tracker", "frames/s", "catstream is faster by", "median sequence", "worst", "three processes by")
-    return Table("Beside OpenCV's trackers", columns, rows, f"{len(own)} sequences, {note}")
+    note = f"{len(own)} sequences, one core and no decoding, but for the three processes, which use all cores{missing}"
+    return Table("Beside OpenCV's trackers", columns, rows, note)
 
 
 def together(runs: list[EvaluationRun]) -> float:
@@ -135,11 +147,63 @@ def together(runs: list[EvaluationRun]) -> float:
     return sum(len(run.seconds) - 1 for run in runs) / sum(float(run.seconds[1:].sum()) for run in runs)
 
 
-@cache
-def rate(frames: int, size: tuple[int, int], settings: Settings) -> float:
-    """Return the frames per second of the pipeline on the rendered video."""
+def frame_times(
+    runs: list[EvaluationRun], journeys: list[Journey], cases: Iterable[tuple[tuple[int, int], bool]], frames: int
+) -> Table:
+    """Return how long frames take, the slowest ones above all.
+
+    Parameters
+    ----------
+    runs, journeys : of all sequences, in one process and in three
+    cases : as `CASES`, of `frames` frames each
+    """
+    rows: list[tuple[object, ...]] = []
+    measured = {
+        "one": [spread(1000 * run.seconds[1:]) for run in runs],
+        "three": [spread(journey.milliseconds) for journey in journeys],
+    }
+    for processes, found in measured.items():
+        rates, *times = np.transpose(found)
+        rows.append(("sequences, median", processes, *map(float, np.median(found, axis=0))))
+        rows.append(("sequences, worst of each", processes, float(rates.min()), *(float(each.max()) for each in times)))
+    for (width, height), tiny in cases:
+        name = f"{width}x{height}" + (f", box of {TINY}x{TINY}" if tiny else "")
+        sequence = demo((width, height), frames, tiny)
+        journey = demo_in_pipeline(frames, (width, height), tiny, Settings())
+        rows.append((name, "one", *spread(1000 * follow("catstream", Settings(), sequence).seconds[1:])))
+        rows.append((name, "three", *spread(journey.milliseconds)))
+    columns = ("video", "processes", "frames/s", "p50, ms", "p99, ms", "slowest, ms", "slowest, medians")
+    note = f"""{len(runs)} sequences; the rendered video has {frames} frames
+one process: without decoding and the first frame; three processes: from one track to the next, with decoding"""
+    return Table("Time of a frame", columns, rows, note)
+
+
+def spread(milliseconds: np.ndarray) -> tuple[float, float, float, float, float]:
+    """Return frames per second; median, 99th percentile and maximum; and the maximum as a multiple of the median."""
+    middle, late, slowest = map(float, np.percentile(milliseconds, (50, 99, 100)))
+    return 1000 / float(milliseconds.mean()), middle, late, slowest, slowest / middle
+
+
+def sequence_in_pipeline(sequence: Sequence) -> Journey:
+    """Run the pipeline on a sequence."""
+    part = slice(sequence.begin, sequence.begin + len(sequence))
+    return travel(video(sequence), sequence.boxes[0], Settings(), part=part)
+
+
+def demo(size: tuple[int, int], frames: int, tiny: bool) -> Sequence:
+    """Return the rendered video; its box may be `tiny`, `TINY` pixels in the middle of the object."""
     sequence = rendered(frames, size)
-    return travel(video(sequence), sequence.boxes[0], settings).rate
+    if not tiny:
+        return sequence
+    middle = Box(*map(float, sequence.boxes[0])).centre
+    return replace(sequence, boxes=np.tile(Box(0, 0, TINY, TINY).centred(*middle), (len(sequence), 1)))
+
+
+@cache
+def demo_in_pipeline(frames: int, size: tuple[int, int], tiny: bool, settings: Settings) -> Journey:
+    """Run the pipeline on the rendered video."""
+    sequence = demo(size, frames, tiny)
+    return travel(video(sequence), sequence.boxes[0], settings)
 
 
 if __name__ == "__main__":
