@@ -1,4 +1,4 @@
-"""Ablation: accuracy without each ingredient of the tracker, over all sequences and several starts of each.
+"""Ablation: accuracy without each ingredient of the tracker, over several starts or first boxes of each sequence.
 
 Single runs are chaotic: what counts is the difference sequence by sequence, beside its standard error. How many runs
 changed shows how much the sequences depend on an ingredient.
@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from accuracy import MEANS, accuracy_command, changed, compared, difference, means, spread, videos
+from accuracy import MEANS, accuracy_command, changed, compared, described, difference, means, spread, videos
 from table import Table, publish
 
 from catstream.evaluation.runs import EvaluationRun
@@ -59,7 +59,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     found = videos(options)
     runs = compared(options, found, variants)
     whole = runs["nothing left out"]
-    note = f"{len(whole)} runs each; spread: standard deviation over {options.starts} starts, mean over the sequences"
+    note = f"{len(whole)} runs each; spread: standard deviation over {described(options)}, mean over the sequences"
     yield Table("Ablation", COLUMNS, beside(whole, runs), note)
     if not options.quick and not options.only:  # last, because SCM takes longer than all variants above
         paper = compared(options, found, {"the paper's tracker": Settings.from_values(PRESETS["one-class-paper"])})

@@ -14,13 +14,26 @@ import numpy as np
 from sequences import sequences
 from table import command
 
+from catstream.errors import VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import evaluate
 from catstream.evaluation.runs import EvaluationRun
+from catstream.evaluation.starts import Starts, choose_starts
 from catstream.evaluation.summary import rows_of
 from catstream.settings import Settings
 
-__all__ = ["accuracy_command", "changed", "compared", "difference", "means", "videos"]
+__all__ = [
+    "accuracy_command",
+    "changed",
+    "check_names",
+    "compared",
+    "described",
+    "difference",
+    "means",
+    "shortened",
+    "starts_of",
+    "videos",
+]
 
 #: Headings for the values of `means`.
 MEANS = ("AUC", "success", "precision")
@@ -29,8 +42,14 @@ MEANS = ("AUC", "success", "precision")
 def accuracy_command(about: str | None, starts: int = 1, *, kept: bool = True) -> argparse.ArgumentParser:
     """Return a parser with the options of a benchmark over many sequences."""
     parser = command(about)
-    parser.add_argument(
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument(
         "--starts", type=int, default=starts, help="number of start frames of each sequence (default: %(default)s)"
+    )
+    chosen.add_argument("--jitter", type=int, metavar="K", help="K first boxes within 2 %% instead")
+    parser.add_argument("--group", choices=("all", "tuning", "check"), default="all", help="only these sequences")
+    parser.add_argument(
+        "--check", type=Path, metavar="FILE", help="names of the check sequences (default: check.txt in the data)"
     )
     parser.add_argument("--frames", type=int, help="number of frames of each sequence (default: all)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes (default: %(default)s)")
@@ -40,8 +59,46 @@ def accuracy_command(about: str | None, starts: int = 1, *, kept: bool = True) -
 
 
 def videos(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
+    """Return the sequences of `--group` whose names begin with `prefix`, cut to the first `--frames`."""
+    found = shortened(options, prefix)
+    if options.quick or options.group == "all":
+        return found
+    names = check_names(options)
+    return [one for one in found if (one.name in names) == (options.group == "check")]
+
+
+def shortened(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
     """Return the sequences whose names begin with `prefix`, cut to the first `--frames`."""
     return [replace(found, boxes=found.boxes[: options.frames]) for found in sequences(options, prefix)]
+
+
+def check_names(options: argparse.Namespace) -> set[str]:
+    """Return the names of the check sequences, on which nothing is tuned; with --quick, none.
+
+    Raises
+    ------
+    VideoError
+        If there is no list.
+    """
+    if options.quick:
+        return set()
+    file = options.check or options.data / "check.txt"
+    try:
+        return set(file.read_text(encoding="utf-8").split())
+    except OSError as error:
+        raise VideoError(f"cannot read the check list {str(file)!r} ({error.strerror}): give it with --check") from None
+
+
+def starts_of(options: argparse.Namespace) -> Starts:
+    """Return the starts of each sequence that the options choose; with --quick, the first frame."""
+    if options.quick:
+        return choose_starts()
+    return choose_starts(None if options.jitter else options.starts, options.jitter)
+
+
+def described(options: argparse.Namespace) -> str:
+    """Return the starts of each sequence in words."""
+    return f"{options.jitter} first boxes" if options.jitter else f"{options.starts} starts"
 
 
 def compared(
@@ -53,7 +110,7 @@ def compared(
             sequences,
             ["catstream"],
             settings,
-            starts=1 if options.quick else options.starts,
+            starts=starts_of(options),
             jobs=1 if options.quick else options.jobs,
             output=options.output and options.output / name.replace("/", "-"),
             done=lambda run, name=name: print(f"{name}: {run.name}", file=sys.stderr),
@@ -63,20 +120,20 @@ def compared(
 
 
 def means(runs: Iterable[EvaluationRun]) -> tuple[float, float, float]:
-    """Return the means of AUC, success and precision over the starts of each sequence, then over the sequences."""
+    """Return the means of AUC, success and precision over the runs of each sequence, then over the sequences."""
     rows = rows_of(runs)
     return tuple(fmean(getattr(row, measure.lower()) for row in rows) for measure in MEANS)
 
 
 def spread(runs: Iterable[EvaluationRun]) -> float:
-    """Return the standard deviation of the AUC over the starts of a sequence, averaged over the sequences."""
+    """Return the standard deviation of the AUC over the runs of a sequence, averaged over the sequences."""
     return fmean(row.auc_spread for row in rows_of(runs))
 
 
 def difference(runs: list[EvaluationRun], others: list[EvaluationRun]) -> tuple[float, float]:
     """Return the mean difference of AUC over the sequences, and its standard error.
 
-    Starts of one sequence are alike: they count as one.
+    Runs over one sequence are alike: they count as one.
     """
     pairs = zip(rows_of(runs), rows_of(others), strict=True)
     apart = np.array([row.auc - other.auc for row, other in pairs])

@@ -12,7 +12,7 @@ from statistics import fmean
 from time import perf_counter
 
 import numpy as np
-from accuracy import MEANS, accuracy_command, compared, difference, means, videos
+from accuracy import MEANS, accuracy_command, compared, described, difference, means, videos
 from groups import TUNED
 from sequences import named
 from table import Cell, Table, publish
@@ -40,7 +40,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     rows = [
         (name, *means(found), *difference(found, runs["svd"]), frames_per_second(found)) for name, found in runs.items()
     ]
-    yield Table("Accuracy", COLUMNS, rows, f"{len(found)} sequences, {options.starts} starts of each")
+    yield Table("Accuracy", COLUMNS, rows, f"{len(found)} sequences, {described(options)} of each")
 
 
 class Stages:

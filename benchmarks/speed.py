@@ -16,7 +16,7 @@ from statistics import median
 
 import cv2
 import numpy as np
-from accuracy import videos
+from accuracy import shortened
 from journey import Journey, travel
 from sequences import named, rendered, video
 from table import Table, command, publish
@@ -62,7 +62,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     cases, sizes, modes, coresets, frames = CASES, SIZES, MODES, CORESETS, 300
     if options.quick:  # one run of the pipeline gives a figure for three tables
         cases, sizes, modes, coresets, frames = CASES[:1], ((640, 480),), ("local",), (Settings().coreset.size,), 8
-    sequences = videos(options)
+    sequences = shortened(options)
     journeys = [sequence_in_pipeline(sequence) for sequence in sequences]
     trackers, missing = installed()
     runs = evaluate(sequences, trackers, Settings())

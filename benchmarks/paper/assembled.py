@@ -10,14 +10,15 @@ from time import perf_counter
 from unittest.mock import patch
 
 import numpy as np
+from accuracy import starts_of
 
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.detection.objects import Detectors
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import start_frames
 from catstream.evaluation.runs import EvaluationRun
+from catstream.evaluation.starts import Start
 from catstream.features.pyramid import Pyramid
 from catstream.names import UNNAMED
 from catstream.paper.scm import SparseCollaborativeModel
@@ -47,8 +48,8 @@ def follow_all(
     options: argparse.Namespace, sequences: list[Sequence], recipes: dict[str, Recipe]
 ) -> dict[str, list[EvaluationRun]]:
     """Run each recipe over all sequences and starts; return the runs in the same order for each."""
-    starts, jobs = (1, 1) if options.quick else (options.starts, options.jobs)
-    tasks = [(recipes, sequence, start) for sequence in sequences for start in start_frames(sequence, starts)]
+    starts, jobs = starts_of(options), 1 if options.quick else options.jobs
+    tasks = [(recipes, sequence, start) for sequence in sequences for start in starts(sequence)]
     runs: dict[str, list[EvaluationRun]] = {name: [] for name in recipes}
     with ProcessPoolExecutor(jobs, mp_context=SPAWN) as pool:
         for found in (map if jobs == 1 else pool.map)(follow_each, *zip(*tasks, strict=True)):
@@ -57,8 +58,8 @@ def follow_all(
     return runs
 
 
-def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: int) -> list[EvaluationRun]:
-    """Run each recipe on one sequence, from the same frame."""
+def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: Start) -> list[EvaluationRun]:
+    """Run each recipe on one sequence, from the same start."""
     runs = []
     # SCM is slow and does not depend on the recipe, so each frame is computed once for all recipes.
     with patch("catstream.paper.scm.SparseCollaborativeModel", Shared()):
@@ -90,16 +91,18 @@ class Shared:
         return self.found[self.told - 1]
 
 
-def follow(name: str, recipe: Recipe, sequence: Sequence, start: int) -> EvaluationRun:
+def follow(name: str, recipe: Recipe, sequence: Sequence, start: Start) -> EvaluationRun:
     """Run the loop of `catstream.tracker.Tracker` with other trees, and stop learning after a share of the frames."""
-    frames = len(sequence) - start
+    frames = len(sequence) - start.frame
     settings = recipe.settings.for_length(frames)
     detectors, compressor, trainer = Detectors(settings), Compressor(settings, tree=recipe.tree), Trainer(settings)
     boxes, scores, moments = [], [], [perf_counter()]
     with one_thread(opencv=True):
-        for row, image in enumerate(sequence.frames(start)):
+        for row, image in enumerate(sequence.frames(start.frame)):
             frame = Pyramid.of(image)
-            given = {} if row else {UNNAMED: detectors.begin(UNNAMED, frame, Box(*sequence.boxes[start]))}
+            given = {}
+            if row == 0:
+                given[UNNAMED] = detectors.begin(UNNAMED, frame, start.box(sequence, image.shape[1::-1]))
             tracks, features = detectors.step(frame, given=given)
             track = tracks.tracks[UNNAMED]
             part, version = features.objects[UNNAMED], compressor.version + 1

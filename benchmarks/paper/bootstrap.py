@@ -16,11 +16,11 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
-from accuracy import MEANS, accuracy_command, compared, difference, means, videos
+from accuracy import MEANS, accuracy_command, compared, difference, means, starts_of, videos
 from table import Table, publish
 
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import start_frames
+from catstream.evaluation.starts import Start
 from catstream.settings import Settings
 
 #: Bootstrap -> its settings. SCM follows all n frames where each gives one row: no copies.
@@ -29,8 +29,8 @@ BOOTSTRAPS: dict[str, dict[str, Any]] = {"copies": {}, "scm": {"teaching.bootstr
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     base = Settings(coreset={"size": options.size})
-    places = 1 if options.quick else options.starts
-    pieces = [piece for found in videos(options) for piece in pieces_of(found, places, options.size)]
+    starts = starts_of(options)
+    pieces = [piece for found in videos(options) for piece in pieces_of(found, starts(found), options.size)]
     options.starts = 1  # for each piece
     runs = compared(options, pieces, {name: base.but(changes) for name, changes in BOOTSTRAPS.items()})
     rows = []
@@ -41,16 +41,16 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield Table(f"The first {options.size} frames", columns, rows, f"{len(pieces)} pieces")
 
 
-def pieces_of(sequence: Sequence, places: int, frames: int) -> list[Sequence]:
+def pieces_of(sequence: Sequence, starts: list[Start], frames: int) -> list[Sequence]:
     """Cut `frames` frames from several places where the object is present, as sequences of their own."""
     return [
         replace(
             sequence,
-            name=f"{sequence.name}-{start}",
-            boxes=sequence.boxes[start : start + frames],
-            begin=sequence.begin + start,
+            name=f"{sequence.name}-{start.frame}",
+            boxes=sequence.boxes[start.frame : start.frame + frames],
+            begin=sequence.begin + start.frame,
         )
-        for start in start_frames(sequence, places)
+        for start in starts
     ]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
-from accuracy import MEANS, accuracy_command, means, spread, videos
+from accuracy import MEANS, accuracy_command, described, means, spread, videos
 from assembled import Recipe, follow_all
 from table import Table, publish
 
@@ -44,7 +44,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     runs = follow_all(options, videos(options), recipes)
     rows = [(name, *means(found), spread(found), *PAPER[name.split(", ")[1]]) for name, found in runs.items()]
     columns = ("learned from", *MEANS, "spread of AUC", "paper: success", "paper: precision")
-    yield Table("Root or hierarchy", columns, rows, f"{options.starts} starts of each sequence")
+    yield Table("Root or hierarchy", columns, rows, f"{described(options)} of each sequence")
 
 
 if __name__ == "__main__":

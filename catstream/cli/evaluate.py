@@ -29,7 +29,9 @@ __all__ = ["evaluate"]
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
 @click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see below.")
-@click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Number of start frames.")
+@click.option("--starts", type=click.IntRange(min=1), help="Run from N frames of each sequence (TRE).")
+@click.option("--shifts", is_flag=True, help="Run from 12 shifted or scaled first boxes (SRE).")
+@click.option("--jitter", type=click.IntRange(min=1), help="Run from K first boxes that differ by at most 2 %.")
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of processes.")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder for results and report.html.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all figures and their provenance.")
@@ -38,7 +40,9 @@ def evaluate(
     settings: Settings,
     paths: tuple[Path, ...],
     trackers: str,
-    starts: int,
+    starts: int | None,
+    shifts: bool,
+    jitter: int | None,
     jobs: int,
     output: Path | None,
     json_file: Path | None,
@@ -64,16 +68,25 @@ def evaluate(
       norm.      normalised precision: the same, relative to the size of the object
       F          F-score of VOT-LT, if the object is absent in some frames
 
-    On difficult sequences a single run varies much: --starts 5 runs from five
-    different frames and prints mean and standard deviation. With --output,
-    results are stored in the layouts of the got10k and VOT toolkits, complete
-    runs are not repeated, and report.html shows plots and the worst failures.
+    On difficult sequences a single run varies much. One of these options makes
+    several runs of each sequence; mean and standard deviation are printed:
+
+    \b
+      --starts 5   from five frames: temporal robustness (TRE)
+      --shifts     from 12 first boxes: moved by 10 % in eight directions, and of
+                   0.8, 0.9, 1.1 and 1.2 times the size: spatial robustness (SRE)
+      --jitter 7   from the first box and six others within 2 %; a sequence flips
+                   if its success differs by more than 0.25 between them
+
+    With --output, results are stored in the layouts of the got10k and VOT
+    toolkits, complete runs are not repeated, and report.html shows plots and
+    the worst failures.
 
     \b
     EXAMPLES
       catstream evaluate sequences/
       catstream evaluate sequences/ --tracker catstream,csrt --jobs 4 --output results
-      catstream evaluate sequences/walk --starts 5 --set coreset.size=128
+      catstream evaluate sequences/walk --jitter 7 --set coreset.size=128
     """
     # Imported here so that --help and the other commands start faster.
     with interruptible():
@@ -81,8 +94,11 @@ def evaluate(
         from catstream.evaluation.onepass import evaluate as run_all
         from catstream.evaluation.report import write_report
         from catstream.evaluation.runs import EvaluationRun
-        from catstream.evaluation.summary import mean_of, rows_of, to_json
+        from catstream.evaluation.starts import choose_starts
+        from catstream.evaluation.summary import describe_flips, mean_of, rows_of, to_json
 
+    if (starts is not None) + shifts + (jitter is not None) > 1:
+        raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
     if json_file is not None and (json_file.is_dir() or not json_file.absolute().parent.is_dir()):
@@ -105,7 +121,7 @@ def evaluate(
             sequences,
             names,
             settings,
-            starts=starts,
+            starts=choose_starts(starts, jitter, shifts=shifts),
             jobs=jobs,
             output=output,
             begin=begin,
@@ -119,6 +135,8 @@ def evaluate(
         raise CatstreamError("all runs have failed: see above")
     rows = rows_of(runs)
     console.print(_table(rows, mean_of(rows)))
+    for line in describe_flips(rows):
+        console.print(line, soft_wrap=True)
     if json_file is not None:
         try:
             json_file.write_text(json.dumps(to_json(rows, settings), indent=1) + "\n", encoding="utf-8")
@@ -163,6 +181,6 @@ def _cells(row: dict[str, float | None]) -> list[str]:
         value, spread = row[measure], row.get(f"{measure}_spread")
         if value is None:
             return "-"
-        return f"{value:.3f}" if row.get("starts", 1) == 1 or spread is None else f"{value:.3f} ±{spread:.3f}"
+        return f"{value:.3f}" if row.get("runs", 1) == 1 or spread is None else f"{value:.3f} ±{spread:.3f}"
 
     return [*map(share, ("auc", "success", "precision", "normalised_precision", "f_score")), f"{row['fps']:.0f}"]

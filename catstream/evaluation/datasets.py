@@ -16,7 +16,8 @@ which start at 1, are not shifted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,7 +52,7 @@ class Sequence:
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def frames(self, start: int = 0) -> Iterator[UInt8]:
+    def frames(self, start: int = 0) -> Generator[UInt8]:
         """Yield the images of boxes[start:], uint8 (h, w, 3), one for each box.
 
         Raises
@@ -70,6 +71,18 @@ class Sequence:
             f"{str(self.path)!r} has {len(self.boxes)} boxes, but {left} frames too few: "
             "each line of the ground truth needs a frame"
         )
+
+    def size(self, start: int = 0) -> tuple[int, int]:
+        """Read the frame of boxes[start], and return its width and height.
+
+        Raises
+        ------
+        VideoError
+            If it cannot be read.
+        """
+        with closing(self.frames(start)) as frames:
+            height, width = next(frames).shape[:2]
+        return width, height
 
 
 def find_sequences(path: str | Path) -> list[Sequence]:

@@ -47,7 +47,7 @@ def failure_strip(run: EvaluationRun) -> FailureStrip:
     last = len(run.boxes) - 1
     wanted = sorted({0, *(min(max(first + step, 0), last) for step in _AROUND), first + length - 1})
     pictures = []
-    for row, image in enumerate(run.sequence.frames(run.start)):
+    for row, image in enumerate(run.sequence.frames(run.start.frame)):
         if row in wanted:
             pictures.append((row, thumbnail(image, run.truth[row], run.boxes[row], _WIDTH)))
         if row == wanted[-1]:

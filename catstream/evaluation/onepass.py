@@ -14,40 +14,30 @@ from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.peers import PEERS, Peer
 from catstream.evaluation.runs import EvaluationRun, load, prepare_folder, run_name, save
+from catstream.evaluation.starts import FIRST, Start, Starts, one_pass
 from catstream.evaluation.workers import run_tasks
 from catstream.settings import Settings
 from catstream.threads import one_thread
 from catstream.tracker import Tracker
 
-__all__ = ["TRACKERS", "evaluate", "follow", "start_frames"]
+__all__ = ["TRACKERS", "evaluate", "follow"]
 
 #: The trackers that can be evaluated.
 TRACKERS = ("catstream", *PEERS)
 
-#: A run that is to be made: tracker, settings, sequence and first frame.
-_Task = tuple[str, Settings, Sequence, int]
+#: A run that is to be made: tracker, settings, sequence and start.
+_Task = tuple[str, Settings, Sequence, Start]
 
 
-def start_frames(sequence: Sequence, count: int) -> list[int]:
-    """Return `count` evenly spaced start frames. If the object is absent in one, the next frame with it is used.
-
-    This is OTB's temporal robustness evaluation (TRE): on a difficult sequence, a single run is not representative.
-    """
-    present = np.flatnonzero(np.isfinite(sequence.boxes).all(axis=1))
-    tasks = np.arange(count) * len(sequence) // count
-    places = np.searchsorted(present, tasks)
-    return sorted({int(present[place]) for place in places if place < len(present)})
-
-
-def follow(tracker: str, settings: Settings, sequence: Sequence, start: int = 0) -> EvaluationRun:
-    """EvaluationRun one tracker from one start to the end of a sequence, in this process."""
-    frames = len(sequence) - start
+def follow(tracker: str, settings: Settings, sequence: Sequence, start: Start = FIRST) -> EvaluationRun:
+    """Run one tracker from one start to the end of a sequence, in this process."""
+    frames = len(sequence) - start.frame
     worker = Tracker(settings.for_length(frames)) if tracker == "catstream" else Peer(tracker)
-    given = Box(*map(float, sequence.boxes[start]))
     boxes, confidence, seconds = np.full((frames, 4), np.nan), np.full(frames, np.nan), np.zeros(frames)
-    for row, image in enumerate(sequence.frames(start)):
+    for row, image in enumerate(sequence.frames(start.frame)):
+        given = start.box(sequence, image.shape[1::-1]) if row == 0 else None
         begin = perf_counter()
-        if row == 0:
+        if given is not None:
             worker.init(image, given)
             box: Box | None = given
         else:
@@ -65,7 +55,7 @@ def evaluate(
     trackers: list[str],
     settings: Settings,
     *,
-    starts: int = 1,
+    starts: Starts = one_pass,
     jobs: int = 1,
     output: Path | None = None,
     begin: Callable[[int], None] = lambda _: None,
@@ -78,7 +68,7 @@ def evaluate(
     ----------
     sequences, trackers : sequences, and names from `TRACKERS`
     settings : settings of catstream
-    starts : number of start frames in each sequence
+    starts : the starts of a sequence, one of the functions of `catstream.evaluation.starts`
     jobs : number of processes, with one thread each
     output : folder for results, or None; runs that are complete there are not repeated
     begin : function that is called with the total number of frames
@@ -109,9 +99,9 @@ def evaluate(
         (tracker, settings, sequence, start)
         for sequence in sequences
         for tracker in trackers
-        for start in start_frames(sequence, starts)
+        for start in starts(sequence)
     ]
-    begin(sum(len(sequence) - start for _, _, sequence, start in tasks))
+    begin(sum(len(sequence) - start.frame for _, _, sequence, start in tasks))
     missing = []
     for task in tasks:
         tracker, _, sequence, start = task
@@ -137,12 +127,12 @@ def _run_all(tasks: list[_Task], output: Path | None, jobs: int) -> Generator[Ev
         yield from (_follow_and_save(output, *task) for task in tasks)
         return
     # Longest runs first, so that no single long run is left at the end.
-    ranked = sorted(tasks, key=lambda task: task[3] - len(task[2]))
+    ranked = sorted(tasks, key=lambda task: task[3].frame - len(task[2]))
     yield from run_tasks(_follow_and_save, [(output, *task) for task in ranked], jobs)
 
 
 def _follow_and_save(
-    output: Path | None, tracker: str, settings: Settings, sequence: Sequence, start: int
+    output: Path | None, tracker: str, settings: Settings, sequence: Sequence, start: Start
 ) -> EvaluationRun | CatstreamError:
     """Run `follow` and save the run. Each tracker gets one thread: the jobs are the parallelism."""
     try:

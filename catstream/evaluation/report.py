@@ -14,7 +14,7 @@ from catstream.arrays import Float64
 from catstream.evaluation.failures import FailureStrip, failure_strip, worst_runs
 from catstream.evaluation.metrics import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.evaluation.runs import EvaluationRun
-from catstream.evaluation.summary import Row, mean_of, rows_of
+from catstream.evaluation.summary import Row, describe_flips, mean_of, rows_of
 from catstream.html.page import table, write_page
 from catstream.html.plots import SHARES, Axis, plot
 from catstream.settings import Settings
@@ -43,7 +43,8 @@ def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> P
     body = [
         "<h1>Accuracy</h1>",
         f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
-        "the object count only for F.</p>",
+        "the object count only for F. ± is the standard deviation over the runs of a sequence.</p>",
+        *(f'<p class="about">{escape(line)}</p>' for line in describe_flips(rows)),
         _plots(runs),
         "<h2>Sequences</h2>",
         _table(rows),
@@ -87,7 +88,7 @@ def _table(rows: list[Row]) -> str:
     lines = []
     for row in rows:
         auc, success = _share(row.auc), _share(row.success)
-        if row.starts > 1:
+        if row.runs > 1:
             auc += f" <small>±{row.auc_spread:.3f}</small>"
             success += f" <small>±{row.success_spread:.3f}</small>"
         rest = (row.precision, row.normalised_precision, row.f_score)
@@ -111,11 +112,11 @@ def _share(value: float | None) -> str:
 def _strip_html(strip: FailureStrip) -> str:
     run, pictures = strip.run, []
     for row, jpeg in strip.pictures:
-        number = f"frame {run.start + row}"
+        number = f"frame {run.start.frame + row}"
         source = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
         pictures.append(f'<figure><img alt="{number}" src="{source}"><figcaption>{number}</figcaption></figure>')
     return (
         f"<p><b>{escape(run.name)}</b>, {run.tracker}: wrong for {strip.length} frames from frame "
-        f"{run.start + strip.first} on; success {run.score().success:.3f}</p>\n"
+        f"{run.start.frame + strip.first} on; success {run.score().success:.3f}</p>\n"
         f'<div class="strip">{"".join(pictures)}</div>'
     )

@@ -8,13 +8,15 @@ The files have the layouts of the benchmarks' toolkits:
                           NAME_001_time.value          and seconds a frame
     catstream/settings.json                            settings and versions of the runs
 
-A run that starts after the first frame is stored as a sequence of its own, NAME@FRAME.
+A run is stored as a sequence of its own: NAME if it starts with the first box of the ground truth, otherwise
+NAME@FRAME (a later frame), NAME@VARIATION (a changed first box, for example walk@left) or NAME@FRAME-VARIATION.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -26,6 +28,7 @@ from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.metrics import Score, score
 from catstream.evaluation.peers import OPENCV
+from catstream.evaluation.starts import Start
 from catstream.settings import Settings
 
 __all__ = ["EvaluationRun", "load", "prepare_folder", "run_name", "save"]
@@ -33,32 +36,32 @@ __all__ = ["EvaluationRun", "load", "prepare_folder", "run_name", "save"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EvaluationRun:
-    """The output of one tracker on one sequence from one start frame.
+    """The output of one tracker on one sequence from one start.
 
     tracker     name of the tracker
     sequence    the whole sequence
-    start       row of `sequence.boxes` that the tracker was initialised with
-    boxes       float64 (frames, 4) from this row on; NaN if the tracker reported no box
+    start       frame and variation of the first box
+    boxes       float64 (frames, 4) from this frame on, the first as given; NaN if the tracker reported no box
     confidence  float64 (frames,)
     seconds     float64 (frames,), time of the tracker alone, without reading the frame
     """
 
     tracker: str
     sequence: Sequence
-    start: int
+    start: Start
     boxes: Float64
     confidence: Float64
     seconds: Float64
 
     @property
     def name(self) -> str:
-        """Name of the sequence, with the start frame if it is not the first."""
+        """Name of the sequence and of the start."""
         return run_name(self.sequence, self.start)
 
     @property
     def truth(self) -> Float64:
         """Ground truth of the frames of this run, float64 (frames, 4)."""
-        return self.sequence.boxes[self.start :]
+        return self.sequence.boxes[self.start.frame :]
 
     @property
     def fps(self) -> float:
@@ -70,9 +73,9 @@ class EvaluationRun:
         return score(self.boxes, self.truth, self.confidence)
 
 
-def run_name(sequence: Sequence, start: int) -> str:
+def run_name(sequence: Sequence, start: Start) -> str:
     """Return the name of a run."""
-    return f"{sequence.name}@{start}" if start else sequence.name
+    return sequence.name + start.suffix
 
 
 def prepare_folder(output: Path, settings: Settings) -> None:
@@ -135,7 +138,7 @@ def save(output: Path, run: EvaluationRun) -> None:
         raise VideoError(f"its result cannot be written to {str(home)!r} ({error.strerror}): free some space") from None
 
 
-def load(output: Path, tracker: str, sequence: Sequence, start: int) -> EvaluationRun | None:
+def load(output: Path, tracker: str, sequence: Sequence, start: Start) -> EvaluationRun | None:
     """Return a complete run, or None if there is none or it started with another box.
 
     Raises
@@ -157,6 +160,17 @@ def load(output: Path, tracker: str, sequence: Sequence, start: int) -> Evaluati
         )
     except (OSError, ValueError) as error:
         raise CatstreamError(f"{str(boxes.parent)!r} cannot be read ({error}): remove it to repeat the run") from None
-    if not len(sequence) - start == len(run.boxes) == len(run.confidence) == len(run.seconds):
+    if not len(sequence) - start.frame == len(run.boxes) == len(run.confidence) == len(run.seconds):
         return None
-    return run if np.array_equal(run.boxes[0], run.truth[0].round(4)) else None
+    return run if _has_first_box(run) else None
+
+
+def _has_first_box(run: EvaluationRun) -> bool:
+    """Return whether a stored run has the first box of its start. Only if it may have been moved is a frame read."""
+    if np.array_equal(run.boxes[0], np.round(run.start.box(run.sequence), 4)):
+        return True
+    if run.start.variation.name:
+        with suppress(VideoError):  # the run is repeated, and reports the error
+            size = run.sequence.size(run.start.frame)
+            return np.array_equal(run.boxes[0], np.round(run.start.box(run.sequence, size), 4))
+    return False

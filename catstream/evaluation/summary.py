@@ -11,25 +11,28 @@ from catstream.evaluation.provenance import provenance
 from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
-__all__ = ["MEASURES", "Row", "mean_of", "rows_of", "to_json"]
+__all__ = ["MEASURES", "Row", "describe_flips", "flips_of", "mean_of", "rows_of", "to_json"]
 
 #: The measures of a row that are averaged.
 MEASURES = ("auc", "success", "precision", "normalised_precision", "f_score", "fps")
 
+_FLIP = 0.25
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """The measures of one tracker on one sequence: means over its starts.
+    """The measures of one tracker on one sequence: means over its runs.
 
     `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and `normalised_precision` are those of
     `catstream.evaluation.metrics`, from 0 to 1. `f_score` and its two components are None if the object is never
-    absent. The spreads are standard deviations over the starts.
+    absent. The spreads are standard deviations over the runs. `flips` is None unless the runs have different first
+    boxes; it is true if their smallest and largest success differ by more than 0.25: then chance decides.
     """
 
     name: str
     tracker: str
     frames: int
-    starts: int
+    runs: int
     auc: float
     auc_spread: float
     success: float
@@ -39,6 +42,7 @@ class Row:
     f_score: float | None
     long_term_precision: float | None
     long_term_recall: float | None
+    flips: bool | None
     fps: float
 
 
@@ -61,28 +65,55 @@ def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
     }
 
 
+def flips_of(rows: Iterable[Row]) -> dict[str, list[str]]:
+    """Return the names of the sequences that flip, by tracker; only trackers whose runs have different first boxes."""
+    found: dict[str, list[str]] = {}
+    for row in rows:
+        if row.flips is not None:
+            found.setdefault(row.tracker, []).extend([row.name] if row.flips else [])
+    return found
+
+
+def describe_flips(rows: Iterable[Row]) -> list[str]:
+    """Return a sentence for each tracker whose runs have different first boxes: how many sequences flip, and which."""
+    rows = list(rows)
+    count = len({row.name for row in rows})
+    return [
+        f"{tracker}: {len(names)} of {count} sequences flip with the first box (success differs by more than {_FLIP})"
+        + (f": {', '.join(names)}" if names else "")
+        for tracker, names in flips_of(rows).items()
+    ]
+
+
 def to_json(rows: list[Row], settings: Settings) -> dict[str, object]:
-    """Return the JSON of `catstream evaluate --json`: rows, {tracker: {measure: mean}}, and provenance."""
-    return {**provenance(settings), "sequences": [dataclasses.asdict(row) for row in rows], "mean": mean_of(rows)}
+    """Return the JSON of `catstream evaluate --json`: rows, means and flips by tracker, and provenance."""
+    return {
+        **provenance(settings),
+        "sequences": [dataclasses.asdict(row) for row in rows],
+        "mean": mean_of(rows),
+        "flips": flips_of(rows),
+    }
 
 
 def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
     scores = [run.score() for run in runs]
+    success = [score.success for score in scores]
     long = [score.long_term for score in scores if score.long_term is not None]
     return Row(
         name=name,
         tracker=tracker,
         frames=len(runs[0].sequence),
-        starts=len(runs),
+        runs=len(runs),
         auc=fmean(score.auc for score in scores),
         auc_spread=pstdev(score.auc for score in scores),
-        success=fmean(score.success for score in scores),
-        success_spread=pstdev(score.success for score in scores),
+        success=fmean(success),
+        success_spread=pstdev(success),
         precision=fmean(score.precision for score in scores),
         normalised_precision=fmean(score.normalised_precision for score in scores),
         f_score=_mean(part.f_score for part in long),
         long_term_precision=_mean(part.precision for part in long),
         long_term_recall=_mean(part.recall for part in long),
+        flips=max(success) - min(success) > _FLIP if any(run.start.variation.name for run in runs) else None,
         fps=fmean(run.fps for run in runs),
     )
 

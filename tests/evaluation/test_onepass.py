@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,10 +15,11 @@ import pytest
 from catstream.errors import BoxError, CatstreamError, SettingsError, VideoError
 from catstream.evaluation import onepass, runs
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import evaluate, follow, start_frames
+from catstream.evaluation.onepass import evaluate, follow
 from catstream.evaluation.peers import PEERS, Peer
 from catstream.evaluation.runs import EvaluationRun, load, save
-from catstream.evaluation.summary import MEASURES, mean_of, rows_of, to_json
+from catstream.evaluation.starts import FIRST, Start, jittered, spatial, temporal
+from catstream.evaluation.summary import MEASURES, describe_flips, flips_of, mean_of, rows_of, to_json
 from catstream.settings import Settings
 
 SETTINGS = Settings()
@@ -28,7 +30,7 @@ def run(sequence, found) -> EvaluationRun:
     frames = len(sequence)
     found[0], found[9] = sequence.boxes[0], np.nan
     return EvaluationRun(
-        "catstream", sequence, 0, found.round(4), np.linspace(1, 0.5, frames).round(6), np.full(frames, 0.02)
+        "catstream", sequence, FIRST, found.round(4), np.linspace(1, 0.5, frames).round(6), np.full(frames, 0.02)
     )
 
 
@@ -37,10 +39,10 @@ def counted(monkeypatch, found):
     """`follow`, without following: counts its calls."""
     calls = []
 
-    def instead(tracker, _, sequence, start=0):
-        calls.append((tracker, sequence.name, start))
-        frames, boxes = len(sequence) - start, found[start:].round(4)
-        boxes[0] = sequence.boxes[start].round(4)
+    def instead(tracker, _, sequence, start):
+        calls.append((tracker, sequence.name + start.suffix))
+        frames, boxes = len(sequence) - start.frame, found[start.frame :].round(4)
+        boxes[0] = np.round(start.box(sequence), 4)
         return EvaluationRun(tracker, sequence, start, boxes, np.ones(frames), np.full(frames, 0.01))
 
     monkeypatch.setattr(onepass, "follow", instead)
@@ -62,23 +64,15 @@ def test_each_tracker_starts_with_the_given_box_and_has_a_row_for_every_frame(se
 
 
 def test_a_later_start_is_a_run_of_its_own(sequence):
-    run = follow("catstream", SETTINGS, sequence, start=8)
+    run = follow("catstream", SETTINGS, sequence, Start(8))
     assert run.name == "walk@8"
     assert run.boxes.shape == run.truth.shape == (4, 4)
     np.testing.assert_allclose(run.boxes[0], sequence.boxes[8], atol=1e-3)
 
 
-def test_start_frames_are_evenly_spaced_over_the_frames_with_the_object(sequence):
-    assert start_frames(sequence, 1) == [0]
-    assert start_frames(sequence, 2) == [0, 8]  # the object is absent in 5, 6 and 7
-    assert start_frames(sequence, 4) == [0, 3, 8, 9]
-    late = Sequence("late", sequence.path, np.vstack([np.full((3, 4), np.nan), sequence.boxes]))
-    assert start_frames(late, 1) == [3]
-
-
 def test_processes_give_the_same_runs_as_one(sequence, tmp_path):
-    alone = evaluate([sequence], ["catstream"], SETTINGS, starts=2)
-    pooled = evaluate([sequence], ["catstream"], SETTINGS, starts=2, jobs=2, output=tmp_path)
+    alone = evaluate([sequence], ["catstream"], SETTINGS, starts=temporal(2))
+    pooled = evaluate([sequence], ["catstream"], SETTINGS, starts=temporal(2), jobs=2, output=tmp_path)
     for one, other in zip(alone, pooled, strict=True):
         assert one.name == other.name
         np.testing.assert_array_equal(one.boxes, other.boxes)
@@ -90,7 +84,7 @@ def test_processes_give_the_same_runs_as_one(sequence, tmp_path):
 
 def test_a_saved_run_is_loaded_unchanged(tmp_path, run):
     save(tmp_path, run)
-    again = load(tmp_path, "catstream", run.sequence, 0)
+    again = load(tmp_path, "catstream", run.sequence, FIRST)
     assert again is not None
     for field in ("boxes", "confidence", "seconds"):
         np.testing.assert_array_equal(getattr(again, field), getattr(run, field))
@@ -111,11 +105,21 @@ def test_results_have_the_layouts_of_the_toolkits(tmp_path, run):
 
 
 def test_complete_runs_are_not_repeated(tmp_path, sequence, counted):
-    first = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=2, output=tmp_path)
+    first = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=temporal(2), output=tmp_path)
     assert len(counted) == len(first) == 4
-    again = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=4, output=tmp_path)
+    again = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=temporal(4), output=tmp_path)
     assert len(again) == 8
-    assert counted[4:] == [("catstream", "walk", 3), ("catstream", "walk", 9), ("mil", "walk", 3), ("mil", "walk", 9)]
+    assert counted[4:] == [("catstream", "walk@3"), ("catstream", "walk@9"), ("mil", "walk@3"), ("mil", "walk@9")]
+
+
+def test_runs_from_changed_first_boxes_are_stored_beside_the_others(tmp_path, sequence, counted):
+    evaluate([sequence], ["mil"], SETTINGS, output=tmp_path)
+    for _ in range(2):
+        shifted = evaluate([sequence], ["mil"], SETTINGS, starts=spatial, output=tmp_path)
+        evaluate([sequence], ["mil"], SETTINGS, starts=jittered(3), output=tmp_path)
+    assert len(shifted) == 12
+    assert len(counted) == len(set(counted)) == 1 + 12 + 2  # the first of the jittered boxes is that of the plain run
+    assert {path.name for path in (tmp_path / "mil" / "longterm").iterdir()} == {name for _, name in counted}
 
 
 def test_an_incomplete_run_is_repeated(tmp_path, sequence, run, counted):
@@ -156,6 +160,17 @@ def test_runs_made_with_other_settings_are_not_mixed_in(tmp_path, sequence, coun
     assert len(counted) == 1
 
 
+def test_a_moved_first_box_is_found_again_and_a_different_one_is_not(tmp_path, sequence):
+    border = Sequence("border", sequence.path, sequence.boxes - sequence.boxes[0] + (-29, 40, 60, 60))
+    (left, *_), right = spatial(border), spatial(border)[1]
+    run = follow("mil", SETTINGS, border, left)
+    assert run.boxes[0].tolist() == [-30, 40, 60, 60]  # its centre would be at -5
+    save(tmp_path, run)
+    assert load(tmp_path, "mil", border, left) is not None
+    save(tmp_path, replace(run, start=right))
+    assert load(tmp_path, "mil", border, right) is None
+
+
 @pytest.mark.usefixtures("counted")
 def test_begin_and_done_report_the_progress(sequence):
     said: list[int] = []
@@ -163,7 +178,7 @@ def test_begin_and_done_report_the_progress(sequence):
         [sequence],
         ["catstream"],
         SETTINGS,
-        starts=2,
+        starts=temporal(2),
         begin=lambda frames: said.append(-frames),
         done=lambda run: said.append(len(run.boxes)),
     )
@@ -193,7 +208,7 @@ def test_a_failing_sequence_is_named_and_the_others_run(tmp_path, sequence, jobs
     errors: list[CatstreamError] = []
     found = evaluate([longer, sequence], ["mil"], SETTINGS, jobs=jobs, output=tmp_path, failed=errors.append)
     assert [run.name for run in found] == ["walk"]
-    assert load(tmp_path, "mil", sequence, 0) is not None
+    assert load(tmp_path, "mil", sequence, FIRST) is not None
     (error,) = errors
     assert str(error).startswith("mil on longer: ")
     assert "1 frames too few" in str(error)
@@ -211,6 +226,7 @@ def test_a_killed_evaluation_leaves_no_worker(tmp_path, sequence):
 import signal
 from catstream.evaluation.datasets import find_sequences
 from catstream.evaluation.onepass import evaluate
+from catstream.evaluation.starts import temporal
 from catstream.settings import Settings
 
 def done(run):
@@ -218,7 +234,7 @@ def done(run):
     signal.pause()
 
 if __name__ == "__main__":
-    evaluate(find_sequences({str(sequence.path)!r}), ["mil"], Settings(), starts=2, jobs=2, done=done)
+    evaluate(find_sequences({str(sequence.path)!r}), ["mil"], Settings(), starts=temporal(2), jobs=2, done=done)
 """)
     with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
         try:
@@ -261,17 +277,17 @@ def test_a_damaged_run_is_named(tmp_path, sequence, run):
     save(tmp_path, run)
     (tmp_path / "catstream" / "longterm" / "walk" / "walk_001.txt").write_text("rubbish\n")
     with pytest.raises(CatstreamError, match="longterm/walk"):
-        load(tmp_path, "catstream", sequence, 0)
+        load(tmp_path, "catstream", sequence, FIRST)
 
 
 # --- summing up --------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("counted")
-def test_rows_are_means_over_the_starts_with_their_spread(sequence):
-    runs = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=2)
+def test_rows_are_means_over_the_runs_with_their_spread(sequence):
+    runs = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=temporal(2))
     rows = rows_of(runs)
-    assert [(row.name, row.tracker, row.frames, row.starts) for row in rows] == [
+    assert [(row.name, row.tracker, row.frames, row.runs) for row in rows] == [
         ("walk", "catstream", 12, 2),
         ("walk", "mil", 12, 2),
     ]
@@ -282,11 +298,26 @@ def test_rows_are_means_over_the_starts_with_their_spread(sequence):
 
 def test_the_mean_f_score_is_over_the_sequences_that_have_one(sequence, run):
     whole = Sequence("whole", sequence.path, np.nan_to_num(sequence.boxes, nan=30.0))
-    other = EvaluationRun("catstream", whole, 0, run.boxes, run.confidence, run.seconds)
+    other = EvaluationRun("catstream", whole, FIRST, run.boxes, run.confidence, run.seconds)
     rows = rows_of([run, other])
     assert rows[1].f_score is None
     assert mean_of(rows)["catstream"]["f_score"] == rows[0].f_score
     assert mean_of(rows[1:])["catstream"]["f_score"] is None
+
+
+def test_a_sequence_flips_if_its_success_depends_on_the_first_box(sequence, run):
+    def with_success(kept: int, start: Start) -> EvaluationRun:
+        boxes = np.where(np.arange(12)[:, None] < kept, sequence.boxes, np.nan)
+        return replace(run, boxes=boxes[start.frame :], confidence=run.confidence[start.frame :], start=start)
+
+    starts = jittered(2)(sequence)
+    rows = rows_of(map(with_success, (12, 9), starts)) + rows_of(map(with_success, (12, 10), starts))
+    assert [row.flips for row in rows] == [True, False]  # 9 of 12 frames have the object: 0.33 and 0.22 are lost
+    assert flips_of(rows[:1]) == {"catstream": ["walk"]}
+    assert describe_flips(rows[1:]) == [
+        "catstream: 0 of 1 sequences flip with the first box (success differs by more than 0.25)"
+    ]
+    assert flips_of(rows_of([with_success(3, start) for start in temporal(2)(sequence)])) == {}
 
 
 def test_the_json_has_every_row_and_the_means(run):
@@ -294,4 +325,5 @@ def test_the_json_has_every_row_and_the_means(run):
     (row,) = numbers["sequences"]
     assert {"name", "frames", "auc", "success", "precision", "f_score", "fps", "tracker"} <= row.keys()
     assert numbers["mean"].keys() == {"catstream"}
+    assert numbers["flips"] == {}
     assert numbers["mean"]["catstream"].keys() == set(MEASURES)

@@ -16,11 +16,12 @@ from catstream.errors import CatstreamError, VideoError
 from catstream.evaluation.failures import failure_strip, worst_runs
 from catstream.evaluation.report import write_report
 from catstream.evaluation.runs import EvaluationRun
+from catstream.evaluation.starts import FIRST
 from catstream.settings import Settings
 
 
 def run_of(sequence, boxes, tracker: str = "catstream") -> EvaluationRun:
-    return EvaluationRun(tracker, sequence, 0, boxes, np.ones(len(boxes)), np.full(len(boxes), 0.01))
+    return EvaluationRun(tracker, sequence, FIRST, boxes, np.ones(len(boxes)), np.full(len(boxes), 0.01))
 
 
 @pytest.fixture
@@ -89,6 +90,22 @@ def test_the_command_prints_a_table_and_writes_all(tmp_path, walk):
 def test_the_command_shows_the_spread_over_several_starts(walk):
     result = CliRunner().invoke(evaluate, [str(walk), "--starts", "2", "--tracker", "mil"], catch_exceptions=False)
     assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", result.output)
+
+
+def test_the_command_counts_the_sequences_that_flip(tmp_path, walk):
+    arguments = [str(walk), "--jitter", "2", "--tracker", "mil", "--output", str(tmp_path)]
+    result = CliRunner().invoke(evaluate, arguments, catch_exceptions=False)
+    assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", result.output)
+    sentence = "mil: 0 of 1 sequences flip with the first box"
+    assert sentence in result.output
+    assert sentence in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("options", [("--shifts", "--jitter", "2"), ("--starts", "2", "--shifts")])
+def test_the_runs_of_a_sequence_are_chosen_by_one_option(walk, options):
+    result = CliRunner().invoke(evaluate, [str(walk), *options])
+    assert result.exit_code == 2
+    assert "--starts, --shifts and --jitter each choose the runs of a sequence: give one of them" in result.output
 
 
 def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk):
