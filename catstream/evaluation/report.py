@@ -19,10 +19,11 @@ from catstream.html.page import table, write_page
 from catstream.html.plots import SHARES, Axis, plot
 from catstream.settings import Settings
 
-__all__ = ["write_report"]
+__all__ = ["write_report", "write_strips"]
 
 _STRIPS = 8  # film strips for the first tracker
 _OTHER_STRIPS = 2  # and for each other tracker
+_LEGEND = '<p class="about">White: ground truth. Orange: tracker.</p>'
 
 
 def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> Path:
@@ -49,12 +50,24 @@ def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> P
         "<h2>Sequences</h2>",
         _table(rows),
         "<h2>Worst failures</h2>" if strips else "",
-        '<p class="about">White: ground truth. Orange: tracker.</p>' if strips else "",
+        _LEGEND if strips else "",
         *map(_strip_html, strips),
         "<h2>Settings that are not the default</h2>",
         f"<pre>{changed or 'none'}</pre>",
     ]
     return write_page(path, "evaluation", body)
+
+
+def write_strips(path: Path, runs: list[EvaluationRun], count: int) -> Path:
+    """Write a page with film strips of the `count` worst runs. It reads their frames.
+
+    Raises
+    ------
+    VideoError
+        If the file cannot be written.
+    """
+    strips = map(failure_strip, worst_runs(runs, count))
+    return write_page(path, "failures", ["<h1>Worst failures</h1>", _LEGEND, *map(_strip_html, strips)])
 
 
 def _plots(runs: list[EvaluationRun]) -> str:

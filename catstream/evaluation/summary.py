@@ -11,12 +11,13 @@ from catstream.evaluation.provenance import provenance
 from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
-__all__ = ["MEASURES", "Row", "describe_flips", "flips_of", "mean_of", "rows_of", "to_json"]
+__all__ = ["FLIP", "MEASURES", "Row", "describe_flips", "flips_of", "mean_of", "rows_of", "to_json"]
 
 #: The measures of a row that are averaged.
 MEASURES = ("auc", "success", "precision", "normalised_precision", "f_score", "fps")
 
-_FLIP = 0.25
+#: Difference of the smallest and the largest success over several first boxes, above which a sequence flips.
+FLIP = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def describe_flips(rows: Iterable[Row]) -> list[str]:
     rows = list(rows)
     count = len({row.name for row in rows})
     return [
-        f"{tracker}: {len(names)} of {count} sequences flip with the first box (success differs by more than {_FLIP})"
+        f"{tracker}: {len(names)} of {count} sequences flip with the first box (success differs by more than {FLIP})"
         + (f": {', '.join(names)}" if names else "")
         for tracker, names in flips_of(rows).items()
     ]
@@ -113,7 +114,7 @@ def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
         f_score=_mean(part.f_score for part in long),
         long_term_precision=_mean(part.precision for part in long),
         long_term_recall=_mean(part.recall for part in long),
-        flips=max(success) - min(success) > _FLIP if any(run.start.variation.name for run in runs) else None,
+        flips=max(success) - min(success) > FLIP if any(run.start.variation.name for run in runs) else None,
         fps=fmean(run.fps for run in runs),
     )
 

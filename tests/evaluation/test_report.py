@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from catstream.cli.evaluate import evaluate
 from catstream.errors import CatstreamError, VideoError
 from catstream.evaluation.failures import failure_strip, worst_runs
-from catstream.evaluation.report import write_report
+from catstream.evaluation.report import write_report, write_strips
 from catstream.evaluation.runs import EvaluationRun
 from catstream.evaluation.starts import FIRST
 from catstream.settings import Settings
@@ -68,6 +68,13 @@ def test_the_worst_failures_of_each_tracker_are_shown_and_more_of_the_first(tmp_
     page = write_report(tmp_path / "report.html", named("catstream") + named("mil"), Settings()).read_text()
     assert len(re.findall(r"<b>catstream\d</b>, catstream: wrong for", page)) == 4
     assert len(re.findall(r"<b>mil\d</b>, mil: wrong for", page)) == 2
+
+
+def test_a_page_of_film_strips_has_the_worst_runs_only(tmp_path, sequence, lost):
+    runs = [replace(lost, sequence=replace(sequence, name=f"walk{number}")) for number in range(3)]
+    page = write_strips(tmp_path / "strips.html", runs, 2).read_text()
+    assert len(re.findall(r"<b>walk\d</b>, catstream: wrong for 9 frames from frame 3 on", page)) == 2
+    assert "<table" not in page
 
 
 def test_a_report_that_cannot_be_written_is_an_error(tmp_path, lost):
