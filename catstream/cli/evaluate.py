@@ -32,6 +32,8 @@ __all__ = ["evaluate"]
 @click.option("--starts", type=click.IntRange(min=1), help="Run from N frames of each sequence (TRE).")
 @click.option("--shifts", is_flag=True, help="Run from 12 shifted or scaled first boxes (SRE).")
 @click.option("--jitter", type=click.IntRange(min=1), help="Run from K first boxes that differ by at most 2 %.")
+@click.option("--attributes", type=click.Path(path_type=Path), help="JSON file {sequence: [attribute]}.")
+@click.option("--peer-models", type=click.Path(path_type=Path), help="Folder of model files for nano and vit.")
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of processes.")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder for results and report.html.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all figures and their provenance.")
@@ -43,6 +45,8 @@ def evaluate(
     starts: int | None,
     shifts: bool,
     jitter: int | None,
+    attributes: Path | None,
+    peer_models: Path | None,
     jobs: int,
     output: Path | None,
     json_file: Path | None,
@@ -59,6 +63,9 @@ def evaluate(
       catstream        this one, in one process
       mil              OpenCV's, always available
       csrt, kcf, tld   OpenCV's, with pip install "catstream[peers]"
+      nano, vit        OpenCV's NanoTrack and VitTrack, with --peer-models FOLDER:
+                       nanotrack_backbone_sim.onnx, nanotrack_head_sim.onnx and
+                       object_tracking_vittrack_2023sep.onnx, which are not included
 
     \b
     MEASURES, over the frames with the object
@@ -82,6 +89,10 @@ def evaluate(
     toolkits, complete runs are not repeated, and report.html shows plots and
     the worst failures.
 
+    The report and --json also have the means over the sequences with fast motion,
+    scale variation, aspect change, low resolution, or an object out of view, as
+    the ground truth shows, and over those with the --attributes of a file.
+
     \b
     EXAMPLES
       catstream evaluate sequences/
@@ -90,6 +101,7 @@ def evaluate(
     """
     # Imported here so that --help and the other commands start faster.
     with interruptible():
+        from catstream.evaluation.attributes import attributes_of, read_attributes
         from catstream.evaluation.datasets import find_sequences
         from catstream.evaluation.onepass import evaluate as run_all
         from catstream.evaluation.report import write_report
@@ -101,9 +113,9 @@ def evaluate(
         raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
-    if json_file is not None and (json_file.is_dir() or not json_file.absolute().parent.is_dir()):
-        problem = "it is a folder" if json_file.is_dir() else "its folder does not exist, make it first"
-        raise CatstreamError(f"cannot write {str(json_file)!r}: {problem}")
+    if json_file is not None:
+        _validate_json(json_file)
+    seen = {} if attributes is None else read_attributes(attributes)
 
     errors: list[CatstreamError] = []
     console = Console(width=None if sys.stdout.isatty() else 120)
@@ -122,6 +134,7 @@ def evaluate(
             names,
             settings,
             starts=choose_starts(starts, jitter, shifts=shifts),
+            peer_models=peer_models,
             jobs=jobs,
             output=output,
             begin=begin,
@@ -137,17 +150,29 @@ def evaluate(
     console.print(_table(rows, mean_of(rows)))
     for line in describe_flips(rows):
         console.print(line, soft_wrap=True)
-    if json_file is not None:
-        try:
-            json_file.write_text(json.dumps(to_json(rows, settings), indent=1) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise CatstreamError(f"cannot write {str(json_file)!r}: {error.strerror}") from None
-    if output is not None:
-        console.print(f"report: {write_report(output / 'report.html', runs, settings)}", soft_wrap=True)
+    if json_file is not None or output is not None:
+        shared = attributes_of({run.sequence.name: run.sequence for run in runs}.values(), seen)
+        if json_file is not None:
+            _write_json(json_file, to_json(rows, settings, shared))
+        if output is not None:
+            console.print(f"report: {write_report(output / 'report.html', runs, settings, shared)}", soft_wrap=True)
     if errors:
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
         )
+
+
+def _validate_json(file: Path) -> None:
+    if file.is_dir() or not file.absolute().parent.is_dir():
+        problem = "it is a folder" if file.is_dir() else "its folder does not exist, make it first"
+        raise CatstreamError(f"cannot write {str(file)!r}: {problem}")
+
+
+def _write_json(file: Path, figures: dict[str, object]) -> None:
+    try:
+        file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise CatstreamError(f"cannot write {str(file)!r}: {error.strerror}") from None
 
 
 @contextmanager

@@ -25,14 +25,16 @@ __all__ = ["TRACKERS", "evaluate", "follow"]
 #: The trackers that can be evaluated.
 TRACKERS = ("catstream", *PEERS)
 
-#: A run that is to be made: tracker, settings, sequence and start.
-_Task = tuple[str, Settings, Sequence, Start]
+#: A run that is to be made: tracker, settings, sequence, start, and folder of model files.
+_Task = tuple[str, Settings, Sequence, Start, Path | None]
 
 
-def follow(tracker: str, settings: Settings, sequence: Sequence, start: Start = FIRST) -> EvaluationRun:
+def follow(
+    tracker: str, settings: Settings, sequence: Sequence, start: Start = FIRST, peer_models: Path | None = None
+) -> EvaluationRun:
     """Run one tracker from one start to the end of a sequence, in this process."""
     frames = len(sequence) - start.frame
-    worker = Tracker(settings.for_length(frames)) if tracker == "catstream" else Peer(tracker)
+    worker = Tracker(settings.for_length(frames)) if tracker == "catstream" else Peer(tracker, peer_models)
     boxes, confidence, seconds = np.full((frames, 4), np.nan), np.full(frames, np.nan), np.zeros(frames)
     for row, image in enumerate(sequence.frames(start.frame)):
         given = start.box(sequence, image.shape[1::-1]) if row == 0 else None
@@ -45,7 +47,7 @@ def follow(tracker: str, settings: Settings, sequence: Sequence, start: Start = 
         seconds[row] = perf_counter() - begin
         if box is not None:
             boxes[row] = box
-        confidence[row] = worker.track.score if isinstance(worker, Tracker) else float(box is not None)
+        confidence[row] = worker.track.score if isinstance(worker, Tracker) else worker.score
     # Rounded as in the files, so that a stored run has the same measures.
     return EvaluationRun(tracker, sequence, start, boxes.round(4), confidence.round(6), seconds.round(8))
 
@@ -56,6 +58,7 @@ def evaluate(
     settings: Settings,
     *,
     starts: Starts = one_pass,
+    peer_models: Path | None = None,
     jobs: int = 1,
     output: Path | None = None,
     begin: Callable[[int], None] = lambda _: None,
@@ -69,6 +72,7 @@ def evaluate(
     sequences, trackers : sequences, and names from `TRACKERS`
     settings : settings of catstream
     starts : the starts of a sequence, one of the functions of `catstream.evaluation.starts`
+    peer_models : folder of the model files of `nano` and `vit`
     jobs : number of processes, with one thread each
     output : folder for results, or None; runs that are complete there are not repeated
     begin : function that is called with the total number of frames
@@ -86,7 +90,7 @@ def evaluate(
         If a tracker is unknown, two sequences have the same name, or `output` has runs with other settings.
     """
     trackers = list(dict.fromkeys(trackers))
-    _validate_names(sequences, trackers)
+    _validate_names(sequences, trackers, peer_models)
     if output is not None:
         prepare_folder(output, settings)
     runs: dict[tuple[str, str], EvaluationRun] = {}
@@ -96,15 +100,15 @@ def evaluate(
         done(run)
 
     tasks = [
-        (tracker, settings, sequence, start)
+        (tracker, settings, sequence, start, peer_models)
         for sequence in sequences
         for tracker in trackers
         for start in starts(sequence)
     ]
-    begin(sum(len(sequence) - start.frame for _, _, sequence, start in tasks))
+    begin(sum(len(sequence) - start.frame for _, _, sequence, start, _ in tasks))
     missing = []
     for task in tasks:
-        tracker, _, sequence, start = task
+        tracker, _, sequence, start, _ = task
         run = None if output is None else load(output, tracker, sequence, start)
         if run is None:
             missing.append(task)
@@ -118,7 +122,7 @@ def evaluate(
                 raise result
             else:
                 failed(result)
-    names = [(tracker, run_name(sequence, start)) for tracker, _, sequence, start in tasks]
+    names = [(tracker, run_name(sequence, start)) for tracker, _, sequence, start, _ in tasks]
     return [runs[name] for name in names if name in runs]
 
 
@@ -132,12 +136,12 @@ def _run_all(tasks: list[_Task], output: Path | None, jobs: int) -> Generator[Ev
 
 
 def _follow_and_save(
-    output: Path | None, tracker: str, settings: Settings, sequence: Sequence, start: Start
+    output: Path | None, tracker: str, settings: Settings, sequence: Sequence, start: Start, peer_models: Path | None
 ) -> EvaluationRun | CatstreamError:
     """Run `follow` and save the run. Each tracker gets one thread: the jobs are the parallelism."""
     try:
         with one_thread(opencv=True):
-            run = follow(tracker, settings, sequence, start)
+            run = follow(tracker, settings, sequence, start, peer_models)
         if output is not None:
             save(output, run)
     except CatstreamError as error:
@@ -145,14 +149,14 @@ def _follow_and_save(
     return run
 
 
-def _validate_names(sequences: list[Sequence], trackers: list[str]) -> None:
+def _validate_names(sequences: list[Sequence], trackers: list[str], peer_models: Path | None) -> None:
     if not trackers:
         raise SettingsError(f"no tracker is given: give one of {', '.join(TRACKERS)}")
     for tracker in trackers:
         if tracker not in TRACKERS:
             raise SettingsError(f"there is no tracker {tracker!r}: give one of {', '.join(TRACKERS)}")
         if tracker in PEERS:
-            Peer(tracker)
+            Peer(tracker, peer_models)
     names = [sequence.name for sequence in sequences]
     for name in names:
         if names.count(name) > 1:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -14,20 +14,26 @@ from catstream.arrays import Float64
 from catstream.evaluation.failures import FailureStrip, failure_strip, worst_runs
 from catstream.evaluation.metrics import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.evaluation.runs import EvaluationRun
-from catstream.evaluation.summary import Row, describe_flips, mean_of, rows_of
+from catstream.evaluation.summary import MEASURES, Row, by_attribute, describe_flips, mean_of, rows_of
 from catstream.html.page import table, write_page
 from catstream.html.plots import SHARES, Axis, plot
 from catstream.settings import Settings
 
 __all__ = ["write_report", "write_strips"]
 
+#: Headings of `MEASURES`.
+_HEADS = ("AUC", "success", "precision", "norm. precision", "F", "frames/s")
 _STRIPS = 8  # film strips for the first tracker
 _OTHER_STRIPS = 2  # and for each other tracker
 _LEGEND = '<p class="about">White: ground truth. Orange: tracker.</p>'
 
 
-def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> Path:
+def write_report(
+    path: Path, runs: list[EvaluationRun], settings: Settings, attributes: Mapping[str, Sequence[str]]
+) -> Path:
     """Write the report of an evaluation. It reads frames of the worst runs for their film strips.
+
+    attributes : names of the sequences that have each attribute
 
     Raises
     ------
@@ -49,6 +55,8 @@ def write_report(path: Path, runs: list[EvaluationRun], settings: Settings) -> P
         _plots(runs),
         "<h2>Sequences</h2>",
         _table(rows),
+        "<h2>Attributes</h2>" if attributes else "",
+        _attribute_table(rows, attributes) if attributes else "",
         "<h2>Worst failures</h2>" if strips else "",
         _LEGEND if strips else "",
         *map(_strip_html, strips),
@@ -97,7 +105,7 @@ def _plots(runs: list[EvaluationRun]) -> str:
 
 
 def _table(rows: list[Row]) -> str:
-    heads = ("sequence", "tracker", "frames", "AUC", "success", "precision", "norm. precision", "F", "frames/s")
+    heads = ("sequence", "tracker", "frames", *_HEADS)
     lines = []
     for row in rows:
         auc, success = _share(row.auc), _share(row.success)
@@ -107,10 +115,21 @@ def _table(rows: list[Row]) -> str:
         rest = (row.precision, row.normalised_precision, row.f_score)
         lines.append([escape(row.name), row.tracker, row.frames, auc, success, *map(_share, rest), f"{row.fps:.0f}"])
     means = mean_of(rows)
-    for tracker, mean in means.items():
-        shares = [_share(mean[name]) for name in ("auc", "success", "precision", "normalised_precision", "f_score")]
-        lines.append(["mean", tracker, "", *shares, f"{mean['fps']:.0f}"])
+    lines += [["mean", tracker, "", *_means(mean)] for tracker, mean in means.items()]
     return table(heads, lines, texts=2, means=len(means))
+
+
+def _attribute_table(rows: list[Row], attributes: Mapping[str, Sequence[str]]) -> str:
+    lines = [
+        [escape(attribute), tracker, len(attributes[attribute]), *_means(mean)]
+        for attribute, means in by_attribute(rows, attributes).items()
+        for tracker, mean in means.items()
+    ]
+    return table(("attribute", "tracker", "sequences", *_HEADS), lines, texts=2, means=0)
+
+
+def _means(mean: Mapping[str, float | None]) -> list[str]:
+    return [*(_share(mean[name]) for name in MEASURES if name != "fps"), f"{mean['fps']:.0f}"]
 
 
 def _share(value: float | None) -> str:

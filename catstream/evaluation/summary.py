@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, pstdev
 
@@ -11,7 +11,7 @@ from catstream.evaluation.provenance import provenance
 from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
-__all__ = ["FLIP", "MEASURES", "Row", "describe_flips", "flips_of", "mean_of", "rows_of", "to_json"]
+__all__ = ["FLIP", "MEASURES", "Row", "by_attribute", "describe_flips", "flips_of", "mean_of", "rows_of", "to_json"]
 
 #: The measures of a row that are averaged.
 MEASURES = ("auc", "success", "precision", "normalised_precision", "f_score", "fps")
@@ -66,6 +66,18 @@ def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
     }
 
 
+def by_attribute(
+    rows: Iterable[Row], attributes: Mapping[str, Sequence[str]]
+) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Return the means of each tracker over the sequences with an attribute: {attribute: {tracker: {measure: mean}}}.
+
+    attributes : names of the sequences that have each attribute
+    """
+    rows = list(rows)
+    means = {attribute: mean_of(row for row in rows if row.name in names) for attribute, names in attributes.items()}
+    return {attribute: mean for attribute, mean in means.items() if mean}
+
+
 def flips_of(rows: Iterable[Row]) -> dict[str, list[str]]:
     """Return the names of the sequences that flip, by tracker; only trackers whose runs have different first boxes."""
     found: dict[str, list[str]] = {}
@@ -86,13 +98,17 @@ def describe_flips(rows: Iterable[Row]) -> list[str]:
     ]
 
 
-def to_json(rows: list[Row], settings: Settings) -> dict[str, object]:
-    """Return the JSON of `catstream evaluate --json`: rows, means and flips by tracker, and provenance."""
+def to_json(rows: list[Row], settings: Settings, attributes: Mapping[str, Sequence[str]]) -> dict[str, object]:
+    """Return the JSON of `catstream evaluate --json`: rows, means, flips and attributes, and provenance."""
+    means = by_attribute(rows, attributes)
     return {
         **provenance(settings),
         "sequences": [dataclasses.asdict(row) for row in rows],
         "mean": mean_of(rows),
         "flips": flips_of(rows),
+        "attributes": {
+            attribute: {"sequences": list(attributes[attribute]), "mean": mean} for attribute, mean in means.items()
+        },
     }
 
 

@@ -7,16 +7,14 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import psutil
 import pytest
 
-from catstream.errors import BoxError, CatstreamError, SettingsError, VideoError
+from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation import onepass, runs
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import evaluate, follow
-from catstream.evaluation.peers import PEERS, Peer
 from catstream.evaluation.runs import EvaluationRun, load, save
 from catstream.evaluation.starts import FIRST, Start, jittered, spatial, temporal
 from catstream.evaluation.summary import MEASURES, describe_flips, flips_of, mean_of, rows_of, to_json
@@ -39,7 +37,7 @@ def counted(monkeypatch, found):
     """`follow`, without following: counts its calls."""
     calls = []
 
-    def instead(tracker, _, sequence, start):
+    def instead(tracker, _, sequence, start, *_models):
         calls.append((tracker, sequence.name + start.suffix))
         frames, boxes = len(sequence) - start.frame, found[start.frame :].round(4)
         boxes[0] = np.round(start.box(sequence), 4)
@@ -248,31 +246,6 @@ if __name__ == "__main__":
     assert not alive
 
 
-def test_a_box_across_the_edge_of_the_frame_is_clipped_for_opencv(sequence):
-    frame = next(iter(sequence.frames()))
-    peer = Peer("mil")
-    peer.init(frame, (-8.0, 90.0, 40.0, 40.0))
-    found, _ = peer.update(frame)
-    assert found
-
-
-def test_a_box_that_opencv_rejects_is_one_line_of_error(monkeypatch, sequence):
-    class Broken:
-        def init(self, *_):
-            raise cv2.error("assertion failed")
-
-    peer = Peer("mil")
-    monkeypatch.setattr(peer, "_create", Broken)
-    with pytest.raises(BoxError, match="does not accept the box 1,2,30,40"):
-        peer.init(next(iter(sequence.frames())), (1, 2, 30, 40))
-
-
-def test_a_tracker_missing_in_opencv_is_an_error_with_the_install_command(monkeypatch):
-    monkeypatch.setitem(PEERS, "csrt", "TrackerThatIsNot")
-    with pytest.raises(SettingsError, match=r"catstream\[peers\]"):
-        Peer("csrt")
-
-
 def test_a_damaged_run_is_named(tmp_path, sequence, run):
     save(tmp_path, run)
     (tmp_path / "catstream" / "longterm" / "walk" / "walk_001.txt").write_text("rubbish\n")
@@ -321,9 +294,12 @@ def test_a_sequence_flips_if_its_success_depends_on_the_first_box(sequence, run)
 
 
 def test_the_json_has_every_row_and_the_means(run):
-    numbers = json.loads(json.dumps(to_json(rows_of([run]), Settings()), allow_nan=False))
+    numbers = json.loads(
+        json.dumps(to_json(rows_of([run]), Settings(), {"blur": ["walk"], "clutter": []}), allow_nan=False)
+    )
     (row,) = numbers["sequences"]
     assert {"name", "frames", "auc", "success", "precision", "f_score", "fps", "tracker"} <= row.keys()
     assert numbers["mean"].keys() == {"catstream"}
     assert numbers["flips"] == {}
+    assert numbers["attributes"] == {"blur": {"sequences": ["walk"], "mean": numbers["mean"]}}
     assert numbers["mean"]["catstream"].keys() == set(MEASURES)

@@ -50,14 +50,17 @@ def test_only_failures_are_shown_and_the_worst_first(sequence, found, lost):
 
 def test_the_report_is_self_contained(tmp_path, sequence, found, lost):
     path = write_report(
-        tmp_path / "report.html", [run_of(sequence, found, "mil"), lost], Settings(coreset={"size": 32})
+        tmp_path / "report.html",
+        [run_of(sequence, found, "mil"), lost],
+        Settings(coreset={"size": 32}),
+        {"blur": ["walk"], "out of view": ["walk"]},
     )
     page = path.read_text()
     assert page.count("<svg") == 2
     assert "data:image/jpeg;base64," in page
     assert not re.search(r"(src|href)=\"(?!data:)|<script|@import|url\(", page)
     assert "coreset.size=32" in page
-    assert page.count("<tr") == 1 + 2 + 2
+    assert page.count("<tr") == 1 + 2 + 2 + 1 + 2 * 2  # the sequences with the means, and the attributes
 
 
 def test_the_worst_failures_of_each_tracker_are_shown_and_more_of_the_first(tmp_path, sequence, lost):
@@ -65,7 +68,7 @@ def test_the_worst_failures_of_each_tracker_are_shown_and_more_of_the_first(tmp_
         sequences = [replace(sequence, name=f"{tracker}{number}") for number in range(4)]
         return [replace(lost, tracker=tracker, sequence=other) for other in sequences]
 
-    page = write_report(tmp_path / "report.html", named("catstream") + named("mil"), Settings()).read_text()
+    page = write_report(tmp_path / "report.html", named("catstream") + named("mil"), Settings(), {}).read_text()
     assert len(re.findall(r"<b>catstream\d</b>, catstream: wrong for", page)) == 4
     assert len(re.findall(r"<b>mil\d</b>, mil: wrong for", page)) == 2
 
@@ -79,17 +82,22 @@ def test_a_page_of_film_strips_has_the_worst_runs_only(tmp_path, sequence, lost)
 
 def test_a_report_that_cannot_be_written_is_an_error(tmp_path, lost):
     with pytest.raises(VideoError, match="cannot write the report"):
-        write_report(tmp_path / "missing" / "report.html", [lost], Settings())
+        write_report(tmp_path / "missing" / "report.html", [lost], Settings(), {})
 
 
 def test_the_command_prints_a_table_and_writes_all(tmp_path, walk):
     out, file = tmp_path / "out", tmp_path / "numbers.json"
+    attributes = tmp_path / "attributes.json"
+    attributes.write_text('{"walk": ["blur"]}')
     arguments = [str(walk), "--output", str(out), "--json", str(file), "--set", "coreset.size=32"]
+    arguments += ["--attributes", str(attributes)]
     result = CliRunner().invoke(evaluate, arguments, catch_exceptions=False)
     assert result.exit_code == 0
     assert re.search(r"walk +catstream +12 +0\.\d{3}", result.output)
     assert "report.html" in result.output
-    assert json.loads(file.read_text())["mean"]["catstream"]["success"] > 0.7
+    figures = json.loads(file.read_text())
+    assert figures["mean"]["catstream"]["success"] > 0.7
+    assert figures["attributes"]["blur"] == {"sequences": ["walk"], "mean": figures["mean"]}
     assert (out / "report.html").exists()
     assert (out / "catstream" / "walk.txt").exists()
 
