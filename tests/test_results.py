@@ -17,6 +17,8 @@ import page  # noqa: E402
 import sections  # noqa: E402
 from groups import CHECK, TUNED  # noqa: E402
 
+from catstream.evaluation.attributes import read_attributes  # noqa: E402
+
 SCRIPTS = {
     path.relative_to(ROOT).as_posix() for path in BENCHMARKS.rglob("*.py") if "publish(figures" in path.read_text()
 }
@@ -78,3 +80,11 @@ def test_the_tuning_set_is_reported_separately():
     assert (len(TUNED), len(CHECK), len(TUNED & CHECK)) == (20, 15, 3)
     assert names >= TUNED | CHECK
     assert "The defaults were chosen on the first 20" in sections.written(page.PAGES[0], FOUND)
+
+
+def test_every_sequence_of_the_benchmarks_has_the_attributes_that_need_looking():
+    attributes = read_attributes(BENCHMARKS / "attributes.json")
+    assert attributes.keys() == {row["name"] for row in FOUND["accuracy"]["sequences"]}
+    assert all(attributes.values())
+    known = {"deformation", "rotation", "occlusion", "blur", "clutter", "illumination"}
+    assert {one for each in attributes.values() for one in each} == known
