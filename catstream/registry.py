@@ -55,7 +55,7 @@ _TURN_SECONDS = 0.5  # after which the endpoint of a fleet on this machine is re
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a stream runs.
+    """The place of a stream.
 
     status    state of the stream
     endpoint  of its pipeline, with the keys to connect with; None if it does not run
@@ -113,7 +113,7 @@ class Registry:
         return status
 
     def place(self, stream: str) -> Place:
-        """Where a stream runs.
+        """Return the place of a stream.
 
         Raises
         ------

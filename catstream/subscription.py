@@ -265,7 +265,7 @@ class Subscription(Generic[Message]):
         return None if self._about is None else _KINDS[self._name]
 
     def _sockets(self) -> list[Subscriber[Any] | FollowedStream]:
-        """What is waited for."""
+        """The sockets that are polled for messages."""
         sockets: list[Subscriber[Any] | FollowedStream] = []
         if self._connection is not None:
             sockets += [self._connection.messages, self._connection.ends]

@@ -138,7 +138,7 @@ def merging(frames: int) -> Iterator[tuple]:
 
 
 def ray_costs() -> Iterator[tuple]:
-    """What the processes of Ray and of an actor in the manager's place take."""
+    """Measure the memory and the processor time of Ray's processes and of an actor in the place of the manager."""
     token = scratch() / "token"
     token.write_text(secrets.token_hex(24))
     os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), "RAY_USAGE_STATS_ENABLED": "0"}

@@ -60,7 +60,7 @@ class StoreLost:
 
 @dataclass(slots=True)
 class Outcome:
-    """What the streams lost.
+    """The losses of the streams.
 
     down      seconds from each failure of a stream until it tracked again, in the order of the recoveries
     back_at   time of each of these recoveries

@@ -183,7 +183,7 @@ def limits(costs: Costs, site: Site, seed: int) -> dict[str, int | None]:
 
 
 def breaking(costs: Costs, prices: Prices, seed: int) -> Table:
-    """Where each variant breaks first."""
+    """Return the first limit that each variant reaches."""
     found = {name: limits(costs, replace(Site(), **changes), seed) for name, changes in VARIANTS.items()}
     rows: list[tuple] = [(limit, *(found[name][limit] for name in VARIANTS)) for limit in found["as built"]]
     firsts = [min(number for number in found[name].values() if number is not None) for name in VARIANTS]

@@ -1,4 +1,4 @@
-"""What a stranger gets at the ports of a fleet: without a token, with a wrong one, and from another machine.
+"""Tries to reach a fleet as a stranger: without a token, with a wrong one, and from another machine.
 
 The calls are all gRPC methods that the programs of Ray name (lists of nodes, the key-value store, jobs, pushing tasks),
 with an empty message, and the HTTP routes of its agent, at each port of a fleet on this machine. As root, there are
@@ -119,7 +119,7 @@ def _frame(kind: int, flags: int, stream: int, body: bytes) -> bytes:
 
 
 def survives_sync(host: str, port: Port, token: str) -> str:
-    """What becomes of the process at a port after a call of `SYNC` without a token."""
+    """Return the effect of a call of `SYNC` without a token on the process at a port."""
     status, _ = grpc(host, port.number, SYNC, None)
     sleep(0.5)
     alive = grpc(host, port.number, "/grpc.health.v1.Health/Check", token)[0] == "0"

@@ -69,7 +69,7 @@ class Start:
 
     @property
     def suffix(self) -> str:
-        """What the name of a run has after that of its sequence: `@120`, `@left` or `@120-left`; often nothing."""
+        """The end of the name of a run, after the name of its sequence: `@120`, `@left`, `@120-left`, or empty."""
         parts = [str(self.frame)] if self.frame else []
         parts += [self.variation.name] if self.variation.name else []
         return "@" + "-".join(parts) if parts else ""

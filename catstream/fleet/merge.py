@@ -30,7 +30,7 @@ _EARLIER = "the last merge"
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What decides whether a saved model is merged.
+    """The properties of a saved model that decide whether it is merged.
 
     origins  of its trees, one for each stream of frames that they contain
     rows     training rows that were inserted into its trees

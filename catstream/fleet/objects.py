@@ -189,7 +189,7 @@ def _code(error: BaseException) -> str:
 
 
 def _trouble(error: Exception, code: str) -> str:
-    """What went wrong and what to do, without the text of the error: it may contain a credential."""
+    """Describe an error and its remedy without the text of the error, which may contain a credential."""
     if code == "NoSuchBucket":
         return "there is no such bucket: create it"
     if code:

@@ -133,7 +133,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """What a call of `reconcile` passes to the next one.
+    """State that a call of `reconcile` passes to the next one.
 
     ended     digest of each stream that has ended
     failures  the latest failure of each stream that failed
@@ -285,7 +285,7 @@ class _Turn:
     # --- where each stream belongs ----------------------------------------------------------------
 
     def _task(self, name: str, each: Desired) -> Task:
-        """What a stream needs. The actor of a stream that ended, or whose source was not opened, occupies no cores."""
+        """The resources that a stream needs. The actor of a stream that ended, or whose source was not opened, occupies no cores."""
         actor, failure = self._actors.get(name), self._failures.get(name)
         node = actor.node if actor is not None and actor.phase not in ("ended", "unopened") else None
         return Task(name, each.cores, each.labels, node, self._target(name), failure.unopened if failure else ())
@@ -353,7 +353,7 @@ class _Turn:
         return may_host(self._nodes[node], self._wanted[name].labels)
 
     def _starts(self, where: Mapping[str, str]) -> tuple[list[Start], dict[str, float]]:
-        """What to start now, and the time of the next start of each stream that waits after a failure."""
+        """The streams to start now, and the time of the next start of each stream that waits after a failure."""
         starts, waiting = [], {}
         for name, each in sorted(self._wanted.items()):
             failure, actor = self._failures.get(name), self._actors.get(name)

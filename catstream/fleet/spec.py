@@ -1,4 +1,4 @@
-"""What a fleet should run: its streams, as a file in TOML describes them.
+"""The desired state of a fleet: its streams, as a file in TOML describes them.
 
     name = "site"                      # the default is the name of the file
     store = "state"                    # a folder, file:///..., or s3://bucket/prefix
@@ -199,7 +199,7 @@ class FleetSpec:
         return json.dumps(own | {"streams": streams})
 
     def changes(self, new: FleetSpec) -> list[str]:
-        """What becomes of each stream if another spec takes the place of this one, a line for each."""
+        """Describe the change of each stream if another spec takes the place of this one, a line for each."""
         lines = []
         for name in sorted(self.streams.keys() | new.streams.keys()):
             before, after = self.streams.get(name), new.streams.get(name)

@@ -60,7 +60,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a stream runs.
+    """The place of a stream.
 
     node     name of the node
     address  IP address at which other machines reach its sockets; empty if all clients are on this machine
@@ -73,7 +73,7 @@ class Place:
 
 
 class Report(NamedTuple):
-    """What a stream tells the manager.
+    """A report of a stream to the manager.
 
     status         its figures
     source_failed  whether it failed because this node cannot read its source
@@ -133,7 +133,6 @@ class Stream:
         self._stop, self._lock = threading.Event(), threading.Lock()
         self._lines: deque[str] = deque(maxlen=_LOG_LINES)
         self._pipeline: Pipeline | None = None
-        self._claim: Claim | None = None
         self._stored_at = 0.0  # seconds since 1970
         self._store_trouble = self._failure = ""
         self._source_failed = self._fenced = False
@@ -191,9 +190,9 @@ class Stream:
         handler = _Lines(self._lines)
         logging.getLogger("catstream").addHandler(handler)
         try:
-            self._claim = self._claimed()
-            if self._claim is not None:
-                self._follow(self._claim)
+            claim = self._claimed()
+            if claim is not None:
+                self._follow(claim)
         except VideoError as error:
             self._fail(str(error), source=True)
         except CatstreamError as error:

@@ -43,7 +43,7 @@ _IDLE_SECONDS = 0.1
 
 @dataclass(frozen=True, slots=True)
 class _Parameters:
-    """What the text of a live demo says."""
+    """The parameters in the address of a live demo."""
 
     seed: int
     size: tuple[int, int] = _SIZE
