@@ -285,7 +285,10 @@ class _Turn:
     # --- where each stream belongs ----------------------------------------------------------------
 
     def _task(self, name: str, each: Desired) -> Task:
-        """The resources that a stream needs. The actor of a stream that ended, or whose source was not opened, occupies no cores."""
+        """The resources that a stream needs.
+
+        The actor of a stream that ended, or whose source was not opened, occupies no cores.
+        """
         actor, failure = self._actors.get(name), self._failures.get(name)
         node = actor.node if actor is not None and actor.phase not in ("ended", "unopened") else None
         return Task(name, each.cores, each.labels, node, self._target(name), failure.unopened if failure else ())
