@@ -14,9 +14,10 @@ import numpy as np
 from sequences import sequences
 from table import command
 
-from catstream.errors import VideoError
+from catstream.errors import SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import evaluate
+from catstream.evaluation.peers import PEERS, Peer
 from catstream.evaluation.runs import EvaluationRun
 from catstream.evaluation.starts import Starts, choose_starts
 from catstream.evaluation.summary import rows_of
@@ -24,11 +25,13 @@ from catstream.settings import Settings
 
 __all__ = [
     "accuracy_command",
+    "available",
     "changed",
     "check_names",
     "compared",
     "described",
     "difference",
+    "many_sequences",
     "means",
     "shortened",
     "starts_of",
@@ -40,13 +43,18 @@ MEANS = ("AUC", "success", "precision")
 
 
 def accuracy_command(about: str | None, starts: int = 1, *, kept: bool = True) -> argparse.ArgumentParser:
-    """Return a parser with the options of a benchmark over many sequences."""
-    parser = command(about)
+    """Return a parser with the options of a benchmark over many sequences and starts."""
+    parser = many_sequences(command(about), kept=kept)
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument(
         "--starts", type=int, default=starts, help="number of start frames of each sequence (default: %(default)s)"
     )
     chosen.add_argument("--jitter", type=int, metavar="K", help="K first boxes within 2 %% instead")
+    return parser
+
+
+def many_sequences(parser: argparse.ArgumentParser, *, kept: bool = True) -> argparse.ArgumentParser:
+    """Add the options that choose sequences and their frames, and, if runs are kept, their folder."""
     parser.add_argument("--group", choices=("all", "tuning", "check"), default="all", help="only these sequences")
     parser.add_argument(
         "--check", type=Path, metavar="FILE", help="names of the check sequences (default: check.txt in the data)"
@@ -87,6 +95,19 @@ def check_names(options: argparse.Namespace) -> set[str]:
         return set(file.read_text(encoding="utf-8").split())
     except OSError as error:
         raise VideoError(f"cannot read the check list {str(file)!r} ({error.strerror}): give it with --check") from None
+
+
+def available(names: Iterable[str], models: Path | None = None) -> tuple[list[str], str]:
+    """Return the trackers that this OpenCV has, and a line for each one that is missing."""
+    trackers, missing = [], ""
+    for name in names:
+        try:
+            if name in PEERS:
+                Peer(name, models)
+            trackers.append(name)
+        except SettingsError as error:  # the message has the install command, or the names of the model files
+            missing += f"\n{error}"
+    return trackers, missing
 
 
 def starts_of(options: argparse.Namespace) -> Starts:

@@ -16,21 +16,19 @@ from statistics import median
 
 import cv2
 import numpy as np
-from accuracy import shortened
+from accuracy import available, shortened
 from journey import Journey, travel
 from sequences import named, rendered, video
 from table import Table, command, publish
 from throughput import MODES, steps
 
 from catstream.box import Box
-from catstream.errors import SettingsError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.onepass import evaluate, follow
-from catstream.evaluation.peers import Peer
 from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
-PEERS = ("csrt", "kcf", "mil")
+TRACKERS = ("catstream", "csrt", "kcf", "mil")
 SIZES = ((320, 240), (640, 480), (960, 720), (1280, 720), (1920, 1080), (3840, 2160))
 #: Width and height of the smallest box, in pixels.
 TINY = 6
@@ -64,7 +62,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         cases, sizes, modes, coresets, frames = CASES[:1], ((640, 480),), ("local",), (Settings().coreset.size,), 8
     sequences = shortened(options)
     journeys = [sequence_in_pipeline(sequence) for sequence in sequences]
-    trackers, missing = installed()
+    trackers, missing = available(TRACKERS)
     runs = evaluate(sequences, trackers, Settings())
     own = [run for run in runs if run.tracker == "catstream"]
     yield beside_peers(sequences, journeys, runs, missing)
@@ -105,18 +103,6 @@ def own_program(options: argparse.Namespace) -> Table:
     return Table(
         "Tracker in a user's program", columns, rows, f"352x288 pixels, {frames} frames, median of {runs} runs"
     )
-
-
-def installed() -> tuple[list[str], str]:
-    """Return the trackers that this OpenCV has, after catstream, and a line for each one that is missing."""
-    trackers, missing = ["catstream"], ""
-    for name in PEERS:
-        try:
-            Peer(name)
-            trackers.append(name)
-        except SettingsError as error:  # the message has the install command
-            missing += f"\n{error}"
-    return trackers, missing
 
 
 def beside_peers(sequences: list[Sequence], journeys: list[Journey], runs: list[EvaluationRun], missing: str) -> Table:

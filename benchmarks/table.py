@@ -23,7 +23,15 @@ __all__ = ["Cell", "Table", "command", "publish", "text"]
 
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")
-_PLACES = ("--json", "--data", "--output", "--strips")  # options with paths of this machine
+_PLACES = (
+    "--json",
+    "--data",
+    "--output",
+    "--strips",
+    "--check",
+    "--attributes",
+    "--peer-models",
+)  # options with paths of this machine
 
 Cell = str | int | float | None
 

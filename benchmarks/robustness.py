@@ -1,0 +1,160 @@
+"""Accuracy over many starts and first boxes, for the tuning and the check sequences apart, beside other trackers.
+
+    ope     one-pass evaluation: one run of each sequence
+    tre     temporal robustness: runs from several frames
+    sre     spatial robustness: 12 first boxes, shifted or scaled
+    jitter  several first boxes that differ by at most 2 %
+
+The standard error is over the sequences; runs over one sequence are alike, and count as one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from accuracy import available, check_names, many_sequences, videos
+from table import Cell, Table, command, publish
+
+from catstream.evaluation.attributes import attributes_of, read_attributes
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.onepass import TRACKERS, evaluate
+from catstream.evaluation.runs import EvaluationRun
+from catstream.evaluation.starts import Start, Starts, jittered, one_pass, spatial, temporal
+from catstream.evaluation.summary import Row, rows_of
+from catstream.settings import Settings
+
+PARTS = ("ope", "tre", "sre", "jitter")
+ATTRIBUTES = Path(__file__).with_name("attributes.json")
+COLUMNS = ("tracker", "starts", "group", "sequences", "AUC", "AUC ±", "success", "success ±", "F", "F ±", "flip")
+
+#: The rows of each tracker and part.
+Found = Mapping[tuple[str, str], list[Row]]
+
+
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    sequences = videos(options)
+    trackers, _ = available(options.trackers, options.peer_models)
+    parts = {tracker: options.parts if tracker == "catstream" else options.peer_parts for tracker in trackers}
+    chosen = starts_by_part(options)
+    found: dict[tuple[str, str], list[Row]] = {}
+    for tracker, own in parts.items():
+        runs = followed(options, tracker, sequences, [chosen[part] for part in own])
+        for part in own:
+            starts = {sequence.name: set(chosen[part](sequence)) for sequence in sequences}
+            found[tracker, part] = rows_of(run for run in runs if run.start in starts[run.sequence.name])
+    check = check_names(options)
+    yield overview(found, described(options), groups_of(sequences, check))
+    attributes = {"any": [sequence.name for sequence in sequences]}
+    attributes |= attributes_of(sequences, read_attributes(options.attributes))
+    yield by_attribute(found, attributes, check)
+
+
+def starts_by_part(options: argparse.Namespace) -> dict[str, Starts]:
+    """Return the starts of each part."""
+    frames, boxes = (2, 2) if options.quick else (options.starts, options.jitter)
+    return dict(zip(PARTS, (one_pass, temporal(frames), spatial, jittered(boxes)), strict=True))
+
+
+def described(options: argparse.Namespace) -> dict[str, str]:
+    """Return each part in words."""
+    words = ("OPE", f"TRE, {options.starts} frames", "SRE, 12 boxes", f"jitter, {options.jitter} boxes")
+    return dict(zip(PARTS, words, strict=True))
+
+
+def followed(
+    options: argparse.Namespace, tracker: str, sequences: list[Sequence], parts: list[Starts]
+) -> list[EvaluationRun]:
+    """Run a tracker on all sequences from the starts of several parts; a start that is in two parts runs once."""
+
+    def starts(sequence: Sequence) -> list[Start]:
+        return list(dict.fromkeys(start for part in parts for start in part(sequence)))
+
+    return evaluate(
+        sequences,
+        [tracker],
+        Settings(),
+        starts=starts,
+        peer_models=options.peer_models,
+        jobs=1 if options.quick else options.jobs,
+        output=options.output,
+        done=lambda run: print(f"{tracker}: {run.name}", file=sys.stderr),
+    )
+
+
+def groups_of(sequences: Iterable[Sequence], check: set[str]) -> dict[str, set[str]]:
+    """Return the names of the sequences of each group; only groups with sequences."""
+    names = {sequence.name for sequence in sequences}
+    groups = {"all": names, "tuning": names - check, "check": names & check}
+    return {group: members for group, members in groups.items() if members}
+
+
+def overview(found: Found, parts: Mapping[str, str], groups: Mapping[str, set[str]]) -> Table:
+    """Return the mean of each tracker and part over each group of sequences, with its standard error."""
+    rows: list[list[Cell]] = []
+    note = "±: standard error over the sequences; F: of the sequences in which the object is absent in some frames"
+    for (tracker, part), measured in found.items():
+        for group, names in groups.items():
+            members = [row for row in measured if row.name in names]
+            rows.append([tracker, parts[part], group, len(members), *summarised(members), flips(members, part)])
+        if names := [row.name for row in measured if part == "jitter" and row.flips]:
+            note += f"\n{tracker} flips on {', '.join(names)}"
+    return Table("Robustness", COLUMNS, rows, note)
+
+
+def summarised(rows: list[Row]) -> Iterator[float | None]:
+    """Return the mean and the standard error of AUC, success and F-score."""
+    for measure in ("auc", "success", "f_score"):
+        yield from mean_and_error([getattr(row, measure) for row in rows])
+
+
+def mean_and_error(values: Iterable[float | None]) -> tuple[float | None, float | None]:
+    """Return the mean of the values that are not None, and its standard error, if there are enough."""
+    known = np.array([value for value in values if value is not None])
+    mean = float(known.mean()) if len(known) else None
+    return mean, float(known.std(ddof=1) / np.sqrt(len(known))) if len(known) > 1 else None
+
+
+def flips(rows: list[Row], part: str) -> int | None:
+    """Return on how many sequences the success depends on the jitter of the first box; None for the other parts."""
+    return sum(bool(row.flips) for row in rows) if part == "jitter" else None
+
+
+def by_attribute(found: Found, attributes: Mapping[str, list[str]], check: set[str]) -> Table:
+    """Return the means of the trackers over the sequences with each attribute, from the first part of each tracker."""
+    first: dict[str, list[Row]] = {}
+    for (tracker, _), measured in found.items():
+        first.setdefault(tracker, measured)
+    rows: list[list[Cell]] = []
+    for attribute, names in attributes.items():
+        cells: list[Cell] = [attribute, len(names), len(check & set(names))]
+        for measured in first.values():
+            members = [row for row in measured if row.name in names]
+            cells += [*mean_and_error(row.auc for row in members), mean_and_error(row.success for row in members)[0]]
+        rows.append(cells)
+    columns = [f"{tracker}{word}" for tracker in first for word in (" AUC", " ±", " success")]
+    return Table(
+        "Attributes", ("attribute", "sequences", "check", *columns), rows, "check: how many are check sequences"
+    )
+
+
+if __name__ == "__main__":
+    parser = many_sequences(command(__doc__))
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="parts for catstream (default: all)")
+    parser.add_argument("--peer-parts", nargs="+", choices=PARTS, default=PARTS[:1], help="for others (default: ope)")
+    parser.add_argument("--starts", type=int, default=5, help="number of frames of tre (default: %(default)s)")
+    parser.add_argument("--jitter", type=int, default=7, help="number of boxes of jitter (default: %(default)s)")
+    parser.add_argument("--trackers", nargs="+", choices=TRACKERS, default=TRACKERS, help="those that are installed")
+    parser.add_argument("--peer-models", type=Path, metavar="FOLDER", help="model files of nano and vit")
+    parser.add_argument(
+        "--attributes",
+        type=Path,
+        metavar="FILE",
+        default=ATTRIBUTES,
+        help="attributes of the sequences (default: %(default)s)",
+    )
+    options = parser.parse_args()
+    publish(figures(options), options)
