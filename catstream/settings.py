@@ -269,7 +269,14 @@ class TeachingSettings(_Group):
     hard_negatives: Annotated[
         int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
     ] = 10
-    mining_interval: Annotated[int, _about("Frames between two searches for hard negatives.", ge=1)] = 8
+    mining_interval: Annotated[
+        int,
+        _about(
+            "Frames between two searches for hard negatives. Of a frame that is too large for its object to be "
+            "searched at once, a part is searched in each frame.",
+            ge=1,
+        ),
+    ] = 8
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from catstream.detection import belief, extent
 from catstream.detection.likeness import Likeness
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
-from catstream.features.pyramid import Pyramid
+from catstream.features.pyramid import Pyramid, Region
 from catstream.heads import EXTENT
 from catstream.messages import DetectorState, Model
 from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
@@ -24,6 +24,7 @@ from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, S
 __all__ = [
     "Detection",
     "ScoreMap",
+    "due",
     "find",
     "fitted",
     "local",
@@ -34,6 +35,7 @@ __all__ = [
     "whole",
 ]
 
+_MOST_CELLS = 16_384  # that a search of the whole frame may have in one frame, at all sizes: they take some 14 ms
 _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a cell away from that at another size
 _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
@@ -41,6 +43,10 @@ _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in th
 _LIKELY_STEPS = 8  # larger or smaller than the size at which an object was first found, that are tried
 _LEAD_OVER_ALIKE = 0.25  # difference of score to another window whose likeness to the object is at least half as high
 _SAME_OVERLAP = 0.3  # above which two windows in successive frames show the same object
+
+
+#: A region of a frame that is searched, and the factor of the window's size in it.
+_Part = tuple[float, Region]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +93,16 @@ class ScoreMap:
         return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step)
 
     @classmethod
+    def within(cls, frame: Pyramid, region: Region, window: Window, model: Model) -> ScoreMap:
+        """All windows of a size in a region of a frame."""
+        image, step = frame.part(region).resized(window)
+        cells = Cells.of(image)
+        return cls(cells, cells.respond(model.weights, model.bias), (float(region.left), float(region.top)), step)
+
+    @classmethod
     def whole(cls, frame: Pyramid, window: Window, model: Model) -> ScoreMap:
         """All windows of a size in a frame, or in as large a part around the window as can be searched in time."""
-        image, origin, step = frame.whole(window)
-        cells = Cells.of(image)
-        return cls(cells, cells.respond(model.weights, model.bias), origin, step)
+        return cls.within(frame, frame.region_around(window), window, model)
 
     def window(self, row: float, column: float) -> Window:
         """The window at (row, column), which may lie between cells."""
@@ -162,12 +173,11 @@ def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings:
     near = _near(frame, state.window, state, model, settings)
     level = belief.level_of(near.score, state.trusted, settings.belief)
     interval = belief.policies(settings.search.whole_interval)[level].search_interval
-    if interval and seq % interval == 0:
-        other = whole(frame, confident, model)
-        if belief.is_redetection(other.score, near.score, settings.belief):
-            other = _near(frame, other.window, state, model, settings)
-            if other.score > near.score:
-                return replace(other, redetected=True)
+    other = _elsewhere(frame, confident, seq, interval, model) if interval else None
+    if other is not None and belief.is_redetection(other.score, near.score, settings.belief):
+        other = _near(frame, other.window, state, model, settings)
+        if other.score > near.score:
+            return replace(other, redetected=True)
     return near
 
 
@@ -226,8 +236,64 @@ def local(frame: Pyramid, window: Window, model: Model, settings: SearchSettings
 
 def whole(frame: Pyramid, window: Window, model: Model) -> Detection:
     """The best window of a whole frame at three sizes: that of a window, 0.8 and 1.25 times as large."""
-    found = [ScoreMap.whole(frame, window.scaled(factor), model).best() for factor in _WHOLE_FACTORS]
-    costs = [extent.cost(math.log(factor)) for factor in _WHOLE_FACTORS]
+    parts = [(factor, frame.region_around(window.scaled(factor))) for factor in _WHOLE_FACTORS]
+    return _best_of(frame, parts, window, model)
+
+
+def due(seq: int, interval: int, count: int) -> int | None:
+    """Number of the part of a task that is done with a frame; None if no part is.
+
+    Of `count` parts, each is done once in `interval` frames, or once in `count` frames if there are more parts.
+
+    >>> [due(seq, 5, 2) for seq in range(7)], [due(seq, 1, 3) for seq in range(5)]
+    ([0, 1, None, None, None, 0, 1], [0, 1, 2, 0, 1])
+    """
+    number = seq % max(interval, count)
+    return number if number < count else None
+
+
+def _elsewhere(frame: Pyramid, window: Window, seq: int, interval: int, model: Model) -> Detection | None:
+    """The best window of the parts of a frame that are due, at the size of a window, 0.8 or 1.25 times it.
+
+    At most `_MOST_CELLS` cells are searched in a frame. If the frame has more at the three sizes, its parts take turns;
+    every other turn is one around the window, if the window is tiny.
+
+    Returns
+    -------
+    None if no part is due
+    """
+    around = _turns(window, frame.region_around)
+    everywhere = _turns(window, lambda _: frame.region)
+    if around == everywhere:
+        turn = due(seq, interval, len(around))
+        return None if turn is None else _best_of(frame, around[turn], window, model)
+    turn = due(seq, interval, 2 * len(everywhere))
+    if turn is None:
+        return None
+    turns = everywhere if turn % 2 else around
+    return _best_of(frame, turns[turn // 2 % len(turns)], window, model)
+
+
+def _turns(window: Window, region: Callable[[Window], Region]) -> list[list[_Part]]:
+    """The parts of a region that are searched at three sizes, in groups of at most `_MOST_CELLS` cells."""
+    turns: list[list[_Part]] = []
+    left = 0.0
+    for factor in _WHOLE_FACTORS:
+        sized = window.scaled(factor)
+        for part in region(sized).split(sized, _MOST_CELLS):
+            cells = part.cells(sized)
+            if not turns or cells > left:
+                turns.append([])
+                left = _MOST_CELLS
+            turns[-1].append((factor, part))
+            left -= cells
+    return turns
+
+
+def _best_of(frame: Pyramid, parts: list[_Part], window: Window, model: Model) -> Detection:
+    """The best window of several parts of a frame, each searched at the size of a window times a factor."""
+    found = [ScoreMap.within(frame, region, window.scaled(factor), model).best() for factor, region in parts]
+    costs = [extent.cost(math.log(factor)) for factor, _ in parts]
     return found[int(np.argmax([each.score - cost for each, cost in zip(found, costs, strict=True)]))]
 
 

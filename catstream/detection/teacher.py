@@ -18,7 +18,7 @@ from catstream import ridge
 from catstream.box import Window
 from catstream.detection import extent
 from catstream.detection.likeness import Likeness
-from catstream.detection.search import ScoreMap, non_maximum_suppression
+from catstream.detection.search import ScoreMap, due, non_maximum_suppression
 from catstream.errors import BoxError
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW, row_length
@@ -49,6 +49,7 @@ _EXTENT_INTERVAL = 2  # frames from one set of rows of group "extent" to the nex
 _OBJECT_WEIGHT = 8.0  # of a frame's rows of the object together; any other row has weight 1
 _BACKGROUND = 12  # windows of the background around the object, of each frame
 _SIDE = 20  # cells around the object, at least, from which background is taken
+_MOST_CELLS = 4096  # that a search for hard negatives may have in one frame: they take some 4 ms
 _HARD_OVERLAP = 0.2  # of a hard negative with the object's window, at most
 
 _SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations of affine copies: a factor, a share of the box, radians
@@ -89,11 +90,11 @@ def training_of(
     ----------
     window : of the detection; the rows are cut around it
     around : as for `training_at`
-    seq : of the frame: rows of group "extent" and hard negatives are not cut in each
+    seq : of the frame: rows of group "extent" are not cut in each, and hard negatives in a part of the frame
     """
     training = training_at(frame, window, seq, model, settings, around, extents=seq % _EXTENT_INTERVAL == 0)
-    if seq % settings.teaching.mining_interval == 0:
-        training[APPEARANCE] += hard_negatives(frame, window, model, settings.teaching)
+    if (mined := _mined(frame, window, seq, model, settings.teaching)) is not None:
+        training[APPEARANCE] += mined
     return training
 
 
@@ -136,6 +137,24 @@ def hard_negatives(frame: Pyramid, window: Window, model: Model, teaching: Teach
     """The windows of the whole frame that score highest, without those that overlap the object's."""
     scores = ScoreMap.whole(frame, window, model)
     return _rows(_strongest(scores, window, teaching.hard_negatives), 0, 1, teaching)
+
+
+def _mined(frame: Pyramid, window: Window, seq: int, model: Model, teaching: TeachingSettings) -> TrainingRows | None:
+    """The hard negatives of the part of the frame that is due, None if no part is.
+
+    Each part has its share of the rows, so that their number over many frames does not depend on that of the parts.
+    """
+    parts = frame.region_around(window).split(window, _MOST_CELLS)
+    number = due(seq, teaching.mining_interval, len(parts))
+    if number is None:
+        return None
+    # Rows of a round: hard_negatives / mining_interval for each of its frames. Each part has an equal share of them.
+    rows = teaching.hard_negatives * max(len(parts), teaching.mining_interval)
+    end, begin = (each * rows // (len(parts) * teaching.mining_interval) for each in (number + 1, number))
+    if begin == end:
+        return None
+    scores = ScoreMap.within(frame, parts[number], window, model)
+    return _rows(_strongest(scores, window, end - begin), 0, 1, teaching)
 
 
 def _strongest(scores: ScoreMap, window: Window, most: int, least: float = -math.inf) -> list[np.ndarray]:

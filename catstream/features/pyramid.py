@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
@@ -10,9 +13,46 @@ from catstream.box import Window
 from catstream.features.compiled import kernel
 from catstream.features.layout import CELL, MARGIN, WINDOW
 
-__all__ = ["Pyramid"]
+__all__ = ["Pyramid", "Region"]
 
-_MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for a tiny object in a large frame
+_MOST_CELLS = 62_500  # around a window: bounds the cost of a tiny object in a large frame
+_OVERLAP = WINDOW + 2 * MARGIN  # cells that two regions beside each other share, at least: a window, and its margin
+
+
+class Region(NamedTuple):
+    """A rectangle of whole pixels of a frame."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def cells(self, window: Window) -> float:
+        """Number of cells of the region if a window in it has 8 x 8."""
+        return (self.width / window.w * WINDOW) * (self.height / window.h * WINDOW)
+
+    def split(self, window: Window, most: int) -> list[Region]:
+        """Parts of at most `most` cells, a few more by rounding; each window lies in one of them, with its margin.
+
+        >>> Region(0, 0, 640, 480).split(Window(0, 0, 64, 64), 5000)
+        [Region(left=0, top=0, width=640, height=480)]
+        >>> Region(0, 0, 640, 480).split(Window(0, 0, 64, 64), 4000)
+        [Region(left=0, top=0, width=368, height=480), Region(left=272, top=0, width=368, height=480)]
+        """
+        share_x, share_y = window.w / WINDOW * _OVERLAP, window.h / WINDOW * _OVERLAP
+        across = down = 1
+        width, height = float(self.width), float(self.height)
+        while width / window.w * height / window.h * WINDOW**2 > most:
+            if width / window.w >= height / window.h:
+                across += 1
+                width = (self.width + (across - 1) * share_x) / across
+            else:
+                down += 1
+                height = (self.height + (down - 1) * share_y) / down
+        w, h = min(math.ceil(width), self.width), min(math.ceil(height), self.height)
+        lefts = [self.left + round(i * (self.width - w) / max(across - 1, 1)) for i in range(across)]
+        tops = [self.top + round(i * (self.height - h) / max(down - 1, 1)) for i in range(down)]
+        return [Region(left, top, w, h) for top in tops for left in lefts]
 
 
 class Pyramid:
@@ -62,24 +102,26 @@ class Pyramid:
         step = window.w / WINDOW, window.h / WINDOW
         return self.cut(x, y, step[0] / CELL, step[1] / CELL, (side + 2 * MARGIN) * CELL)
 
-    def whole(self, window: Window) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
-        """The frame, resized until a window is 64 x 64 pixels; the part around the window, if this were too large.
+    @property
+    def region(self) -> Region:
+        """All of the frame."""
+        return Region(0, 0, *self.size)
 
-        Returns
-        -------
-        the image; its corner, (x, y), and width and height of a cell, in pixels of the frame
-        """
+    def region_around(self, window: Window) -> Region:
+        """All of the frame, or as large a part around a tiny window as has 250 x 250 cells."""
         width, height = self.size
-        side = WINDOW * CELL
-        reach = np.sqrt(_MOST_PIXELS / (width * side / window.w * height * side / window.h))
-        left, top, part = 0, 0, self
-        if reach < 1:
-            x, y = window.centre
-            w, h = int(width * reach), int(height * reach)
-            left, top = int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))
-            part = Pyramid(self.image[top : top + h, left : left + w])
-        resized, step = part.resized(window)
-        return resized, (float(left), float(top)), step
+        reach = math.sqrt(_MOST_CELLS / self.region.cells(window))
+        if reach >= 1:
+            return self.region
+        x, y = window.centre
+        w, h = int(width * reach), int(height * reach)
+        return Region(int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h)), w, h)
+
+    def part(self, region: Region) -> Pyramid:
+        """A region of the frame; the pyramid itself, if the region is all of it."""
+        if region == self.region:
+            return self
+        return Pyramid(self.image[region.top :, region.left :][: region.height, : region.width])
 
     def resized(self, window: Window, *, averaged: bool = True) -> tuple[np.ndarray, tuple[float, float]]:
         """The frame, resized until a window is 64 x 64 pixels.

@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from catstream.box import Window
-from catstream.detection.search import ScoreMap, non_maximum_suppression
+from catstream.detection import search
+from catstream.detection.search import ScoreMap, due, non_maximum_suppression
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
-from catstream.features.pyramid import Pyramid
+from catstream.features.pyramid import Pyramid, Region
 from catstream.messages import Model
 
 
@@ -37,11 +40,49 @@ def test_a_whole_frame_is_resized_until_a_window_is_8_x_8_cells(image, rng):
     assert (scores.origin, scores.step) == ((0, 0), (5, 6.25))
 
 
-def test_of_a_frame_that_is_too_large_for_a_tiny_window_the_part_around_it_is_searched():
-    image, origin, step = Pyramid(np.zeros((600, 800, 3), np.uint8)).whole(Window(396, 296, 8, 8))
-    assert image.shape[0] * image.shape[1] <= 4_000_000
-    assert origin[0] > 0 < origin[1]
-    assert origin[0] + image.shape[1] / 8 * step[0] == pytest.approx(800 - origin[0], abs=2)
+def test_windows_of_a_region_lie_in_it(image, rng):
+    model = Model(1, 0, rng.normal(size=len(Cells.of(image).row(0, 0))).astype(np.float32), 0.0)
+    scores = ScoreMap.within(Pyramid(image), Region(40, 20, 100, 90), Window(0, 0, 40, 40), model)
+    assert scores.origin == (40, 20)
+    last = scores.window(*np.subtract(scores.scores.shape, 1))
+    assert (last.x + last.w, last.y + last.h) == pytest.approx((140, 110))
+
+
+@given(st.integers(0, 10**6), st.integers(1, 30), st.integers(1, 60))
+def test_each_part_is_due_once_in_an_interval_or_in_as_many_frames_as_there_are_parts(seq, interval, count):
+    frames = max(interval, count)
+    parts = [part for number in range(seq, seq + frames) if (part := due(number, interval, count)) is not None]
+    assert sorted(parts) == list(range(count))
+
+
+@pytest.fixture
+def visited(monkeypatch):
+    """The regions that are searched, with the size of their windows, in order."""
+    found = []
+
+    def within(_, region, window, __):
+        found.append((region, window))
+        return ScoreMap(Cells.of(np.zeros((64, 64, 3), np.uint8)), np.zeros((1, 1), np.float32), (0.0, 0.0), (1.0, 1.0))
+
+    monkeypatch.setattr(ScoreMap, "within", within)
+    return found
+
+
+@pytest.mark.parametrize("side", [6, 20, 60])
+@pytest.mark.parametrize("interval", [1, 10])
+def test_in_a_round_each_window_of_each_size_is_searched_for_and_a_frame_costs_no_more_than_is_allowed(
+    visited, side, interval
+):
+    frame, window, model = Pyramid(np.zeros((240, 320, 3), np.uint8)), Window(100, 90, side, side), Model(0, 0, None, 0)
+    for seq in range(200):
+        before = len(visited)
+        search._elsewhere(frame, window, seq, interval, model)
+        assert sum(region.cells(sized) for region, sized in visited[before:]) < 1.2 * 16_384
+    for factor in (0.8, 1.0, 1.25):
+        w = side * factor
+        parts = [region for region, sized in visited if sized.w == pytest.approx(w)]
+        for x, y in np.random.default_rng(1).uniform(0, (320 - w, 240 - w), (50, 2)):
+            assert any(r.left <= x <= r.left + r.width - w and r.top <= y <= r.top + r.height - w for r in parts)
 
 
 def test_a_maximum_between_cells_is_interpolated_from_its_neighbours(image):

@@ -123,6 +123,21 @@ def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
     assert min(np.abs(rows.rows - own).max(axis=1)) > 0.01
 
 
+@pytest.mark.parametrize("most", [5000, 700, 200], ids=["at once", "in parts", "in more parts than frames"])
+def test_hard_negatives_of_a_round_are_as_many_however_many_parts_are_searched_in_turn(frame, model, monkeypatch, most):
+    monkeypatch.setattr(teacher, "_MOST_CELLS", most)
+    monkeypatch.setattr(teacher, "_strongest", lambda scores, window, most: [scores.row(0, 0)] * most)
+    teaching = SETTINGS.teaching
+    parts = frame.region.split(OBJECT, most)
+    frames = max(len(parts), teaching.mining_interval)
+    mined = [teacher._mined(frame, OBJECT, seq, model, teaching) for seq in range(frames)]
+    counts = [len(each) for each in mined if each is not None]
+    assert sum(counts) == teaching.hard_negatives * frames // teaching.mining_interval
+    assert max(counts) <= -(-teaching.hard_negatives // min(len(parts), teaching.mining_interval))
+    again = teacher._mined(frame, OBJECT, 0, model, teaching)
+    np.testing.assert_array_equal(again.rows, mined[0].rows)
+
+
 def test_colours_that_are_not_used_are_0_in_every_row(frame, model):
     for used in (True, False):
         settings = SETTINGS.but({"teaching.colours": used})

@@ -3,8 +3,12 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from catstream.features.pyramid import Pyramid
+from catstream.box import Window
+from catstream.features.layout import WINDOW
+from catstream.features.pyramid import Pyramid, Region
 
 
 @pytest.fixture
@@ -80,3 +84,44 @@ def test_a_cut_lies_between_the_pixels(image, x, y, grey, turn):
     expected = cv2.remap(image.astype(np.float32), *np.float32(where), cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
     assert np.abs(patch - expected).max() < 3, "OpenCV knows 32 places between two pixels"
     assert np.abs(patch - expected).mean() < 0.5
+
+
+REGIONS = st.builds(Region, st.integers(0, 99), st.integers(0, 99), st.integers(40, 4000), st.integers(40, 4000))
+WINDOWS = st.builds(Window, st.just(0.0), st.just(0.0), st.floats(6, 300), st.floats(6, 300))
+
+
+@given(REGIONS, WINDOWS, st.integers(400, 20_000), st.floats(0, 1), st.floats(0, 1))
+def test_each_window_of_a_region_lies_in_one_of_its_parts(region, window, most, across, down):
+    parts = region.split(window, most)
+    x = region.left + across * max(region.width - window.w, 0)
+    y = region.top + down * max(region.height - window.h, 0)
+    assert any(
+        part.left <= x
+        and part.top <= y
+        and min(x + window.w, region.left + region.width) <= part.left + part.width
+        and min(y + window.h, region.top + region.height) <= part.top + part.height
+        for part in parts
+    )
+
+
+@given(REGIONS, WINDOWS, st.integers(400, 20_000))
+def test_a_part_has_no_more_cells_than_are_allowed_but_for_its_last_pixels(region, window, most):
+    for part in region.split(window, most):
+        inner = part._replace(width=part.width - 1, height=part.height - 1)
+        assert inner.cells(window) <= most
+        assert region.left <= part.left <= part.left + part.width <= region.left + region.width
+        assert region.top <= part.top <= part.top + part.height <= region.top + region.height
+
+
+def test_a_part_of_a_frame_shows_the_same_pixels(image):
+    frame = Pyramid(image)
+    np.testing.assert_array_equal(frame.part(Region(30, 20, 100, 50)).image, image[20:70, 30:130])
+    assert frame.part(frame.region) is frame
+
+
+def test_around_a_tiny_window_in_a_large_frame_lies_a_part_of_constant_size():
+    frame, window = Pyramid(np.zeros((600, 800, 3), np.uint8)), Window(396, 296, 8, 8)
+    region = frame.region_around(window)
+    assert 62_000 < region.cells(window) <= 62_500
+    assert 2 * region.left + region.width == pytest.approx(800, abs=2)
+    assert frame.region_around(window.scaled(WINDOW)) == frame.region
