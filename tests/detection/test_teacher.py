@@ -126,7 +126,7 @@ def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
 @pytest.mark.parametrize("most", [5000, 700, 200], ids=["at once", "in parts", "in more parts than frames"])
 def test_hard_negatives_of_a_round_are_as_many_however_many_parts_are_searched_in_turn(frame, model, monkeypatch, most):
     monkeypatch.setattr(teacher, "_MOST_CELLS", most)
-    monkeypatch.setattr(teacher, "_strongest", lambda scores, window, most: [scores.row(0, 0)] * most)
+    monkeypatch.setattr(teacher, "_strongest", lambda scores, _, most: [scores.row(0, 0)] * most)
     teaching = SETTINGS.teaching
     parts = frame.region.split(OBJECT, most)
     frames = max(len(parts), teaching.mining_interval)
