@@ -55,8 +55,13 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 def starts_by_part(options: argparse.Namespace) -> dict[str, Starts]:
     """Return the starts of each part."""
-    frames, boxes = (2, 2) if options.quick else (options.starts, options.jitter)
-    return dict(zip(PARTS, (one_pass, temporal(frames), spatial, jittered(boxes)), strict=True))
+    chosen: list[Starts] = [one_pass, temporal(options.starts), spatial, jittered(options.jitter)]
+    return dict(zip(PARTS, map(first_two, chosen) if options.quick else chosen, strict=True))
+
+
+def first_two(starts: Starts) -> Starts:
+    """Return only the first two of the starts of each sequence."""
+    return lambda sequence: starts(sequence)[:2]
 
 
 def described(options: argparse.Namespace) -> dict[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +21,7 @@ from catstream.services.options import with_settings
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
+    from catstream.evaluation.runs import EvaluationRun
     from catstream.evaluation.summary import Row
 
 __all__ = ["evaluate"]
@@ -105,12 +106,13 @@ def evaluate(
         from catstream.evaluation.datasets import find_sequences
         from catstream.evaluation.onepass import evaluate as run_all
         from catstream.evaluation.report import write_report
-        from catstream.evaluation.runs import EvaluationRun
         from catstream.evaluation.starts import choose_starts
         from catstream.evaluation.summary import describe_flips, mean_of, rows_of, to_json
 
     if (starts is not None) + shifts + (jitter is not None) > 1:
         raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")
+    if attributes is not None and output is None and json_file is None:
+        raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
     if json_file is not None:
@@ -119,16 +121,7 @@ def evaluate(
 
     errors: list[CatstreamError] = []
     console = Console(width=None if sys.stdout.isatty() else 120)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with _reporting_interrupt(output), Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("frames", total=None)
-
-        def begin(frames: int) -> None:
-            progress.update(task, total=frames)
-
-        def done(run: EvaluationRun) -> None:
-            progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}")
-
+    with _reporting_interrupt(output), _progress(console) as (begin, done):
         runs = run_all(
             sequences,
             names,
@@ -160,6 +153,22 @@ def evaluate(
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
         )
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[tuple[Callable[[int], None], Callable[[EvaluationRun], None]]]:
+    """Show a bar; yield the functions that take the number of frames, and each finished run."""
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("frames", total=None)
+
+        def begin(frames: int) -> None:
+            progress.update(task, total=frames)
+
+        def done(run: EvaluationRun) -> None:
+            progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}")
+
+        yield begin, done
 
 
 def _validate_json(file: Path) -> None:

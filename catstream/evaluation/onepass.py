@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator
 from contextlib import closing
 from pathlib import Path
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +26,25 @@ __all__ = ["TRACKERS", "evaluate", "follow"]
 #: The trackers that can be evaluated.
 TRACKERS = ("catstream", *PEERS)
 
-#: A run that is to be made: tracker, settings, sequence, start, and folder of model files.
-_Task = tuple[str, Settings, Sequence, Start, Path | None]
+
+class _Task(NamedTuple):
+    """A run that is to be made."""
+
+    tracker: str
+    settings: Settings
+    sequence: Sequence
+    start: Start
+    peer_models: Path | None
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """Names of the tracker and of the run."""
+        return self.tracker, run_name(self.sequence, self.start)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.sequence) - self.start.frame
 
 
 def follow(
@@ -100,16 +118,15 @@ def evaluate(
         done(run)
 
     tasks = [
-        (tracker, settings, sequence, start, peer_models)
+        _Task(tracker, settings, sequence, start, peer_models)
         for sequence in sequences
         for tracker in trackers
         for start in starts(sequence)
     ]
-    begin(sum(len(sequence) - start.frame for _, _, sequence, start, _ in tasks))
+    begin(sum(task.frames for task in tasks))
     missing = []
     for task in tasks:
-        tracker, _, sequence, start, _ = task
-        run = None if output is None else load(output, tracker, sequence, start)
+        run = None if output is None else load(output, task.tracker, task.sequence, task.start)
         if run is None:
             missing.append(task)
         else:
@@ -122,30 +139,27 @@ def evaluate(
                 raise result
             else:
                 failed(result)
-    names = [(tracker, run_name(sequence, start)) for tracker, _, sequence, start, _ in tasks]
-    return [runs[name] for name in names if name in runs]
+    return [runs[task.name] for task in tasks if task.name in runs]
 
 
 def _run_all(tasks: list[_Task], output: Path | None, jobs: int) -> Generator[EvaluationRun | CatstreamError]:
     if jobs == 1:
-        yield from (_follow_and_save(output, *task) for task in tasks)
+        yield from (_follow_and_save(output, task) for task in tasks)
         return
     # Longest runs first, so that no single long run is left at the end.
-    ranked = sorted(tasks, key=lambda task: task[3].frame - len(task[2]))
-    yield from run_tasks(_follow_and_save, [(output, *task) for task in ranked], jobs)
+    ranked = sorted(tasks, key=lambda task: -task.frames)
+    yield from run_tasks(_follow_and_save, [(output, task) for task in ranked], jobs)
 
 
-def _follow_and_save(
-    output: Path | None, tracker: str, settings: Settings, sequence: Sequence, start: Start, peer_models: Path | None
-) -> EvaluationRun | CatstreamError:
+def _follow_and_save(output: Path | None, task: _Task) -> EvaluationRun | CatstreamError:
     """Run `follow` and save the run. Each tracker gets one thread: the jobs are the parallelism."""
     try:
         with one_thread(opencv=True):
-            run = follow(tracker, settings, sequence, start, peer_models)
+            run = follow(*task)
         if output is not None:
             save(output, run)
     except CatstreamError as error:
-        return CatstreamError(f"{tracker} on {run_name(sequence, start)}: {error}")
+        return CatstreamError(f"{' on '.join(task.name)}: {error}")
     return run
 
 

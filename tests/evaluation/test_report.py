@@ -123,6 +123,12 @@ def test_the_runs_of_a_sequence_are_chosen_by_one_option(walk, options):
     assert "--starts, --shifts and --jitter each choose the runs of a sequence: give one of them" in result.output
 
 
+def test_attributes_without_a_file_to_write_them_to_are_an_error(walk, tmp_path):
+    result = CliRunner().invoke(evaluate, [str(walk), "--attributes", str(tmp_path / "attributes.json")])
+    assert result.exit_code == 2
+    assert "give --output or --json" in result.output
+
+
 def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk):
     torn = tmp_path / "torn"
     shutil.copytree(walk, torn)
