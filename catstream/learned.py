@@ -176,6 +176,8 @@ class Learned:
     @classmethod
     def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
         trees = unpack_trees(arrays, metadata["trees"])
+        if missing := [name for name in HEADS if name not in trees]:
+            raise ValueError(f"it has no tree {missing[0]!r}: learn the object anew with this catstream")
         return cls(
             check_name(metadata["object"]),
             {name: trees[name] for name in HEADS},

@@ -79,6 +79,7 @@ ObjectName = Annotated[str, Name()]
 _COLUMNS = {name: head.more_columns for name, head in HEADS.items()}
 _REQUIRED = frozenset(name for name, head in HEADS.items() if head.adds_to_score)
 _NOT_IN_THE_SCORE = {name: 0 for name in HEADS if name not in _REQUIRED}
+_WITH_BIAS = {name: 0 for name, head in HEADS.items() if head.has_bias}
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +130,8 @@ class TrainingRows:
 
     rows     features of the windows
     labels   group "appearance": 1 for the object, 0 for background, between them for a near miss; group "extent": 1 for
-             a window of the right size and aspect, towards 0 for windows far from it
+             a window of the right size and aspect, towards 0 for windows far from it; groups "size" and "aspect": 0.5
+             for the right one, and 1/16 more for each step by which a window is too large or too wide
     weights  number of ordinary rows that each stands for
     """
 
@@ -282,8 +284,10 @@ class Model:
     weights  of the score of a window: weights @ row + bias
     bias     chosen so that the score is 0 at the mean of the background and 1 at the mean of the object
     motion   parameters of the Kalman filter, None until there are enough centres for EM
-    heads    vector of each head that does not add to the score, once it is trained. The best fitting size and aspect
-             at a place maximise (weights + heads["extent"]) @ row
+    heads    vector of each head that does not add to the score, once it is trained. A window fits well if
+             (weights + heads["extent"]) @ row is high, and heads[name] @ row + biases[name] is near 0.5 for the names
+             "size" and "aspect"
+    biases   bias of each of these heads that has one
     object   name of the object
     """
 
@@ -295,6 +299,7 @@ class Model:
     heads: Annotated[dict[str, Annotated[np.ndarray, Array("float32", ("d",))]], Named(_NOT_IN_THE_SCORE)] = field(
         default_factory=dict
     )
+    biases: Annotated[dict[str, float], Named(_WITH_BIAS)] = field(default_factory=dict)
     object: ObjectName = ""
 
 

@@ -36,8 +36,8 @@ def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.n
     return direction
 
 
-def fit(rows: np.ndarray, penalty: float) -> np.ndarray:
-    """The weights that minimise ||A [w; b; -1]||^2 / r + penalty ||w||^2, with a free bias b.
+def fit(rows: np.ndarray, penalty: float) -> tuple[np.ndarray, float]:
+    """The weights and the bias that minimise ||A [w; b; -1]||^2 / r + penalty ||w||^2.
 
     Parameters
     ----------
@@ -46,14 +46,14 @@ def fit(rows: np.ndarray, penalty: float) -> np.ndarray:
 
     Returns
     -------
-    float32 (d,), w without b: the caller chooses the bias when it scales the score
+    w, float32 (d,), and b
     """
     scaled = rows / np.float32(np.sqrt(len(rows)))
     x, ones, y = scaled[:, :-2], scaled[:, -2], scaled[:, -1]
     solved = _solve(x @ x.T, penalty, np.stack([y, ones], axis=1))
     bias = (ones @ solved[:, 0]) / (ones @ solved[:, 1])
     weights: np.ndarray = x.T @ (solved[:, 0] - bias * solved[:, 1])
-    return weights
+    return weights, float(bias)
 
 
 def _solve(gram: np.ndarray, penalty: float, right: np.ndarray) -> np.ndarray:

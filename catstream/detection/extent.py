@@ -2,16 +2,30 @@
 
 The appearance model alone prefers windows that are too small: they hold less background. The extent head learns how
 well a window fits, from windows of the object that fit and windows that are too large, too small, too wide or too high.
+The size head and the aspect head learn from the same windows by how many steps a window is too large or too wide.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from catstream.box import Window
+from catstream.heads import ASPECT, SIZE
 from catstream.settings import ExtentSettings
 
-__all__ = ["ASPECT_CHANGE", "SIZE_CHANGE", "cost", "followed", "size", "stretch", "trials"]
+__all__ = [
+    "ASPECT_CHANGE",
+    "SIZE_CHANGE",
+    "cost",
+    "followed",
+    "offset_cost",
+    "offset_label",
+    "size",
+    "stretch",
+    "trials",
+]
 
 _SIZE_STEP, _ASPECT_STEP = 0.04, 0.08  # relative change from one size or aspect ratio that is tried to the next
 #: Change of the logarithm by a step.
@@ -19,6 +33,9 @@ SIZE_CHANGE, ASPECT_CHANGE = math.log(1 + _SIZE_STEP), math.log(1 + _ASPECT_STEP
 
 _SIZE_RATE, _ASPECT_RATE = 0.7, 0.2  # share of a change that is applied in one frame, of its logarithm
 _PENALTY = 0.3  # weight of |log f|, for a change by the factor f
+_LABEL_STEPS = 16  # steps between the labels 0 and 1 of groups "size" and "aspect"
+_OFFSET_WEIGHT = 0.02  # weight of the squared steps that a window is off
+_LARGE_OFFSET = 1.0  # steps from which this cost grows linearly
 _GROWTH = 1.18  # factor of size that no object grows by in a frame
 
 
@@ -37,12 +54,41 @@ def followed(before: Window, window: Window, resize: bool) -> Window:
     return before.scaled(grown * stretched, grown / stretched).centred(*window.centre)
 
 
-def trials(window: Window, settings: ExtentSettings) -> list[tuple[int, Window]]:
-    """Windows of wrong sizes and of wrong aspect ratios, with the steps that each is off; none if `weight` is 0."""
+def trials(window: Window, settings: ExtentSettings) -> dict[str, list[tuple[int, Window]]]:
+    """Windows of wrong sizes and of wrong aspect ratios, by group, with the steps that each is off.
+
+    A group that is not searched is left out, and both are if `weight` is 0.
+    """
     if not settings.weight:
-        return []
-    sizes = [(k, window.scaled(size(k))) for k in _steps(settings.size_count)]
-    return sizes + [(k, window.scaled(*stretch(k))) for k in _steps(settings.aspect_count)]
+        return {}
+    found = {
+        SIZE: [(k, window.scaled(size(k))) for k in _steps(settings.size_count)],
+        ASPECT: [(k, window.scaled(*stretch(k))) for k in _steps(settings.aspect_count)],
+    }
+    return {group: windows for group, windows in found.items() if windows}
+
+
+def offset_label(steps: int) -> float:
+    """Label of a window that is a number of steps too large or too wide, from 0 to 1.
+
+    >>> offset_label(0), offset_label(4)
+    (0.5, 0.75)
+    """
+    return 0.5 + steps / _LABEL_STEPS
+
+
+def offset_cost(row: np.ndarray, head: np.ndarray, bias: float) -> float:
+    """Cost of the steps by which a window is too large or too wide as the size or the aspect head predicts it.
+
+    It is Huber's function, because the prediction for an object that looks new may be wrong by many steps.
+
+    Parameters
+    ----------
+    row : float32 (d,), features of the window
+    head, bias : of the regression of the label, float32 (d,) and a number
+    """
+    off = abs(float(row @ head) + bias - 0.5) * _LABEL_STEPS
+    return _OFFSET_WEIGHT * (off**2 if off < _LARGE_OFFSET else _LARGE_OFFSET * (2 * off - _LARGE_OFFSET))
 
 
 def cost(change: float, now: float = 0.0, prior: float = 0.0) -> float:

@@ -17,7 +17,7 @@ from catstream.detection.likeness import Likeness
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
-from catstream.heads import EXTENT
+from catstream.heads import ASPECT, EXTENT, SIZE
 from catstream.messages import DetectorState, Model
 from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 
@@ -346,7 +346,8 @@ def _near(frame: Pyramid, window: Window, state: DetectorState, model: Model, se
 def fitted(frame: Pyramid, found: Detection, first: Window | None, model: Model, settings: ExtentSettings) -> Detection:
     """A detection moved by at most a cell, at the size and then the aspect ratio with the highest value.
 
-    The value is the score, plus `weight` times what the extent head says, less the cost of the change.
+    The value is the score, plus `weight` times the value of the extent head, less the cost of the change, and less the
+    cost of the error that the size head or the aspect head predicts.
 
     Parameters
     ----------
@@ -359,12 +360,11 @@ def fitted(frame: Pyramid, found: Detection, first: Window | None, model: Model,
 
 def _at_best_size(frame: Pyramid, found: Detection, first: Window, model: Model, settings: ExtentSettings) -> Detection:
     grown = math.log(found.window.area / first.area) / 2
-    head = model.heads.get(EXTENT)
 
     def tried(step: int) -> tuple[float, Detection]:
         scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
         best = scores.best()
-        fit = 0.0 if head is None else settings.weight * float(scores.row(1, 1) @ head)
+        fit = _fit(scores.row(1, 1), model, SIZE, settings)
         return best.score + fit - extent.cost(step * extent.SIZE_CHANGE, grown, settings.prior), best
 
     best, _, beside = _climb(tried, settings.size_count // 2)
@@ -375,16 +375,23 @@ def _at_best_aspect(
     frame: Pyramid, found: Detection, first: Window, model: Model, settings: ExtentSettings
 ) -> Detection:
     widened = math.log(found.window.w / found.window.h * first.h / first.w)
-    head = model.heads[EXTENT]
 
     def tried(step: int) -> tuple[float, Detection]:
         scores = ScoreMap.around(frame, found.window.scaled(*extent.stretch(step)), WINDOW, model)
-        fit = settings.weight * float(scores.row(0, 0) @ head)
+        fit = _fit(scores.row(0, 0), model, ASPECT, settings)
         cost = extent.cost(step * extent.ASPECT_CHANGE, widened, settings.prior)
         return float(scores.scores[0, 0]) + fit - cost, found
 
     _, step, beside = _climb(tried, settings.aspect_count // 2)
     return replace(found, window=found.window.scaled(*extent.stretch(step + beside)))
+
+
+def _fit(row: np.ndarray, model: Model, name: str, settings: ExtentSettings) -> float:
+    """How well a window fits: the value of the extent head, less the cost of the error that head `name` predicts."""
+    fit = settings.weight * float(row @ model.heads[EXTENT]) if EXTENT in model.heads else 0.0
+    if name in model.heads and name in model.biases:
+        fit -= extent.offset_cost(row, model.heads[name], model.biases[name])
+    return fit
 
 
 def _climb(tried: Callable[[int], tuple[float, Detection]], most: int) -> tuple[Detection, int, float]:

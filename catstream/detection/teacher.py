@@ -2,20 +2,20 @@
 
 A row of the object has label 1, one of the background 0. Between them are near misses, windows beside the object, and
 windows of the object of a wrong size or aspect ratio. Both get a Gaussian of their offset, so that scores fall smoothly
-around the right window. The initial model is learned from the rows of the first frame.
+around the right window. Windows of wrong extents have a second label, the error of their size or aspect ratio.
+The initial model is learned from the rows of the first frame.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 
 import cv2
 import numpy as np
 
 from catstream import ridge
-from catstream.box import Window
+from catstream.box import Box, Window
 from catstream.detection import extent
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import ScoreMap, due, non_maximum_suppression
@@ -45,7 +45,7 @@ _NEAR = 2  # cells around the object whose windows are near misses, not backgrou
 _NEAREST = 0.9  # cells: a nearer window shows the object as well as its own does
 _NEAR_SIGMA = 0.9  # cells: standard deviation of the Gaussian label of a near miss
 _EXTENT_SIGMA = 1.0  # steps of size or aspect ratio: the same of a window of a wrong extent
-_EXTENT_INTERVAL = 2  # frames from one set of rows of group "extent" to the next
+_EXTENT_INTERVAL = 2  # frames from one set of rows of windows of wrong extents to the next
 _OBJECT_WEIGHT = 8.0  # of a frame's rows of the object together; any other row has weight 1
 _BACKGROUND = 12  # windows of the background around the object, of each frame
 _SIDE = 20  # cells around the object, at least, from which background is taken
@@ -76,7 +76,7 @@ def first_training(
         copies = affine_copies(frame, window, count, rng, context=context, moved=moved)
         rows = _rows(copies, 1, _OBJECT_WEIGHT, teaching)
         rows += _surroundings(ScoreMap.around(frame, window, _SIDE, None), window, count, 0, rng, teaching)
-    training = _extents(frame, window, rows, settings)
+    training = _first_extents(frame, window, rng, settings)
     rows += hard_negatives(frame, window, initial_model(rows), teaching)
     return initial_model(rows), {APPEARANCE: rows, **training}
 
@@ -90,7 +90,7 @@ def training_of(
     ----------
     window : of the detection; the rows are cut around it
     around : as for `training_at`
-    seq : of the frame: rows of group "extent" are not cut in each, and hard negatives in a part of the frame
+    seq : of the frame: windows of wrong extents are not cut in each, and hard negatives in a part of the frame
     """
     training = training_at(frame, window, seq, model, settings, around, extents=seq % _EXTENT_INTERVAL == 0)
     if (mined := _mined(frame, window, seq, model, settings.teaching)) is not None:
@@ -114,7 +114,7 @@ def training_at(
     ----------
     around : scores of the windows around it, if a search left them: near misses and background are taken from these,
         if they reach far enough
-    extents : whether to cut rows of group "extent", too
+    extents : whether to cut rows of groups "extent", "size" and "aspect", too
     """
     rng = np.random.default_rng((settings.run.seed, seq))  # of this frame alone: no frame depends on those before
     rows = _appearance(frame, window, around, model, rng, settings.teaching)
@@ -213,28 +213,68 @@ def affine_copies(
     if count:
         change[0] = 0
     rows = []
-    x, y = window.centre
     for number, (scale, right, down, turn) in enumerate(change):
-        factor = np.exp(_SCALE * scale) / (WINDOW * CELL)
-        pixel = window.w * factor, window.h * factor
-        centre = x + _SHIFT * right * window.w, y + _SHIFT * down * window.h
-        patch = frame.cut(*centre, *pixel, _PATCH, _TURN * turn)
-        if number and number * moved % 1 < moved:
-            angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(_NEAREST_OTHER, _FARTHEST_OTHER)
-            away = centre[0] + far * np.cos(angle) * window.w, centre[1] + far * np.sin(angle) * window.h
-            background, share = frame.cut(*away, *pixel, _PATCH, _TURN * turn), _ellipse(context)
-            patch = cv2.blendLinear(patch, background, share, 1 - share)
+        copy = _shifted(window, right, down).scaled(math.exp(_SCALE * scale))
+        offset = _elsewhere(window, rng) if _is_moved(number, moved) else None
+        patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset)
         if number >= max(count - mirrored, 1):
             patch = cv2.flip(patch, 1)
         rows.append(Cells.within(patch).row(0, 0))
     return np.array(rows, np.float32)
 
 
-@cache
-def _ellipse(context: float) -> np.ndarray:
-    """Share of the object in each pixel of a patch, float32: 1 inside its ellipse, falling to 0 around it."""
-    across = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / context / 2)
-    out = np.hypot(across[:, None], across)
+def _is_moved(number: int, share: float) -> bool:
+    """Whether a copy is put on another background: this share of the copies, but never the first one."""
+    return number > 0 and number * share % 1 < share
+
+
+def _shifted(window: Window, right: float, down: float) -> Window:
+    """A window shifted by multiples of the standard deviation of an affine copy's shift."""
+    x, y = window.centre
+    return window.centred(x + _SHIFT * right * window.w, y + _SHIFT * down * window.h)
+
+
+def _elsewhere(window: Window, rng: np.random.Generator) -> tuple[float, float]:
+    """A random offset of another background from a window, in pixels."""
+    angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(_NEAREST_OTHER, _FARTHEST_OTHER)
+    return far * math.cos(angle) * window.w, far * math.sin(angle) * window.h
+
+
+def _patch(
+    frame: Pyramid, window: Window, turn: float, box: Box, offset: tuple[float, float] | None = None
+) -> np.ndarray:
+    """A window and its margin, cut from a frame and resized.
+
+    Parameters
+    ----------
+    turn : radians by which the window is rotated
+    box : the object, which has the centre of the window
+    offset : pixels from the object to another background that it is put on; None to leave it on its own
+
+    Returns
+    -------
+    uint8 (96, 96, 3) or (96, 96), as the frame
+    """
+    pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
+    x, y = window.centre
+    patch = frame.cut(x, y, *pixel, _PATCH, turn)
+    if offset is None:
+        return patch
+    share = _ellipse(window.w / box.w, window.h / box.h)
+    background = frame.cut(x + offset[0], y + offset[1], *pixel, _PATCH, turn)
+    blended: np.ndarray = cv2.blendLinear(patch, background, share, 1 - share)
+    return blended
+
+
+def _ellipse(across: float, down: float) -> np.ndarray:
+    """Share of the object in each pixel of a patch, float32: 1 inside its ellipse, falling to 0 around it.
+
+    Parameters
+    ----------
+    across, down : width and height of the window as multiples of the object's
+    """
+    place = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / 2)
+    out = np.hypot((place * down)[:, None], place * across)
     share: np.ndarray = ((_GONE - out) / (_GONE - _SOLID)).clip(0, 1).astype(np.float32)
     return share
 
@@ -279,13 +319,57 @@ def _surroundings(
 
 
 def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Settings) -> Training:
-    """Rows of group "extent": the object's own, the first of `rows`, and windows of a wrong size or aspect ratio."""
-    trials = extent.trials(window, settings.extent)
-    if not trials:
+    """Rows of groups "extent", "size" and "aspect": the first of `rows`, which fits, and windows of wrong extents."""
+    own, teaching = (0, rows.rows[0]), settings.teaching
+    cuts = {
+        group: [(steps, Cells.within(frame.around(trial, WINDOW)).row(0, 0)) for steps, trial in trials]
+        for group, trials in extent.trials(window, settings.extent).items()
+    }
+    if not cuts:
         return {}
-    cuts = [Cells.within(frame.around(trial, WINDOW)).row(0, 0) for _, trial in trials]
-    labels = [_gaussian(steps, _EXTENT_SIGMA) for steps, _ in trials]
-    return {EXTENT: _rows([rows.rows[0], *cuts], [1.0, *labels], 1, settings.teaching)}
+    fits = _fits([own, *(cut for each in cuts.values() for cut in each)], 1, teaching)
+    return {EXTENT: fits, **{group: _offsets([own, *each], teaching) for group, each in cuts.items()}}
+
+
+def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, settings: Settings) -> Training:
+    """Rows of the same groups from the first frame, as many as fill a leaf of each tree: only there the box is certain.
+
+    The windows are cut from shifted and rotated copies of the object, most of which are on another background.
+    """
+    cuts = {
+        group: _first_cuts(frame, window, [(0, window), *trials], rng, settings)
+        for group, trials in extent.trials(window, settings.extent).items()
+    }
+    if not cuts:
+        return {}
+    fits = _fits([cut for each in cuts.values() for cut in each], 1 / len(cuts), settings.teaching)
+    return {EXTENT: fits, **{group: _offsets(each, settings.teaching) for group, each in cuts.items()}}
+
+
+def _first_cuts(
+    frame: Pyramid, window: Window, trials: list[tuple[int, Window]], rng: np.random.Generator, settings: Settings
+) -> list[tuple[int, np.ndarray]]:
+    """Feature rows of windows at copies of the object in the first frame, with the steps that each is off."""
+    cuts = []
+    for number in range(math.ceil(settings.coreset.size / len(trials))):
+        right, down, turn = rng.normal(size=3) if number else np.zeros(3)
+        copy = _shifted(window, right, down)
+        offset = _elsewhere(window, rng) if _is_moved(number, settings.teaching.other_backgrounds) else None
+        for steps, trial in trials:
+            tried = trial.centred(*copy.centre)
+            patch = _patch(frame, tried, _TURN * turn, copy.box(settings.search.context), offset)
+            cuts.append((steps, Cells.within(patch).row(0, 0)))
+    return cuts
+
+
+def _fits(cuts: list[tuple[int, np.ndarray]], weight: float, teaching: TeachingSettings) -> TrainingRows:
+    """Rows of group "extent" from feature rows and the steps that each is off."""
+    return _rows([row for _, row in cuts], [_gaussian(steps, _EXTENT_SIGMA) for steps, _ in cuts], weight, teaching)
+
+
+def _offsets(cuts: list[tuple[int, np.ndarray]], teaching: TeachingSettings) -> TrainingRows:
+    """Rows of group "size" or "aspect" from feature rows and the steps that each is off."""
+    return _rows([row for _, row in cuts], [extent.offset_label(steps) for steps, _ in cuts], 1, teaching)
 
 
 def _gaussian(offset: float, sigma: float) -> float:

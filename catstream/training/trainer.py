@@ -55,9 +55,8 @@ class Trainer:
             )
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
         bias = -float(weights @ background_mean)
-        return Model(
-            sample.version, sample.frame, weights, bias, motion, _residual_vectors(sample, weights), sample.object
-        )
+        heads, biases = _head_vectors(sample, weights)
+        return Model(sample.version, sample.frame, weights, bias, motion, heads, biases, sample.object)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
@@ -68,7 +67,7 @@ class Trainer:
         return [
             _between(sample),
             *(
-                ridge.fit(sample.trees[name].rows, head.ridge)
+                ridge.fit(sample.trees[name].rows, head.ridge)[0]
                 for name, head in HEADS.items()
                 if head.adds_to_score and head.ridge is not None
             ),
@@ -84,18 +83,23 @@ def _between(sample: Sample) -> np.ndarray:
     return ridge.between(background.rows, sample.trees["object"].mean - background.mean, BETWEEN_RIDGE)
 
 
-def _residual_vectors(sample: Sample, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """The vectors of the heads that do not add to the score, each fitted to the residual of the labels.
+def _head_vectors(sample: Sample, weights: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """The vectors of the heads that do not add to the score, and the biases of those that have one.
 
-    The residual is label - weights @ row: detection adds both products when it chooses size and aspect.
+    The others are fitted to the residual of the labels, label - weights @ row: detection adds both products when it
+    chooses size and aspect.
     """
-    vectors = {}
+    vectors, biases = {}, {}
     for name, head in HEADS.items():
-        if head.ridge is not None and not head.adds_to_score and name in sample.trees:
-            rows = sample.trees[name].rows.copy()
-            rows[:, -1] -= rows[:, :-2] @ weights
-            vectors[name] = ridge.fit(rows, head.ridge)
-    return vectors
+        if head.ridge is None or head.adds_to_score or name not in sample.trees:
+            continue
+        rows = sample.trees[name].rows
+        if head.has_bias:
+            vectors[name], biases[name] = ridge.fit(rows, head.ridge)
+        else:
+            left = rows[:, -1] - rows[:, :-2] @ weights
+            vectors[name], _ = ridge.fit(np.column_stack([rows[:, :-1], left]), head.ridge)
+    return vectors, biases
 
 
 def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | None:

@@ -16,7 +16,7 @@ from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.compression.tree import TREES, CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.heads import APPEARANCE, EXTENT, HEADS
+from catstream.heads import APPEARANCE, ASPECT, EXTENT, HEADS, SIZE
 from catstream.messages import DetectorState, Features, Motion, ObjectFeatures, Sample, TrainingRows
 from catstream.settings import Settings
 
@@ -42,6 +42,8 @@ def messages(rng) -> Iterator[Features]:
             training = {
                 APPEARANCE: TrainingRows(rows, labels, weights),
                 EXTENT: TrainingRows.labelled(rows[:3], labels[:3]),
+                SIZE: TrainingRows.labelled(rows[:2], [0.5, 0.25]),
+                ASPECT: TrainingRows.labelled(rows[:2], [0.5, 0.75]),
             }
             yield one_object(frame, ObjectFeatures(box, training))
 
@@ -77,7 +79,8 @@ def test_each_row_is_inserted_into_the_tree_of_its_label(settings, messages):
     forest = Forest(settings)
     sample = take(forest, messages, 60)[-1]
     frames = sample.frame + 1
-    rows = {(APPEARANCE, 1.0): 2, (APPEARANCE, 0.0): 3, (APPEARANCE, None): 6, (EXTENT, None): 3}
+    rows = {(APPEARANCE, 1.0): 2, (APPEARANCE, 0.0): 3, (APPEARANCE, None): 6}
+    rows |= {(EXTENT, None): 3, (SIZE, None): 2, (ASPECT, None): 2}
     counts = {name: frames * rows[head.group, head.label] for name, head in HEADS.items()}
     assert {name: tree.count for name, tree in sample.trees.items()} == counts
 

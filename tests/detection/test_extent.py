@@ -4,8 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
+from catstream import ridge
 from catstream.box import Box, Window
-from catstream.detection import extent
+from catstream.detection import extent, teacher
+from catstream.features.cells import Cells
+from catstream.features.layout import WINDOW as WINDOW_CELLS
+from catstream.features.pyramid import Pyramid
+from catstream.heads import ASPECT, GROUPS, HEADS, SIZE
 from catstream.settings import ExtentSettings, Settings
 from catstream.tracker import Tracker
 
@@ -37,10 +42,42 @@ def test_the_box_follows_an_object_that_gets(draw, w, h):
     assert Box(0, 0, 60, 60).centred(*truth.centre).overlap(truth) < 0.75, "had it stayed"
 
 
-def test_trials_are_windows_of_wrong_sizes_and_then_of_wrong_aspect_ratios():
+def test_in_a_frame_that_does_not_change_the_box_keeps_its_size(draw):
+    tracker, (image, truth) = Tracker(), draw(60, 60)
+    tracker.init(image, truth)
+    for _ in range(8):
+        _, box = tracker.update(image)
+    assert box.area == pytest.approx(truth.area, rel=0.04)
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.9])
+def test_the_first_frame_fills_a_leaf_of_each_tree(draw, moved):
+    image, box = draw(60, 60)
+    settings = Settings(teaching={"other_backgrounds": moved})
+    window = Window.around(box, settings.search.context)
+    _, training = teacher.first_training(Pyramid.of(image), window, np.random.default_rng(0), settings)
+    assert set(training) == set(GROUPS)
+    assert min(map(len, training.values())) >= settings.coreset.size
+
+
+@pytest.mark.parametrize("steps", [-2, -1, 1, 2])
+def test_the_heads_predict_by_how_many_steps_a_window_is_too_large_or_too_wide(draw, steps):
+    image, box = draw(60, 60)
+    frame, window = Pyramid.of(image), Window.around(box, Settings().search.context)
+    _, training = teacher.first_training(frame, window, np.random.default_rng(0), Settings())
+    for group, wrong in ((SIZE, window.scaled(extent.size(steps))), (ASPECT, window.scaled(*extent.stretch(steps)))):
+        rows = training[group]
+        table = np.column_stack([rows.rows, np.ones(len(rows)), rows.labels]).astype(np.float32)
+        weights, bias = ridge.fit(table, HEADS[group].ridge)
+        row = Cells.within(frame.around(wrong, WINDOW_CELLS)).row(0, 0)
+        assert (row @ weights + bias - 0.5) * 16 == pytest.approx(steps, abs=0.7)
+
+
+def test_trials_are_windows_of_wrong_sizes_and_of_wrong_aspect_ratios():
     trials = extent.trials(WINDOW, ExtentSettings(size_count=5, aspect_count=3))
-    assert [steps for steps, _ in trials] == [-2, -1, 1, 2, -1, 1]
-    sizes, aspects = trials[:4], trials[4:]
+    sizes, aspects = trials[SIZE], trials[ASPECT]
+    assert [steps for steps, _ in sizes] == [-2, -1, 1, 2]
+    assert [steps for steps, _ in aspects] == [-1, 1]
     for steps, window in sizes:
         assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h)
         assert window.w / WINDOW.w == pytest.approx(1.04**steps)
@@ -50,7 +87,14 @@ def test_trials_are_windows_of_wrong_sizes_and_then_of_wrong_aspect_ratios():
 
 
 def test_without_a_weight_of_the_extent_head_there_are_no_trials():
-    assert extent.trials(WINDOW, ExtentSettings(weight=0)) == []
+    assert extent.trials(WINDOW, ExtentSettings(weight=0)) == {}
+
+
+def test_the_cost_of_an_offset_is_quadratic_up_to_a_step_and_then_linear(rng):
+    row, head = rng.normal(size=(2, 9))
+    steps = (0, 0.5, -0.5, 1, 2, 3)
+    costs = [extent.offset_cost(row, head, 0.5 + each / 16 - float(row @ head)) for each in steps]
+    assert costs == pytest.approx([0, 0.005, 0.005, 0.02, 0.06, 0.1])
 
 
 def test_a_window_follows_by_its_rates():

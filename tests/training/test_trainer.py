@@ -52,6 +52,16 @@ def test_the_sum_of_score_and_extent_predicts_how_well_a_cut_fits(sample, rng):
     np.testing.assert_allclose(together - together.mean(), fits - fits.mean(), atol=1e-2)
 
 
+@pytest.mark.parametrize("name", ["size", "aspect"])
+def test_the_heads_of_size_and_aspect_predict_their_label(sample, rng, name):
+    x, labels = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=40)
+    rows = np.column_stack([x, np.ones(40), labels]).astype(np.float32)
+    model = Trainer(Settings()).train(
+        dataclasses.replace(sample, trees=sample.trees | {name: Summary(rows, rows.mean(axis=0), 40, (0,))})
+    )
+    np.testing.assert_allclose(x @ model.heads[name] + model.biases[name], labels, atol=1e-2)
+
+
 def test_an_object_like_the_background_is_rejected(sample):
     same = dataclasses.replace(sample, trees=sample.trees | {"object": sample.trees["background"]})
     with pytest.raises(ProtocolError, match="give another box"):

@@ -19,7 +19,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 def labels(facts):
     """The labels of each metric, by name, of a pipeline that tracks two objects in a live source."""
     feed = Feed()
-    names, trees = ("anna", "ben"), ("object", "background", "loss", "extent")
+    names, trees = ("anna", "ben"), ("object", "background", "loss", "extent", "size", "aspect")
     report = facts.tracking(6.0, *names)
     report.counters.update(taken=5.0, stored=4.0, skipped=1.0, lost_seconds=0.0, reopened=0.0)
     learned = {"rows": 1.0, "bytes": 1.0} | {f"{tree}_leaves": 1.0 for tree in trees}

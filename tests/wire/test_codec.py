@@ -62,7 +62,14 @@ MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
 WINDOWS = Window(4.0, 2.0, 25.0, 12.5), Window(4.5, 2.0, 25.0, 12.5), Window(9.0, 2.0, 25.0, 12.5)
 DETECTOR = DetectorState(3, "weak", *WINDOWS, False, 2, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
 TRAINING = TrainingRows(array(3, 5), array(3), array(3))
-TREES = {"object": summary(5), "background": summary(5), "loss": summary(7), "extent": summary(7)}
+TREES = {
+    "object": summary(5),
+    "background": summary(5),
+    "loss": summary(7),
+    "extent": summary(7),
+    "size": summary(7),
+    "aspect": summary(7),
+}
 BOX = Box(4.5, 3.0, 20.0, 10.0)
 TRACK = Track(3, 2, 0.08, "present", BOX, 0.75, 4, 1234.5, "anna")
 EXAMPLES = {
@@ -113,7 +120,7 @@ EXAMPLES = {
         {"north": NodeStatus("north", "alive", "10.0.0.2", 4.0, 0.75, {"site": "north"}, 1, "the clock is wrong")},
         True,
     ),
-    "model": Model(4, 20, array(5), -0.25, MOTION, {"extent": array(5)}, "anna"),
+    "model": Model(4, 20, array(5), -0.25, MOTION, {"extent": array(5), "size": array(5)}, {"size": 0.5}, "anna"),
     "position": Position(5, 4, {"anna": ObjectPosition(BOX, 2, DETECTOR), "ben": ObjectPosition()}, 1),
     "preview": Preview(2, 1280, 720, {"anna": BOX, "ben": BOX}, b"\xff\xd8\xff\xe0 and so on"),
     "question": Question("7f", "cam-7", "cam-6"),
