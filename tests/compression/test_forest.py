@@ -107,7 +107,7 @@ def test_an_object_that_begins_again_has_new_trees(settings, messages):
     before = forest.version
     assert before
     forest.take(changed(next(messages), begins=True))
-    assert forest.counters()["rows"] == 2 + 3 + 6 + 3, "those of one frame"
+    assert forest.counters()["rows"] == 2 + 3 + 6 + 3 + 2 + 2, "those of one frame"
     assert all(sample.version > before for sample in take(forest, messages, 40)), "no version is used twice"
 
 
@@ -315,7 +315,7 @@ def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, m
     assert forest.compressors == {"ben": kept}
     assert forest.position.objects.keys() == forest.object_counters().keys() == {"ben"}
     forest.take(merged(3, ben=next(messages), anna=next(messages)))
-    assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3, "those of one frame"
+    assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3 + 2 + 2, "those of one frame"
 
 
 def test_rows_of_another_length_of_one_object_leave_the_others_unchanged(settings, messages):
