@@ -1,12 +1,14 @@
 """Table 2 of the paper: success on the TLD videos, with n = 10 % and 25 % of the video and with our settings.
 
 The paper follows ten videos, we those of them that are there. Its tables 2 and 5 have the columns of Panda and
-Volkswagen the other way round; this is as table 2 prints it.
+Volkswagen the other way round; this is as table 2 prints it. A second table has the success in the frames that SCM
+follows, until n rows make the first leaf, and in those after them.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +19,8 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 from accuracy import accuracy_command, compared, videos
 from table import Table, publish
 
+from catstream.evaluation.metrics import score
+from catstream.evaluation.runs import EvaluationRun
 from catstream.evaluation.summary import rows_of
 from catstream.settings import PRESETS, Settings
 
@@ -34,14 +38,31 @@ PAPER = {
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     variants = {"defaults": Settings(), **{name: Settings.from_values(PRESETS[name]) for name in ("cat25", "cat10")}}
     found = videos(options, "TLD_")
-    rows = []
+    rows, parts = [], []
     for name, runs in compared(options, found, variants).items():
         success = [row.success for row in rows_of(runs)]
         rows.append((name, fmean(success), *success, *PAPER.get(name, (None, None))))
+        if variants[name].teaching.bootstrap == "scm":
+            parts += by_part(name, [run for run in runs if run.start.frame == 0], variants[name])
     nothing = (None,) * (1 + len(found))
     rows += [(name, *nothing, *printed) for name, printed in PAPER.items() if name not in variants]
     names = [video.name.removeprefix("TLD_") for video in found]
     yield Table("Success on TLD", ("tracker", "mean", *names, "paper: mean of ten", "paper: Panda"), rows)
+    yield Table("Success by part of the video", ("tracker", "followed by", "mean", *names), parts)
+
+
+def by_part(tracker: str, runs: list[EvaluationRun], settings: Settings) -> Iterator[tuple[str | float, ...]]:
+    """Rows of the success in the frames that SCM follows, until n rows make the first leaf, and in those after them."""
+
+    def success(run: EvaluationRun, *, scm: bool) -> float:
+        of_video = settings.for_length(len(run.boxes))
+        first = math.ceil(of_video.coreset.size / (1 + of_video.teaching.copies))
+        part = slice(first) if scm else slice(first, None)
+        return score(run.boxes[part], run.truth[part]).success
+
+    for name, scm in (("SCM", True), ("after SCM", False)):
+        each = [success(run, scm=scm) for run in runs]
+        yield tracker, name, fmean(each), *each
 
 
 if __name__ == "__main__":

@@ -127,10 +127,8 @@ class Detector:
     def settle(self, found: Detection, frame: Pyramid, seq: int, time: float) -> Result:
         """Take the detection of `look`, or another one of the same frame, and cut the training rows."""
         state, model, settings = self._known(), self.model, self.settings
-        if self._scm is not None:
-            state = replaced(state, found, settings)
-        else:
-            state = settled(state, found, frame.size, model, settings)
+        followed = self._scm is not None  # by the paper's first tracker
+        state = replaced(state, found) if followed else settled(state, found, frame.size, model, settings)
         self.state = state
         return self._result(seq, time, found.score, taught(state, found, frame, seq, model, self.likeness, settings))
 

@@ -53,10 +53,12 @@ def settled(
     return state
 
 
-def replaced(state: DetectorState, found: Detection, settings: Settings) -> DetectorState:
-    """The state after a detection by the paper's first tracker, which never reports the object as absent."""
-    level = belief.level_of(max(found.score, settings.belief.weak_score), True, settings.belief)
-    return replace(state, level=level, window=found.window)
+def replaced(state: DetectorState, found: Detection) -> DetectorState:
+    """The state after a detection by the paper's first tracker: never absent, and each frame gives training rows.
+
+    The paper's first leaf is made of the first n frames, whatever that tracker's score is.
+    """
+    return replace(state, level="confident", window=found.window)
 
 
 def taught(

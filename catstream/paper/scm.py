@@ -283,63 +283,65 @@ def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
 def _solve(gains: Float64, gram: Float64, codes: Float32) -> None:
     """Active sets (Lawson and Hanson): the atom that gains most comes in, those that turn negative go.
 
-    `gains` are those at code 0, and are used up. The set's Gram matrix is kept as a Cholesky factor whose diagonal
-    is inverted.
+    `gains` are those at code 0. The set's Gram matrix is kept as a Cholesky factor whose diagonal is inverted, with the
+    solution of its forward substitution: an atom that comes in adds one row to both.
     """
     count = len(gram)
-    code, wanted, factor = np.zeros(count), np.zeros(count), np.zeros((count, count))
-    active = np.zeros(count, np.int64)
+    code, wanted, forward, factor = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros((count, count))
+    active, gain = np.zeros(count, np.int64), np.zeros(count)
     for row in range(len(codes)):
-        gain, start = gains[row], gains[row].copy()
-        size = 0
-        code[:] = 0
+        start, size = gains[row], 0
+        gain[:] = start
         for _ in range(3 * count):
-            best = 0
+            most, best = gain[0], 0
             for atom in range(1, count):
-                best = atom if gain[atom] > gain[best] else best
-            if gain[best] <= 1e-6:
+                most = max(most, gain[atom])
+            if most <= 1e-6:
                 break
-            active[size] = best
+            while gain[best] < most:
+                best += 1
+            active[size], code[size] = best, 0.0
             valid, size = size, size + 1
             while size:
                 for i in range(valid, size):
-                    for j in range(i + 1):
-                        total = gram[active[i], active[j]]
+                    alike = gram[active[i]]
+                    for j in range(i):
+                        total = alike[active[j]]
                         for k in range(j):
                             total -= factor[i, k] * factor[j, k]
-                        factor[i, j] = total * factor[j, j] if j < i else 1 / np.sqrt(max(total, 1e-9))
-                for i in range(size):
-                    total = start[active[i]]
+                        factor[i, j] = total * factor[j, j]
+                    total, ahead = alike[active[i]], start[active[i]]
                     for k in range(i):
-                        total -= factor[i, k] * wanted[k]
-                    wanted[i] = total * factor[i, i]
+                        total -= factor[i, k] * factor[i, k]
+                        ahead -= factor[i, k] * forward[k]
+                    factor[i, i] = 1 / np.sqrt(max(total, 1e-9))
+                    forward[i] = ahead * factor[i, i]
+                wanted[:size] = forward[:size]
                 for i in range(size - 1, -1, -1):
-                    total = wanted[i]
-                    for k in range(i + 1, size):
-                        total -= factor[k, i] * wanted[k]
-                    wanted[i] = total * factor[i, i]
+                    wanted[i] *= factor[i, i]
+                    for k in range(i):
+                        wanted[k] -= factor[i, k] * wanted[i]
                 way, out = 1.0, -1
                 for i in range(size):
                     if wanted[i] <= 0:
-                        now = code[active[i]]
+                        now = code[i]
                         part = now / (now - wanted[i]) if now > 0 else 0.0
                         if part < way:
                             way, out = part, i
                 for i in range(size):
-                    code[active[i]] += way * (wanted[i] - code[active[i]])
+                    code[i] += way * (wanted[i] - code[i])
                 if out < 0:
                     break
-                code[active[out]] = 0
                 size -= 1
                 for i in range(out, size):
-                    active[i] = active[i + 1]
+                    active[i], code[i] = active[i + 1], code[i + 1]
                 valid = out
             gain[:] = start
             for i in range(size):
-                weight, alike = code[active[i]], gram[active[i]]
+                weight, alike = code[i], gram[active[i]]
                 for atom in range(count):
                     gain[atom] -= weight * alike[atom]
             for i in range(size):
                 gain[active[i]] = 0
-        for atom in range(count):
-            codes[row, atom] = code[atom]
+        for i in range(size):
+            codes[row, active[i]] = code[i]

@@ -117,6 +117,14 @@ def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
     assert not features.training
 
 
+def test_each_frame_that_scm_follows_is_learned_from_whatever_its_score(scene):
+    """Otherwise n rows might never make the first leaf, and SCM would follow the object to the end."""
+    detector = started(scene, {"teaching.bootstrap": "scm"})
+    track, features = detector.step(scene())
+    assert track.score < detector.settings.belief.confident_score
+    assert features.training
+
+
 def test_an_object_that_reappears_in_another_place_is_found_in_the_whole_frame(scene):
     detector = started(scene)
     detector.step(scene())
