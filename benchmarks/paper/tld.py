@@ -38,7 +38,8 @@ PAPER = {
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     variants = {"defaults": Settings(), **{name: Settings.from_values(PRESETS[name]) for name in ("cat25", "cat10")}}
     found = videos(options, "TLD_")
-    rows, parts = [], []
+    rows = []
+    parts: list[tuple[str | float, ...]] = []
     for name, runs in compared(options, found, variants).items():
         success = [row.success for row in rows_of(runs)]
         rows.append((name, fmean(success), *success, *PAPER.get(name, (None, None))))
