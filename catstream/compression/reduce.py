@@ -16,7 +16,8 @@ _TINY = np.float32(1e-30)  # in place of an energy of 0, which nothing can be di
 
 def prepare() -> None:
     """Import scipy before the first reduction, which would otherwise take a quarter of a second longer."""
-    import scipy.linalg  # noqa: F401
+    import scipy.linalg.blas
+    import scipy.linalg.lapack  # noqa: F401
 
 
 def energy(rows: np.ndarray) -> float:
@@ -33,8 +34,8 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     """Shrink rows to at most `size`, keeping the strongest directions.
 
     For every orthonormal Y, ||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2 with
-    c = ||A||^2 - ||C||^2 (paper, "Coresets"). Costs one Gram matrix and its
-    eigenvectors, O(m^2 d) for m rows of length d > m.
+    c = ||A||^2 - ||C||^2 (paper, "Coresets"). Costs one triangle of the Gram
+    matrix and its eigenvectors, O(m^2 d) for m rows of length d > m.
 
     Parameters
     ----------
@@ -50,8 +51,8 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     >>> reduce(np.ones((6, 4), np.float32), size=2).shape
     (2, 4)
     """
-    _, kept = _strongest(rows, size)
-    return _signed(kept, rows, towards)
+    _, kept = _strongest(rows, size, towards)
+    return kept
 
 
 def shrink(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np.ndarray:
@@ -68,24 +69,25 @@ def shrink(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     >>> (shrink(np.diag([3.0, 2, 1]).astype(np.float32), size=2) ** 2).round().tolist()
     [[8.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
     """
-    energies, kept = _strongest(rows, size + 1)
+    energies, kept = _strongest(rows, size + 1, towards)
     scale = np.sqrt(1 - energies[size] / np.maximum(energies[:size], _TINY))
-    return _signed(kept[:size] * scale[:, None], rows, towards)
+    shrunk: Float32 = kept[:size] * scale[:, None]
+    return shrunk
 
 
-def _strongest(rows: np.ndarray, count: int) -> tuple[Float32, Float32]:
+def _strongest(rows: np.ndarray, count: int, towards: np.ndarray | None) -> tuple[Float32, Float32]:
     """Energies and rows s_i v_i of the `count` strongest directions, all of them if there are fewer rows."""
-    import scipy.linalg  # imported late, so that a restarted compressor can answer first
+    from scipy.linalg.blas import ssyrk  # imported late, so that a restarted compressor can answer first
+    from scipy.linalg.lapack import ssyevd
 
     keep = min(count, len(rows))
-    gram = rows @ rows.T
-    # Divide and conquer: the default driver loses orthogonality, or vectors, if many eigenvalues are equal.
-    energies, vectors = scipy.linalg.eigh(gram, driver="evd", overwrite_a=True, check_finite=False)
-    kept: Float32 = vectors[:, : -keep - 1 : -1].T @ rows
-    return energies[: -keep - 1 : -1].clip(min=0), kept
-
-
-def _signed(kept: Float32, rows: np.ndarray, towards: np.ndarray | None) -> Float32:
-    """The kept rows, each with the sign with which its product with `towards` is not negative."""
-    kept[kept @ (rows.sum(axis=0) if towards is None else towards).astype(np.float32) < 0] *= -1
-    return kept
+    gram = ssyrk(1, rows.T, trans=1, lower=1)  # one triangle: the matrix is symmetric
+    # Divide and conquer: other drivers lose orthogonality, or vectors, if many eigenvalues are equal.
+    energies, vectors, failed = ssyevd(gram, lower=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError(f"no eigenvectors of the products of {len(rows)} rows were found")
+    # The rows of A are weighted by row i of `strongest`, and their sum is s_i v_i.
+    strongest = vectors.T[: -keep - 1 : -1].copy()
+    target = (rows.sum(axis=0) if towards is None else towards).astype(np.float32)
+    strongest[strongest @ (rows @ target) < 0] *= -1
+    return energies[: -keep - 1 : -1].clip(min=0), strongest @ rows

@@ -40,28 +40,29 @@ def sample(nodes: Sequence[Node], size: int) -> np.ndarray:
     """
     if not nodes:
         return np.empty((0, 0), np.float32)
-    top = nodes[0].level
-    parts = []
-    for node in nodes:
-        count = share(node.level, top, size)
-        if not count:
-            break
-        parts.append(spread(node.directions[:count]) * np.float32(np.sqrt(count / node.count)))
-    return np.vstack(parts)
+    counts = [share(node.level, nodes[0].level, size) for node in nodes]
+    rows = np.empty((sum(counts), nodes[0].rows.shape[1]), np.float32)
+    for node, part in zip(nodes, np.split(rows, np.cumsum(counts[:-1])), strict=True):
+        if count := len(part):
+            np.multiply(node.directions[:count], np.float32(np.sqrt(count / node.count)), out=part)
+            spread(part)
+    return rows
 
 
-def spread(rows: np.ndarray) -> np.ndarray:
-    """Reflect rows so that the first is distributed evenly over all: Q C with Q e1 = 1 / sqrt(m).
+def spread(rows: np.ndarray) -> None:
+    """Reflect rows, in place, so that the first is distributed evenly over all: Q C with Q e1 = 1 / sqrt(m).
 
     A Householder reflection: Q'Q = I, so that the result is the same coreset. Costs O(m d).
 
-    >>> spread(np.array([[2, 0], [0, 1], [0, 0], [0, 0]], np.float32))[:, 0]
+    >>> rows = np.array([[2, 0], [0, 1], [0, 0], [0, 0]], np.float32)
+    >>> spread(rows)
+    >>> rows[:, 0]
     array([1., 1., 1., 1.], dtype=float32)
     """
     m = len(rows)
     if m < 2:
-        return rows
+        return
     normal = np.full(m, -1 / np.sqrt(m), np.float32)
     normal[0] += 1
     normal /= np.linalg.norm(normal)
-    return rows - np.outer(2 * normal, normal @ rows)
+    rows -= np.outer(2 * normal, normal @ rows)

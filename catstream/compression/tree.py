@@ -57,12 +57,18 @@ class CoresetTree:
             raise ValueError(f"a coreset needs at least 1 row, got size={size}")
         self.size = size
         self.nodes: list[Node] = []
-        self.pending = np.empty((0, 0), np.float32)
+        self._leaf = np.empty((size, 0), np.float32)  # the next leaf, and its number of rows so far
+        self._filled = 0
+
+    @property
+    def pending(self) -> np.ndarray:
+        """The newest rows, fewer than fill a leaf, float32 (k, d); later rows do not change them."""
+        return self._leaf[: self._filled]
 
     @property
     def width(self) -> int:
         """Length d of a row, 0 before the first."""
-        return self.nodes[0].rows.shape[1] if self.nodes else self.pending.shape[1]
+        return self.nodes[0].rows.shape[1] if self.nodes else self._leaf.shape[1]
 
     @property
     def rows_seen(self) -> int:
@@ -89,7 +95,7 @@ class CoresetTree:
 
     @property
     def nbytes(self) -> int:
-        """Size of all arrays in bytes."""
+        """Size of the rows and of their sums in bytes."""
         return self.pending.nbytes + sum(node.rows.nbytes + node.sum.nbytes for node in self.nodes)
 
     def insert(self, rows: np.ndarray) -> None:
@@ -101,18 +107,22 @@ class CoresetTree:
             If the rows have another length than those before, or numbers that are not finite.
         """
         rows = self._checked(rows)
-        if not len(rows):
-            return
-        waiting = np.vstack([self.pending, rows]) if len(self.pending) else rows
-        while len(waiting) >= self.size:
-            self._push(Node.leaf(waiting[: self.size].copy()))
-            waiting = waiting[self.size :]
-        self.pending = waiting.copy()
+        while len(rows):
+            if not self._filled:  # a node has the array before
+                self._leaf = np.empty((self.size, rows.shape[1]), np.float32)
+            room = self.size - self._filled
+            taken, rows = rows[:room], rows[room:]
+            self._leaf[self._filled : self._filled + len(taken)] = taken
+            self._filled += len(taken)
+            if self._filled == self.size:
+                self._filled = 0
+                self._push(Node.leaf(self._leaf))
 
     def copy(self) -> Self:
         """A tree with the same content: rows that are inserted into one are not in the other."""
         tree = type(self)(self.size)
-        tree.nodes, tree.pending = list(self.nodes), self.pending  # nodes and pending rows are replaced, not changed
+        tree.nodes = list(self.nodes)  # a node never changes
+        tree._leaf, tree._filled = self._leaf.copy(), self._filled
         return tree
 
     def merged(self, other: CoresetTree) -> Self:
@@ -141,7 +151,7 @@ class CoresetTree:
                 "build both from the same features"
             )
         if not self.width:
-            self.pending = np.empty((0, other.width), np.float32)
+            self._leaf = np.empty((self.size, other.width), np.float32)
         # As in the addition of two binary numbers, equal levels are merged from the lowest level up.
         carried = sorted([*self.nodes, *other.nodes], key=lambda node: -node.level)
         self.nodes = []
@@ -196,8 +206,10 @@ class CoresetTree:
             for i, node in enumerate(metadata["nodes"]):
                 rows, total, whole = arrays[f"rows.{i}"], arrays[f"sum.{i}"], float.fromhex(node["energy"])
                 tree.nodes.append(Node(int(node["level"]), rows, int(node["count"]), total, whole))
-            tree.pending = arrays["pending"]
-            tree._check()
+            pending = arrays["pending"]
+            tree._check(pending)
+            tree._leaf = np.empty((tree.size, pending.shape[1]), np.float32)
+            tree.insert(pending)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"not the state of a coreset tree ({error!r}): use an older copy of the file") from None
         return tree
@@ -230,12 +242,13 @@ class CoresetTree:
             raise ProtocolError("rows hold a number that is not finite: check the source of the features")
         return rows
 
-    def _check(self) -> None:
+    def _check(self, pending: np.ndarray) -> None:
+        """Raise ValueError unless the nodes, and the pending rows that follow them, are those of a tree."""
         levels = [node.level for node in self.nodes]
         if levels != sorted(set(levels), reverse=True):
             raise ValueError(f"levels {levels} are not strictly decreasing")
-        if self.pending.ndim != 2 or self.pending.dtype != np.float32 or len(self.pending) >= self.size:
-            raise ValueError(f"pending rows of {self.pending.dtype} {self.pending.shape}")
+        if pending.ndim != 2 or pending.dtype != np.float32 or len(pending) >= self.size:
+            raise ValueError(f"pending rows of {pending.dtype} {pending.shape}")
         for node in self.nodes:
             whole = node.rows.shape == (self.size, self.width) and node.sum.shape == (self.width,)
             if not whole or node.rows.dtype != np.float32 or node.sum.dtype != np.float64:
