@@ -223,7 +223,8 @@ def test_a_tracker_of_other_features_is_rejected(video, tmp_path):
     tracker.init(video[0][0], video[1][0])
     tracker.save(tmp_path / "kept")
     arrays, metadata = storage.read(tmp_path / "kept")
-    storage.write(tmp_path / "kept", arrays | {"model.0.weights": arrays["model.0.weights"][:-1].copy()}, metadata)
+    shorter = {name: row[:-1].copy() for name, row in arrays.items() if name.startswith("model.0.") and row.ndim == 1}
+    storage.write(tmp_path / "kept", arrays | shorter, metadata)
     with pytest.raises(ProtocolError, match="its model has 2463 weights, the features of this catstream are 2464"):
         Tracker.load(tmp_path / "kept")
 
