@@ -14,7 +14,7 @@ from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import energy
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
-from catstream.heads import APPEARANCE, EXTENT
+from catstream.heads import APPEARANCE, EXTENT, HEADS
 from catstream.learned import Learned, merge
 from catstream.messages import DetectorState, ObjectFeatures, TrainingRows
 from catstream.settings import Settings
@@ -142,6 +142,14 @@ def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
     monkeypatch.setattr("catstream.learned.row_length", lambda: WIDTH + 1)
     with pytest.raises(ProtocolError, match=f"{WIDTH} features of a window, this catstream has {WIDTH + 1}"):
         Learned.load(tmp_path / "one")
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_file_without_the_tree_of_a_head_is_an_error(learned, head):
+    arrays, metadata = storage.decode(learned.to_bytes(), "one")
+    trees = {name: tree for name, tree in metadata["trees"].items() if name != head}
+    with pytest.raises(ProtocolError, match=f"it has no tree '{head}': learn the object anew"):
+        Learned.from_bytes(storage.encode(arrays, {**metadata, "trees": trees}), "one")
 
 
 def test_an_unwritable_file_is_an_error_and_leaves_nothing(learned, tmp_path):
