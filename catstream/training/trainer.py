@@ -21,6 +21,7 @@ from catstream.heads import BETWEEN_RIDGE, HEADS
 from catstream.messages import Model, Motion, Sample
 from catstream.paper.one_class import one_class
 from catstream.settings import Settings
+from catstream.training.motion_em import learn_motion
 
 __all__ = ["Trainer"]
 
@@ -109,6 +110,4 @@ def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | Non
 
 @lru_cache(maxsize=256)  # all samples of a block of one object have the same centres
 def _motion(centres: bytes) -> Motion | None:
-    from catstream.training.motion_em import learn_motion  # imports numba, which a process needs after a block only
-
     return learn_motion(np.frombuffer(centres, np.float64).reshape(-1, 2))
