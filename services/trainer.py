@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from catstream import kalman
 from catstream.messages import End
 from catstream.services.loop import Process
 from catstream.training.trainer import Trainer
@@ -29,6 +30,8 @@ def main(process: Process) -> None:
             if message is not None and message.version != trained.get(message.object, _NONE)["version"]:
                 process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
+                if message.frame >= process.settings.search.motion_frames // 2:
+                    kalman.prepare()  # a sample contains the centres after twice as many frames
                 count = trained.pop(message.object, _NONE)["trained"] + 1
                 trained[message.object] = {"version": float(message.version), "trained": count}
                 if len(trained) > process.settings.run.objects_most:  # the longest ago: it was forgotten

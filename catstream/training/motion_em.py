@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from catstream.arrays import Bool, Float64
-from catstream.features.compiled import kernel
-from catstream.kalman import OBSERVED, TRANSITION
+from catstream.arrays import Float64
+from catstream.kalman import OBSERVED, TRANSITION, constant_velocity
 from catstream.messages import Motion
 
 __all__ = ["FEWEST", "OBSERVATION_FLOOR", "PROCESS_FLOOR", "learn_motion"]
@@ -25,7 +24,7 @@ def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
 
     No iteration lowers the likelihood. The covariances are symmetric, and their eigenvalues are at least
     `PROCESS_FLOOR` and `OBSERVATION_FLOOR`, so that the filter also works for a motionless object. Costs O(m) an
-    iteration, about 4 microseconds a frame.
+    iteration, about 50 microseconds a frame.
 
     Parameters
     ----------
@@ -48,14 +47,9 @@ def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
         return None
     mean, covariance, motion = _start(centres[present])
     # Frames before the first centre and after the last carry no information.
-    centres = np.array(centres[present[0] : present[-1] + 1], np.float64)  # a kernel takes no read-only array
-    seen = np.isfinite(centres).all(axis=1)
-    m = len(centres)
-    states, covariances, lagged = np.empty((m, 4, 1)), np.empty((m, 4, 4)), np.empty((m - 1, 4, 4))
+    centres = centres[present[0] : present[-1] + 1]
     for _ in range(iterations):
-        states[0, :, 0] = mean
-        _smooth(centres, seen, covariance, motion.process, motion.observation, TRANSITION, states, covariances, lagged)
-        motion = _refit(centres, seen, states[:, :, 0], covariances, lagged)
+        motion = _refit(centres, *_smooth(centres, mean, covariance, motion))
     return motion
 
 
@@ -69,91 +63,28 @@ def _start(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray, Motion]:
     return mean, np.diag([share, share, share + speed, share + speed]), Motion(share * np.eye(4), share * np.eye(2))
 
 
-@kernel("float64[:,::1](float64[:,:], float64[:,:])")
-def _times(one: Float64, other: Float64) -> Float64:
-    """The product of two matrices."""
-    product = np.zeros((one.shape[0], other.shape[1]))
-    for i in range(one.shape[0]):
-        for k in range(one.shape[1]):
-            for j in range(other.shape[1]):
-                product[i, j] += one[i, k] * other[k, j]
-    return product
-
-
-@kernel("float64[:,::1](float64[:,:])")
-def _inverse(matrix: Float64) -> Float64:
-    """The inverse of a symmetric positive definite matrix, by Gauss-Jordan elimination, which then needs no pivots."""
-    size = len(matrix)
-    left, inverse = matrix.copy(), np.eye(size)
-    for k in range(size):
-        scale = 1 / left[k, k]
-        for j in range(size):
-            left[k, j] *= scale
-            inverse[k, j] *= scale
-        for i in range(size):
-            if i != k:
-                factor = left[i, k]
-                for j in range(size):
-                    left[i, j] -= factor * left[k, j]
-                    inverse[i, j] -= factor * inverse[k, j]
-    return inverse
-
-
-@kernel(
-    "void(float64[:,::1], boolean[::1], float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1],"
-    " float64[:,:,::1], float64[:,:,::1], float64[:,:,::1])"
-)
 def _smooth(
-    centres: Float64,
-    seen: Bool,
-    covariance: Float64,
-    process: Float64,
-    observation: Float64,
-    transition: Float64,
-    states: Float64,
-    covariances: Float64,
-    lagged: Float64,
-) -> None:
-    """Expectation: states given all centres, their covariances, and the covariance of each state with the next.
+    centres: np.ndarray, mean: np.ndarray, covariance: np.ndarray, motion: Motion
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Expectation: states (m, 4) given all centres, their covariances (m, 4, 4), and those of each with the next.
 
     A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
-
-    Parameters
-    ----------
-    centres : float64 (m, 2); rows that were not `seen`, bool (m,), do not count
-    covariance : float64 (4, 4), of the first state before it is measured
-    states : float64 (m, 4, 1), filled; the first one is given
-    covariances, lagged : float64 (m, 4, 4) and (m - 1, 4, 4), filled
     """
-    m, state, ahead = len(centres), states[0].copy(), np.empty(covariances.shape)
-    for k in range(m):
-        if seen[k]:
-            gain = _times(covariance[:, :2], _inverse(covariance[:2, :2] + observation))
-            kept = np.eye(4)
-            kept[:, :2] -= gain
-            error = centres[k].reshape(2, 1) - state[:2]
-            state = state + _times(gain, error)
-            covariance = _times(_times(kept, covariance), kept.T) + _times(_times(gain, observation), gain.T)
-        states[k], covariances[k] = state, covariance
-        state = _times(transition, state)
-        covariance = _times(_times(transition, covariance), transition.T) + process
-        ahead[k] = covariance
-    for k in range(m - 2, -1, -1):
-        gain = _times(_times(covariances[k], transition.T), _inverse(ahead[k]))
-        lagged[k] = _times(covariances[k + 1], gain.T)
-        states[k] += _times(gain, states[k + 1] - _times(transition, states[k]))
-        covariances[k] += _times(_times(gain, covariances[k + 1] - ahead[k]), gain.T)
+    kalman = constant_velocity(mean, covariance, motion.process, motion.observation)
+    measured = [centre if np.isfinite(centre).all() else None for centre in centres]
+    states, covariances, _, _ = kalman.batch_filter(measured, update_first=True)
+    states, covariances, gains, _ = kalman.rts_smoother(states, covariances)
+    return states, covariances, covariances[1:] @ gains[:-1].transpose(0, 2, 1)
 
 
-def _refit(
-    centres: np.ndarray, seen: np.ndarray, states: np.ndarray, covariances: np.ndarray, lagged: np.ndarray
-) -> Motion:
+def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lagged: np.ndarray) -> Motion:
     """Maximisation: mean outer products of the residuals, plus the uncertainty of the smoothed states."""
     push = states[1:] - states[:-1] @ TRANSITION.T
     together = (lagged @ TRANSITION.T).sum(axis=0)
     spread = covariances[1:].sum(axis=0) + TRANSITION @ covariances[:-1].sum(axis=0) @ TRANSITION.T
     process = (push.T @ push + spread - together - together.T) / len(push)
 
+    seen = np.isfinite(centres).all(axis=1)
     error = centres[seen] - states[seen] @ OBSERVED.T
     observation = error.T @ error / len(error) + OBSERVED @ covariances[seen].mean(axis=0) @ OBSERVED.T
     return Motion(_floored(process, PROCESS_FLOOR), _floored(observation, OBSERVATION_FLOOR))
