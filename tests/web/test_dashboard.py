@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from catstream.colours import PALETTE
+from catstream.heads import HEADS
 from catstream.messages import End, Health
 from catstream.web.dashboard import Dashboard
 
