@@ -15,6 +15,7 @@ ALONE = BENCHMARKS / "kernels.py"
 SCRIPTS = sorted({path for path in BENCHMARKS.rglob("*.py") if "publish(figures" in path.read_text()} - {ALONE})
 
 
+@pytest.mark.timeout(420)  # faults of a fleet take 80 s on a quiet machine, and several times that beside other tests
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: str(path.relative_to(BENCHMARKS)))
 def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path, monkeypatch):
     figures = tmp_path / "figures.json"
