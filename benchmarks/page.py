@@ -230,14 +230,12 @@ _REDUCTION = """
     is ||C||^2 / ||A||^2 over all trees. Accuracy is measured on the 20 sequences on which the defaults were chosen,
     from three start frames of each. See [decision 52](decisions/0052-frequent-directions-optional.md)."""
 _STARTS = """
-    OPE is one run of each sequence, TRE runs from several frames, and SRE from 12 first boxes, shifted by 10 % or
-    scaled by 0.8, 0.9, 1.1 and 1.2; jitter changes the first box by at most 2 %. Each sequence counts once, with
+    OPE is one run of each sequence; jitter changes the first box by at most 2 %. Each sequence counts once, with
     the mean over its runs; ± is the standard error over the sequences. F is that of the sequences in which the
     object is absent in some frames. A sequence flips if its success differs by more than 0.25 between the jittered
-    boxes. The check sequences are not used to choose anything. The first two commands are of the code before
-    [decision 65](decisions/0065-errors-of-the-extent.md), the others of the code after it; TRE and SRE have the first
-    120 frames of each sequence. The last table has the runs of OPE;
-    [Evaluate on your own video](how-to/evaluate.md#6-see-what-is-difficult) defines the attributes."""
+    boxes. The check sequences are not used to choose anything. The first table is of the code before
+    [decision 65](decisions/0065-errors-of-the-extent.md), the others are of the code after it. The last table has the
+    runs of OPE; [Evaluate on your own video](how-to/evaluate.md#6-see-what-is-difficult) defines the attributes."""
 _FORKS = """
     Each sequence is followed from seven first boxes that differ by at most 2 %. It flips if the success of these runs
     differs by more than 0.25, and it is lost if all are below 0.5; other sequences are not listed. Each failing run of
@@ -367,8 +365,6 @@ ROBUSTNESS = (
         _STARTS,
         (
             Shown("robustness-before", select(0)),
-            Shown("robustness-starts-before", select(0)),
-            Shown("robustness-starts", select(0)),
             Shown("robustness", robustness),
         ),
     ),
