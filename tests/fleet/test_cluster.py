@@ -189,6 +189,7 @@ def test_ray_is_started_again_after_its_death_with_the_cause_in_one_line(monkeyp
 
 
 def test_a_cluster_that_asks_for_no_token_is_not_joined(token, monkeypatch):
+    monkeypatch.delitem(sys.modules, "ray", raising=False)  # another test may have connected this process
     answered = subprocess.CompletedProcess([], 0, stdout=json.dumps({"open": True}).encode())
     monkeypatch.setattr(cluster.subprocess, "run", lambda *_, **__: answered)
     monkeypatch.setattr(cluster.socket, "create_connection", lambda *_: SimpleNamespace(close=lambda: None))

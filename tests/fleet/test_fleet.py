@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 
@@ -81,6 +83,13 @@ def test_a_stream_of_a_dead_node_continues_elsewhere(site, fleet, until):
     assert after.node in ("node-1", "node-2")
     assert after.frame > before.frame  # numbers go on after what was lost
     assert after.lost_frames > 0
+
+
+@pytest.mark.usefixtures("fleet")
+def test_processes_of_the_nodes_have_the_priority_of_the_process_that_starts_them():
+    ray = import_module("ray")
+    theirs = ray.get(ray.remote(num_cpus=0)(lambda: os.getpriority(os.PRIO_PROCESS, 0)).remote())
+    assert theirs == os.getpriority(os.PRIO_PROCESS, 0)
 
 
 def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
