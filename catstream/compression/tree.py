@@ -57,7 +57,7 @@ class CoresetTree:
             raise ValueError(f"a coreset needs at least 1 row, got size={size}")
         self.size = size
         self.nodes: list[Node] = []
-        self._leaf = np.empty((size, 0), np.float32)  # the next leaf, and its number of rows so far
+        self._leaf = np.empty((0, 0), np.float32)  # memory for the next leaf, and its number of rows so far
         self._filled = 0
 
     @property
@@ -110,6 +110,9 @@ class CoresetTree:
         while len(rows):
             if not self._filled:  # a node has the array before
                 self._leaf = np.empty((self.size, rows.shape[1]), np.float32)
+            elif self._filled == len(self._leaf):  # the pending rows of a tree that was read or copied
+                left = np.empty((self.size - self._filled, rows.shape[1]), np.float32)
+                self._leaf = np.vstack([self._leaf, left])
             room = self.size - self._filled
             taken, rows = rows[:room], rows[room:]
             self._leaf[self._filled : self._filled + len(taken)] = taken
@@ -121,8 +124,8 @@ class CoresetTree:
     def copy(self) -> Self:
         """A tree with the same content: rows that are inserted into one are not in the other."""
         tree = type(self)(self.size)
-        tree.nodes = list(self.nodes)  # a node never changes
-        tree._leaf, tree._filled = self._leaf.copy(), self._filled
+        tree.nodes = list(self.nodes)  # nodes and pending rows never change
+        tree._leaf, tree._filled = self.pending, self._filled
         return tree
 
     def merged(self, other: CoresetTree) -> Self:
@@ -151,7 +154,7 @@ class CoresetTree:
                 "build both from the same features"
             )
         if not self.width:
-            self._leaf = np.empty((self.size, other.width), np.float32)
+            self._leaf = np.empty((0, other.width), np.float32)
         # As in the addition of two binary numbers, equal levels are merged from the lowest level up.
         carried = sorted([*self.nodes, *other.nodes], key=lambda node: -node.level)
         self.nodes = []
@@ -208,8 +211,7 @@ class CoresetTree:
                 tree.nodes.append(Node(int(node["level"]), rows, int(node["count"]), total, whole))
             pending = arrays["pending"]
             tree._check(pending)
-            tree._leaf = np.empty((tree.size, pending.shape[1]), np.float32)
-            tree.insert(pending)
+            tree._leaf, tree._filled = tree._checked(pending), len(pending)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"not the state of a coreset tree ({error!r}): use an older copy of the file") from None
         return tree

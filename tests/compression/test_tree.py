@@ -208,6 +208,22 @@ def test_a_damaged_file_is_rejected_unless_the_tree_in_it_is_intact(tmp_path_fac
     assert bits(loaded) == bits(tree)
 
 
+def test_a_damaged_size_takes_no_memory(stream):
+    tree = grown(stream[:3])
+    arrays, metadata = tree.state()
+    assert CoresetTree.from_state(arrays, metadata | {"size": 10**15}).nbytes == tree.nbytes
+
+
+def test_rows_inserted_into_a_tree_are_not_in_its_copy(stream):
+    tree = grown(stream[:3])
+    copy, other = tree.copy(), tree.copy()
+    tree.insert(stream[3:])
+    assert bits(copy) == bits(grown(stream[:3]))
+    copy.insert(stream[3:])
+    assert bits(copy) == bits(tree)
+    assert bits(other) == bits(grown(stream[:3]))
+
+
 # --- what it refuses ------------------------------------------------------------------------------------
 
 
