@@ -44,7 +44,8 @@ def attributes_of(sequences: Iterable[Sequence], others: Mapping[str, Iterable[s
     """
     found: dict[str, list[str]] = {}
     for sequence in sequences:
-        for attribute in (*computed_attributes(sequence.boxes, sequence.size()), *others.get(sequence.name, ())):
+        computed = computed_attributes(sequence.boxes, sequence.size())
+        for attribute in dict.fromkeys([*computed, *others.get(sequence.name, ())]):
             found.setdefault(attribute, []).append(sequence.name)
     return dict(sorted(found.items()))
 

@@ -70,9 +70,10 @@ class Peer:
         Raises
         ------
         BoxError
-            If OpenCV does not accept the box.
+            If `Box.validated` or OpenCV does not accept the box.
         """
         height, width = frame.shape[:2]
+        Box(*map(float, box)).validated(width, height)  # from one outside the frame, OpenCV's MIL never returns
         left, top, w, h = (round(value) for value in box)
         right, bottom = min(left + max(w, 1), width), min(top + max(h, 1), height)
         left, top = min(max(left, 0), width - 1), min(max(top, 0), height - 1)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from catstream.box import Box
+from catstream.errors import BoxError, VideoError
 from catstream.evaluation.datasets import Sequence
 
 __all__ = [
@@ -106,7 +107,7 @@ _JITTER = 0.02
 
 
 def choose_starts(frames: int | None = None, boxes: int | None = None, *, shifts: bool = False) -> Starts:
-    """Return the function below for one of `--starts FRAMES`, `--jitter BOXES` and `--shifts`, or for none of them."""
+    """Return the starts for `--starts FRAMES`, `--jitter BOXES` or `--shifts`; without any of them, those of OPE."""
     if shifts:
         return spatial
     if boxes is not None:
@@ -120,12 +121,16 @@ def one_pass(sequence: Sequence) -> list[Start]:
 
 
 def temporal(count: int) -> Starts:
-    """Choose `count` evenly spaced start frames. If the object is absent in one, the next frame with it is used."""
+    """Choose `count` evenly spaced start frames.
+
+    If the object is absent in one, or its box is one that tracking cannot start with, for example with its centre
+    outside the frame, the next frame is used. Reads a frame of each sequence.
+    """
 
     def starts(sequence: Sequence) -> list[Start]:
-        present = _present(sequence)
-        places = np.searchsorted(present, np.arange(count) * len(sequence) // count)
-        return [Start(frame) for frame in sorted({present[place] for place in places if place < len(present)})]
+        frames = _valid(sequence)
+        places = np.searchsorted(frames, np.arange(count) * len(sequence) // count)
+        return [Start(frame) for frame in sorted({frames[place] for place in places if place < len(frames)})]
 
     return starts
 
@@ -157,6 +162,27 @@ def _jitter(seed: int) -> Variation:
 def _present(sequence: Sequence) -> list[int]:
     """Return the frames with the object."""
     return [int(frame) for frame in np.flatnonzero(np.isfinite(sequence.boxes).all(axis=1))]
+
+
+def _valid(sequence: Sequence) -> list[int]:
+    """Return the frames with a box that `Box.validated` accepts; all with the object if none has one, or none is read.
+
+    The run then raises the error.
+    """
+    present = _present(sequence)
+    try:
+        size = sequence.size(present[0])
+    except VideoError:
+        return present
+    return [frame for frame in present if _is_valid(Start(frame).box(sequence), *size)] or present
+
+
+def _is_valid(box: Box, width: int, height: int) -> bool:
+    try:
+        box.validated(width, height)
+    except BoxError:
+        return False
+    return True
 
 
 def _startable(box: Box, width: int, height: int) -> Box:

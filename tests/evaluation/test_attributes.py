@@ -43,7 +43,7 @@ def test_motion_across_frames_without_the_object_is_not_fast():
 
 
 def test_the_attributes_of_a_file_join_those_of_the_ground_truth(sequence):
-    found = attributes_of([sequence], {"walk": ["blur"], "other": ["clutter"]})
+    found = attributes_of([sequence], {"walk": ["blur", "out of view", "blur"], "other": ["clutter"]})
     assert found == {"blur": ["walk"], "out of view": ["walk"]}
 
 

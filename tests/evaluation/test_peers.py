@@ -183,6 +183,11 @@ def test_a_box_across_the_edge_of_the_frame_is_clipped_for_opencv(sequence):
     assert peer.score == 1
 
 
+def test_a_box_outside_the_frame_is_one_line_of_error(sequence):
+    with pytest.raises(BoxError, match="outside the frame of 160 x 120"):
+        Peer("mil").init(next(iter(sequence.frames())), (-90, 0, 60, 60))
+
+
 def test_a_box_that_opencv_rejects_is_one_line_of_error(monkeypatch, sequence):
     class Broken:
         def init(self, *_):

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Box
+from catstream.errors import CatstreamError
 from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.onepass import evaluate
 from catstream.evaluation.starts import FIRST, SHIFTS, Start, jittered, one_pass, spatial, temporal
+from catstream.settings import Settings
 
 
 def boxes_of(starts: list[Start], sequence: Sequence) -> np.ndarray:
@@ -23,6 +28,28 @@ def test_start_frames_are_evenly_spaced_over_the_frames_with_the_object(sequence
     assert frames(1) == [0]
     assert frames(2) == [0, 8]  # the object is absent in 5, 6 and 7
     assert frames(4) == [0, 3, 8, 9]
+
+
+@pytest.mark.parametrize("box", [(-40, 50, 60, 30), (140, 50, 60, 30), (60, 50, 30, 1), (-99, 0, 330, 90)])
+def test_a_start_frame_whose_box_tracking_cannot_start_with_is_not_used(sequence, box):
+    boxes = sequence.boxes.copy()
+    boxes[[0, 3]] = box
+    frames = [start.frame for start in temporal(4)(replace(sequence, boxes=boxes))]
+    assert frames == [1, 4, 8, 9]
+
+
+def test_if_no_frame_has_a_valid_box_or_can_be_read_the_run_says_so(sequence, tmp_path):
+    outside = replace(sequence, boxes=np.tile([-90.0, 0, 60, 60], (12, 1)))
+    unreadable = replace(sequence, path=tmp_path)
+    errors: list[CatstreamError] = []
+    assert evaluate([outside], ["mil"], Settings(), starts=temporal(2), failed=errors.append) == []
+    assert evaluate([unreadable], ["mil"], Settings(), starts=temporal(2), failed=errors.append) == []
+    assert [str(error).split(": ")[0] for error in errors] == [
+        "mil on walk",
+        "mil on walk@6",
+        "mil on walk",
+        "mil on walk@8",
+    ]
 
 
 def test_every_choice_starts_when_the_object_appears(sequence):
