@@ -1,4 +1,4 @@
-"""The frames at which runs lose the object, and what the detector saw there.
+"""The frames at which runs lose the object, and the state of the detector in them.
 
 Each sequence is followed from K first boxes that differ by at most 2 %. A sequence flips if the success of these runs
 differs by more than 0.25: each run that fails is compared with the best one. If all runs fail, the worst one is
@@ -15,8 +15,8 @@ from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
-from accuracy import accuracy_command, videos
-from table import Cell, Table, publish
+from accuracy import many_sequences, videos
+from table import Cell, Table, command, publish
 
 from catstream.box import Box
 from catstream.compression.forest import Forest
@@ -158,7 +158,7 @@ def observed(forks: list[Fork]) -> dict[str, list[Seen]]:
 
 
 def seen(run: EvaluationRun, last: int) -> Iterator[Seen]:
-    """Repeat a run up to a frame, and yield what the detector saw in each frame.
+    """Repeat a run up to a frame, and yield the state of the detector in each frame.
 
     Raises
     ------
@@ -194,7 +194,7 @@ def lead_of(found: Detection) -> float | None:
 
 
 def overview(forks: list[Fork], frames: dict[str, list[Seen]]) -> Table:
-    """Return a row for each fork: its frame, what the failing run and the good one saw, and what was taught before."""
+    """Return a row for each fork: its frame, the states of the failing run and of the good one, and the rows taught."""
     rows: list[list[Cell]] = []
     for failing, good, frame in forks:
         cells: list[Cell] = [failing.name, good.name if good else "ground truth", failing.start.frame + frame]
@@ -237,8 +237,8 @@ def state(run: EvaluationRun, frames: dict[str, list[Seen]], row: int) -> list[C
 
 
 if __name__ == "__main__":
-    parser = accuracy_command(__doc__)
+    parser = many_sequences(command(__doc__))
+    parser.add_argument("--jitter", type=int, default=7, help="number of first boxes (default: %(default)s)")
     parser.add_argument("--strips", type=Path, metavar="FILE", help=f"write film strips of the {STRIPS} worst runs")
-    parser.set_defaults(jitter=7)
     options = parser.parse_args()
     publish(figures(options), options)

@@ -36,7 +36,7 @@ Found = Mapping[tuple[str, str], list[Row]]
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    sequences = videos(options)
+    sequences, check, seen = videos(options), check_names(options), read_attributes(options.attributes)
     trackers, _ = available(options.trackers, options.peer_models)
     parts = {tracker: options.parts if tracker == "catstream" else options.peer_parts for tracker in trackers}
     chosen = starts_by_part(options)
@@ -46,10 +46,9 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         for part in own:
             starts = {sequence.name: set(chosen[part](sequence)) for sequence in sequences}
             found[tracker, part] = rows_of(run for run in runs if run.start in starts[run.sequence.name])
-    check = check_names(options)
     yield overview(found, described(options), groups_of(sequences, check))
     attributes = {"any": [sequence.name for sequence in sequences]}
-    attributes |= attributes_of(sequences, read_attributes(options.attributes))
+    attributes |= attributes_of(sequences, seen)
     yield by_attribute(found, attributes, check)
 
 

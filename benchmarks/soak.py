@@ -29,7 +29,7 @@ from catstream.detection.objects import Detectors
 from catstream.errors import ServiceError
 from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
-from catstream.heads import APPEARANCE, EXTENT
+from catstream.heads import APPEARANCE, GROUPS
 from catstream.messages import End, Features, ObjectFeatures, TrainingRows
 from catstream.names import UNNAMED
 from catstream.services.start import service_command
@@ -48,7 +48,7 @@ COLUMNS = ("messages", "rows", "us a message", "nodes", "trees MB", "law MB", "r
 class Measurement(NamedTuple):
     """The measurements after some messages; a megabyte is 10**6 bytes.
 
-    messages, rows  number of messages processed, and of rows inserted into the four trees
+    messages, rows  number of messages processed, and of rows inserted into all trees
     micros          microseconds of processor time per message since the last measurement, with reductions and samples
     nodes, trees    nodes of all trees, and megabytes of their arrays
     law             megabytes of log2(p/n) + 1 nodes and n pending rows in each tree
@@ -75,18 +75,21 @@ class Stream:
         features = list(cut(sequence, frames, settings))
         seen = _all(features, APPEARANCE)
         self._object, self._background = seen.rows[seen.labels == 1], seen.rows[seen.labels == 0]
-        self._extents = _all(features, EXTENT)
+        self._others = {group: _all(features, group) for group in GROUPS if group != APPEARANCE}
         self._box, self._random = features[-1].box, np.random.default_rng(settings.run.seed)
 
     def message(self, seq: int) -> Features:
-        """A row of the object, one of the background and two of its extent."""
-        random = self._random
-        gains = random.normal(1, GAIN, (4, 1)).astype(np.float32)
-        pair = random.integers(len(self._extents), size=2)
-        rows = np.stack([part[random.integers(len(part))] for part in (self._object, self._background)]) * gains[:2]
-        extents = TrainingRows.labelled(self._extents.rows[pair] * gains[2:], self._extents.labels[pair])
-        training = {APPEARANCE: TrainingRows.labelled(rows, [1, 0]), EXTENT: extents}
+        """A row of the object, one of the background and two of each other group."""
+        rows = np.stack([part[self._random.integers(len(part))] for part in (self._object, self._background)])
+        training = {APPEARANCE: TrainingRows.labelled(rows * self._gains(), [1, 0])}
+        for group, seen in self._others.items():
+            pair = self._random.integers(len(seen), size=2)
+            training[group] = TrainingRows.labelled(seen.rows[pair] * self._gains(), seen.labels[pair])
         return Features(seq, seq - 1, (seq - 1) / 25, {UNNAMED: ObjectFeatures(self._box, training)})
+
+    def _gains(self) -> np.ndarray:
+        """The changes of brightness of two rows, float32 (2, 1)."""
+        return self._random.normal(1, GAIN, (2, 1)).astype(np.float32)
 
 
 def _all(features: list[ObjectFeatures], group: str) -> TrainingRows:

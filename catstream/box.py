@@ -166,5 +166,5 @@ class Window(_Rectangle):
         return cls(*box).scaled(context)
 
     def box(self, context: float) -> Box:
-        """The box of a window: the inverse of `of`."""
+        """The box of a window: the inverse of `around`."""
         return Box(*self.scaled(1 / context))

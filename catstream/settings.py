@@ -298,7 +298,11 @@ class ExtentSettings(_Group):
     ] = 0.5
     weight: Annotated[
         float,
-        _about("Weight of the extent head beside the appearance score if size and aspect ratio are chosen.", ge=0),
+        _about(
+            "Weight of the extent head beside the appearance score if size and aspect ratio are chosen (0: the size "
+            "and aspect heads are not used either).",
+            ge=0,
+        ),
     ] = 1.0
     colour_slack: Annotated[
         float,

@@ -35,7 +35,7 @@ __all__ = [
     "whole",
 ]
 
-_MOST_CELLS = 16_384  # that a search of the whole frame may have in one frame, at all sizes: they take some 14 ms
+_MOST_CELLS = 16_384  # limit of a search of the whole frame in one frame, over all sizes: about 14 ms
 _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a cell away from that at another size
 _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
@@ -387,7 +387,15 @@ def _at_best_aspect(
 
 
 def _fit(row: np.ndarray, model: Model, name: str, settings: ExtentSettings) -> float:
-    """How well a window fits: the value of the extent head, less the cost of the error that head `name` predicts."""
+    """The value of the extent head, less the cost of the error that the head `name` predicts; 0 if `weight` is 0.
+
+    Parameters
+    ----------
+    row : float32 (d,), features of the window
+    name : "size" or "aspect"
+    """
+    if not settings.weight:  # a saved model may have the heads
+        return 0.0
     fit = settings.weight * float(row @ model.heads[EXTENT]) if EXTENT in model.heads else 0.0
     if name in model.heads and name in model.biases:
         fit -= extent.offset_cost(row, model.heads[name], model.biases[name])

@@ -49,7 +49,7 @@ _EXTENT_INTERVAL = 2  # frames from one set of rows of windows of wrong extents 
 _OBJECT_WEIGHT = 8.0  # of a frame's rows of the object together; any other row has weight 1
 _BACKGROUND = 12  # windows of the background around the object, of each frame
 _SIDE = 20  # cells around the object, at least, from which background is taken
-_MOST_CELLS = 4096  # that a search for hard negatives may have in one frame: they take some 4 ms
+_MOST_CELLS = 4096  # limit of a search for hard negatives in one frame: about 4 ms
 _HARD_OVERLAP = 0.2  # of a hard negative with the object's window, at most
 
 _SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations of affine copies: a factor, a share of the box, radians

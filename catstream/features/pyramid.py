@@ -15,8 +15,8 @@ from catstream.features.layout import CELL, MARGIN, WINDOW
 
 __all__ = ["Pyramid", "Region"]
 
-_MOST_CELLS = 62_500  # around a window: bounds the cost of a tiny object in a large frame
-_OVERLAP = WINDOW + 2 * MARGIN  # cells that two regions beside each other share, at least: a window, and its margin
+_MOST_CELLS = 62_500  # of the region around a tiny window, which bounds the cost of a large frame
+_OVERLAP = WINDOW + 2 * MARGIN  # cells that adjacent parts of a region share, at least: a window and its margin
 
 
 class Region(NamedTuple):
@@ -108,7 +108,7 @@ class Pyramid:
         return Region(0, 0, *self.size)
 
     def region_around(self, window: Window) -> Region:
-        """All of the frame, or as large a part around a tiny window as has 250 x 250 cells."""
+        """All of the frame, or, if that has more than 62,500 cells, a part around the window with so many."""
         width, height = self.size
         reach = math.sqrt(_MOST_CELLS / self.region.cells(window))
         if reach >= 1:
