@@ -98,7 +98,7 @@ def success(run: EvaluationRun) -> float:
 
 
 def spreads(found: dict[str, list[EvaluationRun]]) -> Table:
-    """Return how success and AUC of each sequence depend on the first box."""
+    """Return the mean and the range of success and AUC of each sequence over its first boxes."""
     rows: list[list[Cell]] = []
     for name, runs in found.items():
         cells: list[Cell] = [name, kind(runs)]

@@ -37,7 +37,8 @@ Found = Mapping[tuple[str, str], list[Row]]
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     sequences, check, seen = videos(options), check_names(options), read_attributes(options.attributes)
-    trackers, _ = available(options.trackers, options.peer_models)
+    trackers, missing = available(options.trackers, options.peer_models)
+    print(missing.lstrip(), file=sys.stderr)
     parts = {tracker: options.parts if tracker == "catstream" else options.peer_parts for tracker in trackers}
     chosen = starts_by_part(options)
     found: dict[tuple[str, str], list[Row]] = {}
@@ -123,7 +124,7 @@ def mean_and_error(values: Iterable[float | None]) -> tuple[float | None, float 
 
 
 def flips(rows: list[Row], part: str) -> int | None:
-    """Return on how many sequences the success depends on the jitter of the first box; None for the other parts."""
+    """Return the number of sequences that flip with the jitter of the first box; None for the other parts."""
     return sum(bool(row.flips) for row in rows) if part == "jitter" else None
 
 
@@ -141,7 +142,7 @@ def by_attribute(found: Found, attributes: Mapping[str, list[str]], check: set[s
         rows.append(cells)
     columns = [f"{tracker}{word}" for tracker in first for word in (" AUC", " ±", " success")]
     return Table(
-        "Attributes", ("attribute", "sequences", "check", *columns), rows, "check: how many are check sequences"
+        "Attributes", ("attribute", "sequences", "check", *columns), rows, "check: number of check sequences among them"
     )
 
 

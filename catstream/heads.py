@@ -1,7 +1,7 @@
 """The table of heads. A head is one coreset tree of the compressor, and what the trainer computes from its sample.
 
-The trees of all rows of a group have a ridge regression each. Object and background share one: least squares of the
-object's mean against the background's mean and covariance. Only the one-class classifier uses the object's rows.
+Each tree with all rows of a group has a ridge regression of its own. Object and background share one: least squares of
+the object's mean against the background's mean and covariance. Only the one-class classifier uses the object's rows.
 
 Compressor, trainer, checkpoint, codec, `catstream watch` and the page use this table: a new head is a new row.
 """

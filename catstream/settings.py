@@ -272,8 +272,8 @@ class TeachingSettings(_Group):
     mining_interval: Annotated[
         int,
         _about(
-            "Frames between two searches for hard negatives. Of a frame that is too large for its object to be "
-            "searched at once, a part is searched in each frame.",
+            "Frames between two searches for hard negatives. A large frame is searched in parts, one of them in each "
+            "frame.",
             ge=1,
         ),
     ] = 8

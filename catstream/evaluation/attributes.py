@@ -1,4 +1,4 @@
-"""Attributes of annotated sequences: what makes tracking in them difficult.
+"""Attributes of annotated sequences: properties that make tracking in them difficult.
 
 Five follow from the ground truth, as the benchmarks OTB and UAV123 define them:
 
@@ -8,8 +8,8 @@ Five follow from the ground truth, as the benchmarks OTB and UAV123 define them:
     low resolution   the area is less than 400 pixels
     out of view      the object is absent, or partly outside the frame
 
-A sequence has an attribute if one of its frames has. Attributes that only people can see, for example occlusion, come
-from a JSON file: {"sequence": ["occlusion", "blur"]}.
+A sequence has an attribute if one of its frames has. Attributes that only people can see, for example occlusion, are
+read from a JSON file: {"sequence": ["occlusion", "blur"]}.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ def _parameters(name: str, models: Path | None) -> Any:
 
 
 def _with_models(create: Callable[..., Any], name: str, parameters: Any) -> Any:
-    """Create a tracker with model files; what OpenCV prints about them is suppressed."""
+    """Create a tracker with model files, without the messages that OpenCV prints about them."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

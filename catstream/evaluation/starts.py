@@ -3,7 +3,7 @@
 one_pass  one-pass evaluation (OPE): one run from the first box of the ground truth
 temporal  temporal robustness (TRE): runs from several frames
 spatial   spatial robustness (SRE) of the CVPR2013 benchmark: 12 first boxes, shifted or scaled
-jittered  several first boxes that differ by at most 2 %: how much a result depends on chance
+jittered  several first boxes that differ by at most 2 %: dependence of a result on chance
 """
 
 from __future__ import annotations

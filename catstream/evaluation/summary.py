@@ -88,7 +88,7 @@ def flips_of(rows: Iterable[Row]) -> dict[str, list[str]]:
 
 
 def describe_flips(rows: Iterable[Row]) -> list[str]:
-    """Return a sentence for each tracker whose runs have different first boxes: how many sequences flip, and which."""
+    """Return the number and the names of the sequences that flip, a sentence for each tracker as in `flips_of`."""
     rows = list(rows)
     count = len({row.name for row in rows})
     return [

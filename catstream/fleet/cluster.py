@@ -72,7 +72,7 @@ _ALWAYS = {
     "RAY_gcs_rpc_server_reconnect_timeout_s": "3600",  # nodes and drivers wait for a head that restarts
     "RAY_raylet_start_wait_time_s": "60",
     "RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0",  # a node that is stopped ends at once
-    "RAY_worker_niceness": "0",  # the streams are what a node is for: 15, the default, starves them beside other work
+    "RAY_worker_niceness": "0",  # the default, 15, starves the streams of a node on which other work runs
     "RAY_prestart_worker_first_driver": "0",  # a process is started if an actor needs it
     "RAY_OBJECT_STORE_ALLOW_SLOW_STORAGE": "1",  # no warning about a small /dev/shm: frames are not stored in Ray
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",

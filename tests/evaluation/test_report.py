@@ -111,8 +111,7 @@ def test_the_command_counts_the_sequences_that_flip(tmp_path, walk):
     arguments = [str(walk), "--jitter", "2", "--tracker", "mil", "--output", str(tmp_path)]
     result = CliRunner().invoke(evaluate, arguments, catch_exceptions=False)
     assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", result.output)
-    sentence = "mil: 0 of 1 sequences flip with the first box"
-    assert sentence in result.output
+    (sentence,) = re.findall(r"mil: [01] of 1 sequences flip with the first box", result.output)  # MIL is random
     assert sentence in (tmp_path / "report.html").read_text()
 
 
