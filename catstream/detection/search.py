@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -43,7 +44,6 @@ _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in th
 _LIKELY_STEPS = 8  # larger or smaller than the size at which an object was first found, that are tried
 _LEAD_OVER_ALIKE = 0.25  # difference of score to another window whose likeness to the object is at least half as high
 _SAME_OVERLAP = 0.3  # above which two windows in successive frames show the same object
-
 
 #: A region of a frame that is searched, and the factor of the window's size in it.
 _Part = tuple[float, Region]
@@ -262,8 +262,9 @@ def _elsewhere(frame: Pyramid, window: Window, seq: int, interval: int, model: M
     -------
     None if no part is due
     """
-    around = _turns(window, frame.region_around)
-    everywhere = _turns(window, lambda _: frame.region)
+    sizes = [window.scaled(factor) for factor in _WHOLE_FACTORS]
+    around = _turns(window.w, window.h, tuple(map(frame.region_around, sizes)))
+    everywhere = _turns(window.w, window.h, (frame.region,) * len(sizes))
     if around == everywhere:
         turn = due(seq, interval, len(around))
         return None if turn is None else _best_of(frame, around[turn], window, model)
@@ -274,14 +275,22 @@ def _elsewhere(frame: Pyramid, window: Window, seq: int, interval: int, model: M
     return _best_of(frame, turns[turn // 2 % len(turns)], window, model)
 
 
-def _turns(window: Window, region: Callable[[Window], Region]) -> list[list[_Part]]:
-    """The parts of a region that are searched at three sizes, in groups of at most `_MOST_CELLS` cells."""
+@lru_cache(maxsize=8)  # a 4K frame has thousands of parts for a tiny window
+def _turns(width: float, height: float, regions: tuple[Region, ...]) -> list[list[_Part]]:
+    """The parts of regions that are searched, in groups of at most `_MOST_CELLS` cells.
+
+    Parameters
+    ----------
+    width, height : of the window in pixels
+    regions : the region that is searched at each of `_WHOLE_FACTORS`
+    """
     turns: list[list[_Part]] = []
     left = 0.0
-    for factor in _WHOLE_FACTORS:
-        sized = window.scaled(factor)
-        for part in region(sized).split(sized, _MOST_CELLS):
-            cells = part.cells(sized)
+    for factor, region in zip(_WHOLE_FACTORS, regions, strict=True):
+        sized = Window(0.0, 0.0, width, height).scaled(factor)
+        parts = region.split(sized, _MOST_CELLS)
+        cells = parts[0].cells(sized)  # as many as in each other part
+        for part in parts:
             if not turns or cells > left:
                 turns.append([])
                 left = _MOST_CELLS
