@@ -38,7 +38,8 @@ Found = Mapping[tuple[str, str], list[Row]]
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     sequences, check, seen = videos(options), check_names(options), read_attributes(options.attributes)
     trackers, missing = available(options.trackers, options.peer_models)
-    print(missing.lstrip(), file=sys.stderr)
+    if missing:
+        print(missing.strip(), file=sys.stderr)
     parts = {tracker: options.parts if tracker == "catstream" else options.peer_parts for tracker in trackers}
     chosen = starts_by_part(options)
     found: dict[tuple[str, str], list[Row]] = {}
