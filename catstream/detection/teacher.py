@@ -61,7 +61,9 @@ _SOLID, _GONE = 0.8, 1.15  # radii between which the object's ellipse fades; 1 t
 def first_training(
     frame: Pyramid, window: Window, rng: np.random.Generator, settings: Settings
 ) -> tuple[Model, Training]:
-    """The initial model and the rows of the first frame: as many as fill a leaf of each tree, unless SCM comes first.
+    """The initial model and the rows of the first frame, which fill a leaf of each tree.
+
+    If SCM follows the object first, group "appearance" has only the rows of an ordinary frame.
 
     Raises
     ------

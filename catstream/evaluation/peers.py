@@ -112,7 +112,7 @@ def _parameters(name: str, models: Path | None) -> Any:
     files = MODELS[name]
     if models is None:
         raise SettingsError(
-            f"the tracker {name!r} needs {' and '.join(files.values())}: give their folder with --peer-models"
+            f"the tracker {name!r} needs {' and '.join(files.values())}: give the folder with --peer-models"
         )
     missing = [file for file in files.values() if not (models / file).is_file()]
     if missing:
