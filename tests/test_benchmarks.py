@@ -12,11 +12,15 @@ import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 ALONE = BENCHMARKS / "kernels.py"
+SLOW = {BENCHMARKS / "fleet" / "faults.py"}  # minutes; tests/fleet/test_fleet.py kills a node, too
 SCRIPTS = sorted({path for path in BENCHMARKS.rglob("*.py") if "publish(figures" in path.read_text()} - {ALONE})
+CASES = [
+    pytest.param(path, id=str(path.relative_to(BENCHMARKS)), marks=[pytest.mark.slow] if path in SLOW else [])
+    for path in SCRIPTS
+]
 
 
-@pytest.mark.timeout(420)  # faults of a fleet take 80 s on a quiet machine, and several times that beside other tests
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: str(path.relative_to(BENCHMARKS)))
+@pytest.mark.parametrize("script", CASES)
 def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path, monkeypatch):
     figures = tmp_path / "figures.json"
     monkeypatch.chdir(tmp_path)
