@@ -14,7 +14,7 @@ from accuracy import MEANS, accuracy_command, changed, compared, described, diff
 from table import Table, publish
 
 from catstream.evaluation.runs import EvaluationRun
-from catstream.settings import PRESETS, Settings
+from catstream.settings import Settings
 
 COLUMNS = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error", "runs changed")
 _NEVER = -100.0  # lower than any score
@@ -61,9 +61,6 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     whole = runs["nothing left out"]
     note = f"{len(whole)} runs each; spread: standard deviation over {described(options)}, mean over the sequences"
     yield Table("Ablation", COLUMNS, beside(whole, runs), note)
-    if not options.quick and not options.only:  # last, because SCM takes longer than all variants above
-        paper = compared(options, found, {"the paper's tracker": Settings.from_values(PRESETS["one-class-paper"])})
-        yield Table("The paper's tracker", COLUMNS, beside(whole, paper), note)
 
 
 def beside(whole: list[EvaluationRun], runs: dict[str, list[EvaluationRun]]) -> list[tuple[str | float, ...]]:

@@ -28,7 +28,7 @@ CAMERAS = (1000, 3000, 10_000, 30_000, 100_000)
 YEAR = 365 * 86400.0
 _DAY = 86400.0
 _AT, _WATCHED = 61.3, 1800.0  # time of the faults of a scenario, and its end, in seconds
-_YOUNG_STATE = 1e6  # bytes, of a stream that has tracked for a minute
+_YOUNG_STATE = 20e6  # bytes, of a stream that has tracked for some hundred frames
 _MOST = 300_000  # cameras up to which limits are searched
 #: Seconds in which the streams of a machine (99 of 100) and of a rack (all of them) have to be back.
 MACHINE_BACK, RACK_BACK = 15.0, 60.0
