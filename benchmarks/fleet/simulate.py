@@ -234,7 +234,7 @@ def check(costs: Costs, found: Mapping[str, Any]) -> Table:
         down = [seconds for outcome in outcomes for seconds in outcome.down]
         real = measured.get(name, (name, None, None, None))
         rows.append((name, *map(float, np.percentile(down, (50, 99))), real[2], real[3]))
-    columns = ("fault", "p50 s, simulated", "p99 s", "p50 s, measured", "p99 s")
+    columns = ("fault", "p50 s, simulated", "p99 s, simulated", "p50 s, measured", "p99 s, measured")
     return Table("Three nodes and six streams on one machine", columns, rows)
 
 
