@@ -266,8 +266,8 @@ def _measured(found: Records) -> str:
 
 _REAL = """
     The same simulation, of the fleet in which `faults.py` kills and freezes nodes: three nodes and six streams on one
-    machine, with young states. It counts up to the first frame, and `faults.py` up to the second one. A dash means that
-    it was not measured."""
+    machine, with young states. It counts up to the first frame, and `faults.py` up to the second one. All nodes of
+    the measured fleet share two cores, which its films in lockstep use up. A dash means that it was not measured."""
 
 SECTIONS = (
     Section("How far one head goes", _far, (Shown("scale", select(7)),)),
