@@ -267,12 +267,13 @@ def _stored(trial: Trial, fault: str, before: FleetStatus, hit: dict[str, Stream
 
 
 def _check_untouched(trial: Trial, fault: str, before: FleetStatus) -> None:
-    """All streams must have gone on with the same processes."""
-    now = trial.status()
-    for name, each in before.streams.items() if now is not None else ():
-        if each.state == "running" and now.streams[name].token != each.token:
+    """All streams must have gone on with the same processes; a film in its last frame may only have ended."""
+    status = trial.status()
+    for name, each in before.streams.items() if status is not None else ():
+        now = status.streams[name]
+        if each.state == "running" and now.token != each.token:
             trial.wrong.append(f"{fault}: {name} was started again")
-        elif each.state == "running" and now.streams[name].frame <= each.frame:
+        elif each.state == "running" and now.state != "ended" and now.frame <= each.frame:
             trial.wrong.append(f"{fault}: {name} stood still")
 
 
