@@ -1,7 +1,7 @@
 """The motion of a centre: a Kalman filter of filterpy, with the matrices of constant velocity.
 
-The state is (x, y, vx, vy), in pixels and pixels a frame; x and y are measured. The detector filters
-with it, the trainer smooths with it.
+The state is (x, y, vx, vy), in pixels and pixels a frame; x and y are measured. The detector filters with it, and the
+trainer smooths with it.
 """
 
 from __future__ import annotations

@@ -92,7 +92,8 @@ def evaluate(
 
     The report and --json also have the means over the sequences with fast motion,
     scale variation, aspect change, low resolution, or an object out of view, as
-    the ground truth shows, and over those with an attribute of the file --attributes.
+    the ground truth shows, and over those with an attribute from the file
+    of --attributes.
 
     \b
     EXAMPLES

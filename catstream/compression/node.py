@@ -34,7 +34,7 @@ class Node:
     def leaf(cls, rows: np.ndarray) -> Node:
         """A node of level 0: the rows themselves."""
         wide = rows.astype(np.float64)
-        return cls(0, rows, len(rows), wide.sum(axis=0), float(np.vdot(wide, wide)))
+        return cls(0, rows, len(rows), wide.sum(axis=0), energy(wide))
 
     @property
     def dropped(self) -> float:

@@ -26,7 +26,7 @@ def energy(rows: np.ndarray) -> float:
     >>> energy(np.ones((2, 3), np.float32))
     6.0
     """
-    flat = rows.ravel().astype(np.float64)
+    flat = rows.ravel().astype(np.float64, copy=False)
     return float(flat @ flat)
 
 

@@ -226,7 +226,7 @@ def affine_copies(
 
 
 def _is_moved(number: int, share: float) -> bool:
-    """Whether a copy is put on another background: this share of the copies, but never the first one."""
+    """Whether copy `number` is put on another background: a `share` of all copies is, but never the first one."""
     return number > 0 and number * share % 1 < share
 
 

@@ -108,7 +108,7 @@ class Pyramid:
         return Region(0, 0, *self.size)
 
     def region_around(self, window: Window) -> Region:
-        """All of the frame, or, if that has more than 62,500 cells, a part around the window with so many."""
+        """All of the frame, or, if that has more than 62,500 cells, a part around the window with that many."""
         width, height = self.size
         reach = math.sqrt(_MOST_CELLS / self.region.cells(window))
         if reach >= 1:
