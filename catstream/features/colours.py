@@ -13,9 +13,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from catstream.arrays import Float32, UInt8, UInt16
+from catstream.arrays import Float32, Int64, UInt8, UInt16
 from catstream.features.compiled import kernel
-from catstream.features.layout import CHROMA, LIGHT, SIDE, WINDOW
+from catstream.features.layout import CHROMA, LIGHT, SHADES, SIDE, WINDOW
 
 __all__ = ["add_scores", "highest_score", "histogram", "shades"]
 
@@ -47,7 +47,7 @@ def shades(image: np.ndarray) -> np.ndarray:
 
 def histogram(found: np.ndarray, row: int, column: int, features: np.ndarray) -> None:
     """Features of the window whose first cell is (row, column), into float32 (SHADES,)."""
-    _histogram(found, row * SIDE + _EDGE, column * SIDE + _EDGE, _ROOTS, features)
+    _histogram(found, row * SIDE + _EDGE, column * SIDE + _EDGE, _ROOTS, np.empty(SHADES, np.int64), features)
 
 
 def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray, least: float = _LOWEST) -> None:
@@ -61,7 +61,7 @@ def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray, least
     least : windows with a lower score are left out, and their score stays as it is
     """
     # Weights that came over the wire cannot be written, and a kernel takes none of those.
-    _add_scores(found, np.require(weights, requirements="W"), _STEPS, least, scores)
+    _add_scores(found, np.require(weights, requirements="W"), _STEPS, least, np.empty(SHADES, np.int64), scores)
 
 
 def highest_score(weights: np.ndarray) -> float:
@@ -103,9 +103,8 @@ def _look_up(image: UInt8, table: UInt16, found: UInt16) -> None:
             found[y, x] = table[place]
 
 
-@kernel("void(uint16[:,::1], int64, int64, float32[::1], float32[::1])")
-def _histogram(found: UInt16, top: int, left: int, roots: Float32, features: Float32) -> None:
-    counts = np.empty(len(features), np.int64)
+@kernel("void(uint16[:,::1], int64, int64, float32[::1], int64[::1], float32[::1])")
+def _histogram(found: UInt16, top: int, left: int, roots: Float32, counts: Int64, features: Float32) -> None:
     for shade in range(len(counts)):
         counts[shade] = 0
     for y in range(top, top + _COUNTED):
@@ -115,9 +114,8 @@ def _histogram(found: UInt16, top: int, left: int, roots: Float32, features: Flo
         features[shade] = roots[counts[shade]]
 
 
-@kernel("void(uint16[:,::1], float32[::1], float32[::1], float32, float32[:,::1])")
-def _add_scores(found: UInt16, weights: Float32, steps: Float32, least: float, scores: Float32) -> None:
-    counts = np.empty(len(weights), np.int64)
+@kernel("void(uint16[:,::1], float32[::1], float32[::1], float32, int64[::1], float32[:,::1])")
+def _add_scores(found: UInt16, weights: Float32, steps: Float32, least: float, counts: Int64, scores: Float32) -> None:
     for row in range(scores.shape[0]):
         top, last, total = row * SIDE + _EDGE, -2, 0.0
         for column in range(scores.shape[1]):

@@ -58,8 +58,11 @@ def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
     cells = np.empty((max(rows - 2 * margin, 0), max(columns - 2 * margin, 0), CHANNELS), np.float32)
     if cells.size:
         blue, green, red = channels = [np.asarray(channel, np.uint8) for channel in cv2.split(image)]
-        _count(blue, green, red, _SHARES, histogram)
-        _normalise(histogram, margin, cells)
+        width = columns * CELL
+        lines, gradients = np.empty((3, 3, width + 2), np.float32), np.empty((3, width), np.float32)
+        orientation, turns = np.empty(width, np.uint8), np.empty((2, histogram.shape[1]), np.float32)
+        _count(blue, green, red, _SHARES, lines, gradients, orientation, turns, histogram)
+        _normalise(histogram, margin, np.empty((rows, columns), np.float32), cells)
         for i, channel in enumerate(channels):
             _average(channel, colour[:, :, i])
         # The mean colour, converted, costs a tenth of the converted colours' mean and differs by little.
@@ -68,7 +71,6 @@ def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
     return cells
 
 
-@kernel("void(uint8[::1], float32[::1])")
 def _read(row: UInt8, line: Float32) -> None:
     """One row of a channel, each pixel at the edge twice."""
     width = len(row)
@@ -77,7 +79,6 @@ def _read(row: UInt8, line: Float32) -> None:
     line[0], line[width + 1] = row[0], row[width - 1]
 
 
-@kernel("void(float32[:,::1], float32[:,::1], float32[:,::1], float32[::1], float32[::1], float32[::1])")
 def _gradients(
     above: Float32, here: Float32, below: Float32, across: Float32, down: Float32, magnitude: Float32
 ) -> None:
@@ -100,7 +101,6 @@ def _gradients(
         magnitude[x] = np.sqrt(most)
 
 
-@kernel("void(float32[::1], float32[::1], uint8[::1])")
 def _orientations(across: Float32, down: Float32, orientation: UInt8) -> None:
     """Which of 18 directions, 0 ... 17, each gradient points to."""
     for x in range(len(orientation)):
@@ -113,17 +113,31 @@ def _orientations(across: Float32, down: Float32, orientation: UInt8) -> None:
         orientation[x] = np.uint8(float32(0) if o == float32(_SIGNED) else o)
 
 
-@kernel("void(uint8[:,::1], uint8[:,::1], uint8[:,::1], float32[::1], float32[:,::1])")
-def _count(blue: UInt8, green: UInt8, red: UInt8, shares: Float32, histogram: Float32) -> None:
-    """Histograms of the cells, with one cell more on every side, which takes what falls outside."""
+@kernel(
+    "void(uint8[:,::1], uint8[:,::1], uint8[:,::1], float32[::1], "
+    "float32[:,:,::1], float32[:,::1], uint8[::1], float32[:,::1], float32[:,::1])"
+)
+def _count(
+    blue: UInt8,
+    green: UInt8,
+    red: UInt8,
+    shares: Float32,
+    lines: Float32,
+    gradients: Float32,
+    orientation: UInt8,
+    turns: Float32,
+    histogram: Float32,
+) -> None:
+    """Histograms of the cells, with one cell more on every side, which takes what falls outside.
+
+    Scratch: lines (3, 3, width + 2), the three channels of the rows above, here and below, in turns; gradients
+    (3, width), across, down and their magnitude; orientation (width,); turns (2, columns of the histogram).
+    """
     columns = histogram.shape[1] // _SIGNED - 2
     height, width = (histogram.shape[0] - 2) * CELL, columns * CELL
-    lines = np.empty((3, 3, width + 2), np.float32)  # three channels of the rows above, here and below, in turns
-    across, down = np.empty(width, np.float32), np.empty(width, np.float32)
-    magnitude = np.empty(width, np.float32)
-    orientation = np.empty(width, np.uint8)
+    across, down, magnitude = gradients[0], gradients[1], gradients[2]
     # Neighbours often have the same orientation, and adding to what was just added to is slow: they take turns.
-    even, odd = np.empty(histogram.shape[1], np.float32), np.empty(histogram.shape[1], np.float32)
+    even, odd = turns[0], turns[1]
     for y in range(-2, height):
         below, at = lines[(y + 1) % 3], min(max(y + 1, 0), height - 1)
         _read(blue[at, :width], below[0])
@@ -165,11 +179,13 @@ def _average(channel: UInt8, means: UInt8) -> None:
             means[row, column] = total // (CELL * CELL)
 
 
-@kernel("void(float32[:,::1], int64, float32[:,:,::1])")
-def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
-    """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in."""
+@kernel("void(float32[:,::1], int64, float32[:,::1], float32[:,:,::1])")
+def _normalise(histogram: Float32, margin: int, energy: Float32, cells: Float32) -> None:
+    """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in.
+
+    Scratch: energy (rows, columns).
+    """
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] // _SIGNED - 2
-    energy = np.empty((rows, columns), np.float32)
     for row in range(rows):
         for column in range(columns):
             bins = histogram[row + 1, (column + 1) * _SIGNED :]

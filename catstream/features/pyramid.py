@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from catstream.arrays import UInt8
+from catstream.arrays import Float32, UInt8, UInt32
 from catstream.box import Window
 from catstream.features.compiled import kernel
 from catstream.features.layout import CELL, MARGIN, WINDOW
@@ -165,7 +165,11 @@ class Pyramid:
             found = np.empty((size, size, *image.shape[2:]), np.uint8)
             corner = x - middle * across, y - middle * down
             channels = found.size // size**2
-            _sample(image.reshape(len(image), -1), channels, *corner, across, down, found.reshape(size, -1))
+            columns = size * channels
+            pixels, share = np.empty((2, columns), np.uint32), np.empty(columns, np.float32)
+            line = np.empty(image[0].size, np.float32)
+            sampled = found.reshape(size, -1)
+            _sample(image.reshape(len(image), -1), channels, *corner, across, down, pixels, share, line, sampled)
             return found
         cos, sin = np.cos(turn), np.sin(turn)
         matrix = np.array([[across * cos, -down * sin, x], [across * sin, down * cos, y]])
@@ -180,30 +184,45 @@ def _half(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
 
 
-@kernel("void(uint8[:,::1], int64, float64, float64, float64, float64, uint8[:,::1])")
-def _sample(image: UInt8, channels: int, left: float, top: float, across: float, down: float, found: UInt8) -> None:
-    """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row."""
+@kernel(
+    "void(uint8[:,::1], int64, float64, float64, float64, float64, "
+    "uint32[:,::1], float32[::1], float32[::1], uint8[:,::1])"
+)
+def _sample(
+    image: UInt8,
+    channels: int,
+    left: float,
+    top: float,
+    across: float,
+    down: float,
+    pixels: UInt32,
+    share: Float32,
+    line: Float32,
+    found: UInt8,
+) -> None:
+    """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row.
+
+    Scratch, of each number of a row found: pixels (2, columns), where in the line the two pixels are that it lies
+    between; share (columns,) of the second one; line (columns of the image,).
+    """
     rows, columns = found.shape
     height, width = image.shape[0], image.shape[1] // channels
     begin = min(max(int(np.floor(left)), 0), width - 1)
     end = min(max(int(np.floor(left + (columns // channels - 1) * across)) + 2, begin + 1), width)
-    # Of each number of a row: where in the line the two pixels are that it lies between, and the second one's share.
-    first, second = np.empty(columns, np.uint32), np.empty(columns, np.uint32)
-    share = np.empty(columns, np.float32)
+    first, second = pixels[0], pixels[1]
     for i in range(columns):
         x, channel = left + i // channels * across, i % channels
         pixel = int(np.floor(x))
         first[i] = (min(max(pixel, begin), end - 1) - begin) * channels + channel
         second[i] = (min(max(pixel + 1, begin), end - 1) - begin) * channels + channel
         share[i] = x - np.floor(x)
-    line = np.empty((end - begin) * channels, np.float32)
     for row in range(rows):
         y = top + row * down
         pixel = int(np.floor(y))
         above = image[min(max(pixel, 0), height - 1), begin * channels : end * channels]
         below = image[min(max(pixel + 1, 0), height - 1), begin * channels : end * channels]
         part = np.float32(y - np.floor(y))
-        for i in range(len(line)):
+        for i in range((end - begin) * channels):
             value = np.float32(above[i])
             line[i] = value + part * (np.float32(below[i]) - value) + np.float32(0.5)  # half, to round
         for i in range(columns):

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from catstream.arrays import Float32, Float64
+from catstream.arrays import Float32, Float64, Int64
 from catstream.box import Box
 from catstream.features.compiled import kernel
 from catstream.features.pyramid import Pyramid
@@ -275,23 +275,25 @@ def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
     """
     wide = atoms.astype(np.float64)
     codes = np.zeros((len(rows), len(atoms)), np.float32)
-    _solve(rows @ wide.T - _PENALTY, wide @ wide.T, codes)
+    count = len(atoms)
+    _solve(rows @ wide.T - _PENALTY, wide @ wide.T, np.zeros((count + 4, count)), np.zeros(count, np.int64), codes)
     return codes
 
 
-@kernel("void(float64[:,::1], float64[:,::1], float32[:,::1])")
-def _solve(gains: Float64, gram: Float64, codes: Float32) -> None:
+@kernel("void(float64[:,::1], float64[:,::1], float64[:,::1], int64[::1], float32[:,::1])")
+def _solve(gains: Float64, gram: Float64, scratch: Float64, active: Int64, codes: Float32) -> None:
     """Active sets (Lawson and Hanson): the atom that gains most comes in, those that turn negative go.
 
     `gains` are those at code 0. The set's Gram matrix is kept as a Cholesky factor whose diagonal is inverted, with the
     solution of its forward substitution: an atom that comes in adds one row to both.
+    Scratch: scratch (atoms + 4, atoms), active (atoms,).
     """
     count = len(gram)
-    code, wanted, forward, factor = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros((count, count))
-    active, gain = np.zeros(count, np.int64), np.zeros(count)
+    code, wanted, forward, gain, factor = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4:]
     for row in range(len(codes)):
         start, size = gains[row], 0
-        gain[:] = start
+        for atom in range(count):
+            gain[atom] = start[atom]
         for _ in range(3 * count):
             most, best = gain[0], 0
             for atom in range(1, count):
@@ -316,7 +318,8 @@ def _solve(gains: Float64, gram: Float64, codes: Float32) -> None:
                         ahead -= factor[i, k] * forward[k]
                     factor[i, i] = 1 / np.sqrt(max(total, 1e-9))
                     forward[i] = ahead * factor[i, i]
-                wanted[:size] = forward[:size]
+                for i in range(size):
+                    wanted[i] = forward[i]
                 for i in range(size - 1, -1, -1):
                     wanted[i] *= factor[i, i]
                     for k in range(i):
@@ -336,7 +339,8 @@ def _solve(gains: Float64, gram: Float64, codes: Float32) -> None:
                 for i in range(out, size):
                     active[i], code[i] = active[i + 1], code[i + 1]
                 valid = out
-            gain[:] = start
+            for atom in range(count):
+                gain[atom] = start[atom]
             for i in range(size):
                 weight, alike = code[i], gram[active[i]]
                 for atom in range(count):
