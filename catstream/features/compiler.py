@@ -1,12 +1,14 @@
-"""The compiler of kernels: numba's, and an entry by which ctypes calls the machine code with NumPy arrays.
+"""The compiler of kernels: numba's, and an entry by which Python calls the machine code with arrays and numbers.
 
-The entry reads the arrays itself, from the C structure that NumPy's C-API makes public, as `numpy.ndarray.ctypes` and
-its like take longer than many a kernel.
+The entry does what a function of a C extension does: it checks the arguments, reads numbers by Python's C-API and
+arrays by the C structure that NumPy's C-API makes public, and releases the interpreter lock while the kernel runs.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FunctionType
 
 import llvmlite.binding as llvm
@@ -14,7 +16,7 @@ import numba
 import numpy as np
 from llvmlite import ir
 
-from catstream.features.compiled import ARRAY_TYPE, ENTRY, Parameter, globals_of, parameters, target_machine
+from catstream.features.compiled import ENTRY, FUNCTIONS, Parameter, globals_of, parameters, target_machine
 
 __all__ = ["machine_code"]
 
@@ -29,8 +31,10 @@ _CHARACTERS = _HEADER + 1  # word of a PyArray_Descr: its kind, type and byteord
 _CONTIGUOUS, _ALIGNED, _WRITABLE = 0x1, 0x100, 0x400  # bits of the flags
 
 
-def machine_code(function: FunctionType, signature: str) -> bytes:
-    """An object file with the function `ENTRY` (parameters ...): 0, or 1 if an array is of another type.
+def machine_code(name: str, function: FunctionType, signature: str) -> bytes:
+    """An object file with the function `ENTRY`, which Python calls as one of a C extension (METH_FASTCALL).
+
+    name : of the kernel, for its errors
 
     Raises
     ------
@@ -39,16 +43,17 @@ def machine_code(function: FunctionType, signature: str) -> bytes:
     """
     compiled = _export(signature)(_translated(function))
     module = llvm.parse_assembly(compiled.inspect_llvm())
-    entry = llvm.parse_assembly(str(_entry(compiled.native_name, parameters(signature))))
+    error = f"{name} takes writable arrays of these types: {signature}"
+    entry = llvm.parse_assembly(str(_entry(compiled.native_name, parameters(signature), error)))
     taken, given = (str(each.get_function(compiled.native_name).global_value_type) for each in (module, entry))
     if taken != given:
         raise TypeError(f"this version of numba has another structure of arrays: {taken} in place of {given}")
     module.link_in(entry)
     machine = target_machine()
     _remove_unused(module, machine)
-    foreign = [each.name for each in module.functions if each.is_declaration and not each.name.startswith("llvm.")]
-    if foreign:
-        raise TypeError(f"{function.__qualname__} may allocate or raise: it calls {', '.join(foreign)}")
+    declared = {each.name for each in module.functions if each.is_declaration and not each.name.startswith("llvm.")}
+    if declared - set(FUNCTIONS):
+        raise TypeError(f"{name} may allocate or raise: it calls {', '.join(declared - set(FUNCTIONS))}")
     code: bytes = machine.emit_object(module)
     return code
 
@@ -75,62 +80,104 @@ def _remove_unused(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> None:
     passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
 
 
-def _entry(callee: str, types: list[Parameter]) -> ir.Module:
+def _entry(callee: str, types: list[Parameter], error: str) -> ir.Module:
     """A module with the entry, which calls the function `callee` with numba's structures in place of the arrays."""
     module = ir.Module()
-    ndarray = ir.GlobalVariable(module, ir.IntType(8), ARRAY_TYPE)
     taken = [_structure_type(each.dimensions) if each.dimensions else _NUMBERS[each.dtype] for each in types]
     kernel = ir.Function(module, ir.FunctionType(_POINTER, taken), callee)
-    given = [_POINTER if each.dimensions else _NUMBERS[each.dtype] for each in types]
-    entry = ir.Function(module, ir.FunctionType(_INT, given), ENTRY)
-    builder = ir.IRBuilder(entry.append_basic_block())
-    parameters = list(zip(entry.args, types, strict=True))
-    for value, each in parameters:
+    entry = ir.Function(module, ir.FunctionType(_POINTER, [_POINTER, _POINTER, _WORD]), ENTRY)
+    builder = _Builder(entry.append_basic_block())
+    _, arguments, count = entry.args
+    with builder.unless(count, _WORD(len(types))):
+        builder.refuse(error)
+    values = []
+    for place, each in enumerate(types):
+        value = builder.word(arguments, place, _POINTER)
         if each.dimensions:
-            _check(builder, value, ndarray, each)
-    builder.call(kernel, [_structure(builder, value, each) if each.dimensions else value for value, each in parameters])
-    builder.ret(_INT(0))
+            builder.check(value, each, error)
+            values.append(builder.structure(value, each))
+        else:
+            values.append(builder.number(value, each))
+    thread = builder.foreign("PyEval_SaveThread", _POINTER)
+    builder.call(kernel, values)
+    builder.foreign("PyEval_RestoreThread", ir.VoidType(), thread)
+    builder.ret(builder.foreign("Py_NewRef", _POINTER, builder.object("None")))
     return module
+
+
+class _Builder(ir.IRBuilder):  # type: ignore[misc]  # llvmlite has no types
+    """Writes the instructions of an entry."""
+
+    def foreign(self, name: str, result: ir.Type, *arguments: ir.Value) -> ir.Value:
+        """Call a function of Python's C-API."""
+        function = self.module.globals.get(name)
+        if function is None:
+            function = ir.Function(self.module, ir.FunctionType(result, [each.type for each in arguments]), name)
+        return self.call(function, arguments)
+
+    def object(self, name: str) -> ir.Value:
+        """Address of an object of Python."""
+        return self.module.globals.get(name) or ir.GlobalVariable(self.module, ir.IntType(8), name)
+
+    def word(self, address: ir.Value, place: int, kind: ir.Type = _WORD) -> ir.Value:
+        return self.load(self.gep(address, [_WORD(place)], source_etype=_WORD), typ=kind)
+
+    @contextmanager
+    def unless(self, value: ir.Value, expected: ir.Value) -> Iterator[None]:
+        """A block for a value that differs from the expected one."""
+        with self.if_then(self.icmp_unsigned("!=", value, expected), likely=False):
+            yield
+
+    def refuse(self, error: str) -> None:
+        """Raise a TypeError."""
+        text = ir.Constant(ir.ArrayType(ir.IntType(8), len(error) + 1), bytearray(f"{error}\0".encode()))
+        variable = ir.GlobalVariable(self.module, text.type, self.module.get_unique_name("error"))
+        variable.initializer, variable.global_constant = text, True
+        self.foreign("PyErr_SetString", ir.VoidType(), self.object("TypeError"), variable)
+        self.ret(_POINTER(None))
+
+    def number(self, value: ir.Value, parameter: Parameter) -> ir.Value:
+        """A Python number as one of C."""
+        if parameter.dtype == "int64":
+            number = self.foreign("PyLong_AsLongLong", _WORD, value)
+        else:
+            number = self.foreign("PyFloat_AsDouble", ir.DoubleType(), value)
+        with self.unless(self.foreign("PyErr_Occurred", _POINTER), _POINTER(None)):
+            self.ret(_POINTER(None))
+        return self.fptrunc(number, ir.FloatType()) if parameter.dtype == "float32" else number
+
+    def check(self, array: ir.Value, parameter: Parameter, error: str) -> None:
+        """Refuse an object that is no array, or one of another type."""
+        dtype = np.dtype(parameter.dtype)
+        characters = int.from_bytes(f"{dtype.kind}{dtype.char}{dtype.byteorder}".encode(), "little")
+        flags = _ALIGNED | _WRITABLE | _CONTIGUOUS * parameter.contiguous
+        with self.unless(self.word(array, _TYPE, _POINTER), self.object("ndarray")):
+            self.refuse(error)
+        with self.unless(self.word(array, _DIMENSIONS, _INT), _INT(parameter.dimensions)):
+            self.refuse(error)
+        with self.unless(self.and_(self.word(array, _FLAGS, _INT), _INT(flags)), _INT(flags)):
+            self.refuse(error)
+        found = self.word(self.word(array, _DESCR, _POINTER), _CHARACTERS, _INT)
+        with self.unless(self.and_(found, _INT(0xFFFFFF)), _INT(characters)):
+            self.refuse(error)
+
+    def structure(self, array: ir.Value, parameter: Parameter) -> ir.Value:
+        """An array as numba's structure, which owns nothing."""
+        size = _WORD(1)
+        shape = strides = ir.Constant(ir.ArrayType(_WORD, parameter.dimensions), None)
+        for axis in range(parameter.dimensions):
+            length = self.word(self.word(array, _SHAPE, _POINTER), axis)
+            stride = self.word(self.word(array, _STRIDES, _POINTER), axis)
+            size = self.mul(size, length)
+            shape, strides = self.insert_value(shape, length, axis), self.insert_value(strides, stride, axis)
+        item = _WORD(np.dtype(parameter.dtype).itemsize)
+        structure = ir.Constant(_structure_type(parameter.dimensions), None)
+        for place, value in enumerate((size, item, self.word(array, _DATA, _POINTER), shape, strides), start=2):
+            structure = self.insert_value(structure, value, place)
+        return structure
 
 
 def _structure_type(dimensions: int) -> ir.LiteralStructType:
     """numba's structure of an array: two owners, number and size of its elements, address, shape, strides."""
     lengths = ir.ArrayType(_WORD, dimensions)
     return ir.LiteralStructType([_POINTER, _POINTER, _WORD, _WORD, _POINTER, lengths, lengths])
-
-
-def _check(builder: ir.IRBuilder, array: ir.Value, ndarray: ir.Value, parameter: Parameter) -> None:
-    """Return 1 from the entry if an object is no array, or one of another type."""
-    dtype = np.dtype(parameter.dtype)
-    characters = int.from_bytes(f"{dtype.kind}{dtype.char}{dtype.byteorder}".encode(), "little")
-    flags = _ALIGNED | _WRITABLE | _CONTIGUOUS * parameter.contiguous
-
-    def require(value: ir.Value, expected: ir.Value) -> None:
-        with builder.if_then(builder.icmp_unsigned("!=", value, expected), likely=False):
-            builder.ret(_INT(1))
-
-    require(_word(builder, array, _TYPE, _POINTER), ndarray)
-    require(_word(builder, array, _DIMENSIONS, _INT), _INT(parameter.dimensions))
-    require(builder.and_(_word(builder, array, _FLAGS, _INT), _INT(flags)), _INT(flags))
-    descr = _word(builder, array, _DESCR, _POINTER)
-    require(builder.and_(_word(builder, descr, _CHARACTERS, _INT), _INT(0xFFFFFF)), _INT(characters))
-
-
-def _structure(builder: ir.IRBuilder, array: ir.Value, parameter: Parameter) -> ir.Value:
-    """An array as numba's structure, which owns nothing."""
-    size = _WORD(1)
-    shape = strides = ir.Constant(ir.ArrayType(_WORD, parameter.dimensions), None)
-    for axis in range(parameter.dimensions):
-        length = _word(builder, _word(builder, array, _SHAPE, _POINTER), axis)
-        stride = _word(builder, _word(builder, array, _STRIDES, _POINTER), axis)
-        size = builder.mul(size, length)
-        shape, strides = builder.insert_value(shape, length, axis), builder.insert_value(strides, stride, axis)
-    item = _WORD(np.dtype(parameter.dtype).itemsize)
-    structure = ir.Constant(_structure_type(parameter.dimensions), None)
-    for place, value in enumerate((size, item, _word(builder, array, _DATA, _POINTER), shape, strides), start=2):
-        structure = builder.insert_value(structure, value, place)
-    return structure
-
-
-def _word(builder: ir.IRBuilder, address: ir.Value, place: int, kind: ir.Type = _WORD) -> ir.Value:
-    return builder.load(builder.gep(address, [_WORD(place)], source_etype=_WORD), typ=kind)
