@@ -1,9 +1,10 @@
 """Questions and their answers (`control`, `registry`): each is taken once, though its answer may get lost.
 
 One process binds a ROUTER socket (`Responder`); any number of clients connect DEALER sockets (`Requester`). A client
-sends a question again until an answer with its `id` arrives. The responder remembers its last 64 answers, and repeats
-the answer to a question that it has answered already. At most 64 questions wait; any further one is dropped and sent
-again by its client. A command is a question that asks for an action.
+sends a question again until an answer with its `id` arrives: as soon as it is connected again if the connection broke,
+otherwise after a time that suits the size of the question. The responder remembers its last 64 answers, and repeats the
+answer to a question that it has answered already. At most 64 questions wait; any further one is dropped and sent again
+by its client. A command is a question that asks for an action.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ _MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and th
 _LONGEST_QUESTION = 1 << 20  # bytes
 _MOST_QUEUED = 256 << 20  # bytes of questions that a socket queues for each client
 _REPEAT_SECONDS = 0.2
+_TURN_SECONDS = 0.05  # from one look at the connection to the next
 _BYTES_PER_SECOND = 1e6  # of a slow network: a large question is repeated later
 
 
@@ -48,18 +50,22 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
     def __init__(self, channel: Channel[Question | Answer], endpoint: Endpoint) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=_MAX_QUESTIONS)
         self._answer_kind = cast(type[Answer], channel.messages[1])
+        self._in_transit = False  # whether a question was sent, and the connection did not break since
         self._socket.set(zmq.LINGER, 0)  # a question that nobody received is given up
-        self._socket.set(zmq.IMMEDIATE, 1)
+        self._socket.set(zmq.IMMEDIATE, 1)  # nothing is queued before the responder is connected
         self._connect()
 
     def ask(self, question: Question, seconds: float) -> Answer | None:
         """Send a question until it is answered; None if no answer arrived in time."""
-        data, deadline = encode(question), monotonic() + seconds
-        pause = _REPEAT_SECONDS + len(data) / _BYTES_PER_SECOND
-        while (left := deadline - monotonic()) > 0:
-            self._send(data)
-            if (answer := self.receive(question.id, min(left, pause))) is not None:
+        data, now = encode(question), monotonic()
+        deadline, repeat_at = now + seconds, now
+        while now < deadline:
+            if now >= repeat_at or not self._in_transit:
+                self._send(data)
+                repeat_at = now + _REPEAT_SECONDS + len(data) / _BYTES_PER_SECOND
+            if (answer := self.receive(question.id, min(deadline - now, _TURN_SECONDS))) is not None:
                 return answer
+            now = monotonic()
         return None
 
     def send(self, question: Question) -> None:
@@ -76,8 +82,15 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         return None
 
     def _send(self, data: bytes) -> None:
+        self._read_events()  # those from before do not concern this question
+        self._in_transit = False
         with contextlib.suppress(zmq.Again):  # nobody is connected yet
             self._socket.send(data, zmq.NOBLOCK)
+            self._in_transit = True
+
+    def _disconnected(self) -> None:
+        super()._disconnected()
+        self._in_transit = False
 
 
 class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from threading import Event
 
@@ -13,6 +13,7 @@ from catstream.box import Box
 from catstream.errors import CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages import Answer, Command
 from catstream.steering import Control
+from catstream.wire import commands
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.codec import decode, encode
 from catstream.wire.commands import Requester, Responder
@@ -65,6 +66,33 @@ def test_a_command_sent_before_the_pipeline_runs_is_answered_as_soon_as_it_does(
         answer = pool.submit(requester.ask, PAUSE, 20)
         with answering(endpoint, done) as (_, heard):
             assert answer.result(20) == done(PAUSE)
+    assert heard == [PAUSE]
+
+
+@pytest.fixture
+def slow_network(monkeypatch):
+    """Lets so much time pass before a question is repeated on the same connection that no test sees it."""
+    monkeypatch.setattr(commands, "_BYTES_PER_SECOND", 1e-6)
+
+
+@pytest.mark.usefixtures("slow_network")
+def test_a_question_that_nobody_was_connected_for_is_sent_as_soon_as_somebody_is(endpoint):
+    with ThreadPoolExecutor(1) as pool, Requester(CONTROL, endpoint) as requester:
+        answer = pool.submit(requester.ask, PAUSE, 60)
+        assert not wait([answer], 0.2).done
+        with answering(endpoint, done) as (_, heard):
+            assert answer.result(60) == done(PAUSE)
+    assert heard == [PAUSE]
+
+
+@pytest.mark.usefixtures("slow_network")
+def test_a_question_whose_connection_broke_is_sent_again_as_soon_as_there_is_another(endpoint, until):
+    with ThreadPoolExecutor(1) as pool, Requester(CONTROL, endpoint) as requester:
+        with Responder(CONTROL, endpoint) as dies:
+            answer = pool.submit(requester.ask, PAUSE, 60)
+            assert until(lambda: dies.receive_all(0.1)) == [PAUSE]
+        with answering(endpoint, done) as (_, heard):
+            assert answer.result(60) == done(PAUSE)
     assert heard == [PAUSE]
 
 
