@@ -467,7 +467,8 @@ class End:
     seq     number of the last message before it, plus one
     reason  description of why the stream ended
     failed  whether it ended because of an error
-    totals  final counters, by name: features messages `sent` and `stored`
+    totals  final counters, by name: features messages `sent` and `stored`, frames that were `damaged` or `skipped`, and
+            how often a live source was `reopened`
     """
 
     seq: int

@@ -365,7 +365,11 @@ class Pipeline:
 
     @property
     def totals(self) -> dict[str, int]:
-        """At the end: the number of features messages that were `sent`, and `stored` in the coreset trees."""
+        """At the end: the number of features messages that were `sent`, and `stored` in the coreset trees.
+
+        If frames of a file were left out, how many were `damaged`; of a live source, how many frames were `skipped`,
+        and how often it was `reopened`.
+        """
         return {name: int(value) for name, value in self._end.totals.items()} if self._end else {}
 
     @property

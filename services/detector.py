@@ -306,7 +306,9 @@ class DetectorLoop:
         self._control.end(reason)
         features, results, seq = self._outputs.features, self._outputs.results, self.detectors.seq
         self._deliver(features, End(seq + 1, reason, failed), _COMPRESSOR_SECONDS, stored=True)
-        end = End(seq + 1, reason, failed, {"sent": float(seq), "stored": float(min(features.stored, seq))})
+        totals = {"sent": float(seq), "stored": float(min(features.stored, seq))} | self._source_counters()
+        totals.pop("lost_seconds", None)  # this one is of the moment
+        end = End(seq + 1, reason, failed, totals)
         if results is not None:
             self._deliver(results, end, _OWNER_SECONDS, stored=True)
         self._control.clear_stop()
@@ -342,9 +344,6 @@ class DetectorLoop:
 
     def _counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
-        counters = self._source.counters if self._source is not None else {}
-        if "skipped" in counters:
-            counters["skipped"] += self._skipped
         features = self._outputs.features
         own = {
             "sent": features.sent,
@@ -353,7 +352,14 @@ class DetectorLoop:
             "model_version": max((each.model_version for each in self._tracks.tracks.values()), default=0),
             "objects": len(self._commands.desired.objects),
         }
-        return own | self._commands.counters | counters
+        return own | self._commands.counters | self._source_counters()
+
+    def _source_counters(self) -> dict[str, float]:
+        """The counters of the source; frames that were skipped while the run was paused count, too."""
+        counters = self._source.counters if self._source is not None else {}
+        if "skipped" in counters:
+            counters["skipped"] += self._skipped
+        return counters
 
     def _object_counters(self) -> dict[str, dict[str, float]]:
         """The counters of each object, by name, for the health of the process."""

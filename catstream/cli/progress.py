@@ -127,7 +127,8 @@ class RunProgress:
             yield f"  {number} {name or '(no name)'}: {frames}"
 
     def _detector(self, counter: str) -> float:
-        return self._pipeline.health.get("detector", {}).get(counter, 0)
+        """A counter of the detector: the final one, or before the end that of its last report."""
+        return (self._pipeline.health.get("detector", {}) | self._pipeline.totals).get(counter, 0)
 
     def _rate(self, now: float) -> float:
         return (self.frames - 1) / max(now - self._started - self._first, 1e-9)

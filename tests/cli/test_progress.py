@@ -17,7 +17,8 @@ from catstream.messages import Track
 @pytest.mark.parametrize("width", [40, 60, 80, 200])
 def test_the_line_fits_and_begins_with_the_state_and_the_frames(width, live):
     health = {"detector": {"skipped": 1234.0}, "compressor": {"leaves": 456.0}}
-    pipeline = SimpleNamespace(live=live, frames=None if live else 30000, health=health, lost_seconds=0, holding="")
+    seen = {"health": health, "lost_seconds": 0, "holding": "", "totals": {}}
+    pipeline = SimpleNamespace(live=live, frames=None if live else 30000, **seen)
     written = StringIO()
     console = Console(file=written, width=width, force_terminal=True, color_system=None, soft_wrap=True)
     run = RunProgress(pipeline)

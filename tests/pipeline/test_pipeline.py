@@ -55,11 +55,11 @@ def test_the_object_is_followed_with_ever_newer_models(run, video):
     assert versions[-1] > 2
 
 
-def test_all_processes_tell_how_they_are(run):
-    _, pipeline, _ = run
-    assert set(pipeline.health) == set(NAMES)
-    assert pipeline.health["compressor"]["leaves"] > 0
-    assert pipeline.health["detector"]["sent"] > 0
+def test_all_processes_tell_how_they_are(endless, video):
+    counted = {"detector": "sent", "compressor": "leaves", "trainer": "trained"}
+    with Pipeline(endless, video[1][0], SETTINGS) as pipeline:
+        reports = (pipeline.health for _ in pipeline)
+        assert any(all(told.get(name, {}).get(counted[name]) for name in NAMES) for told in reports)
 
 
 def test_a_health_report_after_the_last_track_counts_too(video, until):
