@@ -81,9 +81,13 @@ class _Libraries:
             self._original.clear()
 
     def _find(self) -> None:
-        """Search for libraries if a module was imported since the last search; takes a few milliseconds."""
+        """Search for libraries if a module was imported since the last search; takes a few milliseconds.
+
+        Those that catstream computes with are loaded first: one that is loaded after the search would have all threads.
+        """
         if len(sys.modules) == self._modules:
             return
+        import scipy.linalg  # noqa: F401  brings a BLAS beside that of numpy
         from threadpoolctl import ThreadpoolController
 
         self._modules = len(sys.modules)

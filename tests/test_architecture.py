@@ -37,7 +37,10 @@ LEVELS = [
 #: The files or folders that may import a foreign library.
 IMPORTERS = {
     "numpy": ["catstream", "services"],
-    "scipy": ["catstream/ridge.py", "catstream/compression/reduce.py", "catstream/evaluation/multiple.py"],
+    "scipy": [
+        *("catstream/ridge.py", "catstream/compression/reduce.py", "catstream/evaluation/multiple.py"),
+        "catstream/threads.py",  # its BLAS is limited, too
+    ],
     "cv2": [
         "catstream/features",
         "catstream/detection",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
@@ -10,7 +13,7 @@ import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from catstream.threads import _Libraries, one_thread
+from catstream.threads import _VARIABLES, _Libraries, one_thread
 
 
 def counts():
@@ -27,6 +30,23 @@ def libraries(monkeypatch):
         if set(counts().values()) != {2}:
             pytest.skip("this machine has one core, or BLAS without threads")
         yield own
+
+
+FIRST_USE = """
+from threadpoolctl import threadpool_info
+from catstream.threads import one_thread
+with one_thread():
+    import numpy, scipy.linalg
+    print({library["num_threads"] for library in threadpool_info()})
+"""
+
+
+def test_a_library_that_is_imported_inside_is_on_one_thread_too():
+    environment = os.environ | dict.fromkeys(_VARIABLES, "2")
+    said = subprocess.run(
+        [sys.executable, "-c", FIRST_USE], env=environment, capture_output=True, text=True, check=True
+    )
+    assert said.stdout == "{1}\n"
 
 
 @pytest.mark.usefixtures("libraries")
