@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 TOOLS := $(VENV)/.tools
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo test test-slow lint format docs pythons picture settings protocol bench results lock clean fuzz audit
+.PHONY: help setup develop demo test test-system test-slow lint format docs pythons picture settings protocol bench results lock clean fuzz audit
 
 help:  ## list all commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -37,8 +37,11 @@ $(TOOLS): $(READY) requirements-dev.lock
 demo: $(READY)  ## render a video, track the object in it, print the accuracy
 	@$(BIN)/catstream demo
 
-test: $(TOOLS)  ## all tests except the slow ones, with doctests
+test: $(TOOLS)  ## all tests but those of test-system and test-slow, with doctests
 	@$(BIN)/pytest -n auto --dist worksteal
+
+test-system: $(TOOLS)  ## those with Ray, a browser, Node.js, an RTSP server, several hosts, or a whole benchmark
+	@$(BIN)/pytest -n 2 --dist worksteal -m 'system and not slow'
 
 test-slow: $(TOOLS)  ## the slow ones: long real sequences, soaks
 	@$(BIN)/pytest -m slow --timeout 3600 -o faulthandler_timeout=0

@@ -20,6 +20,7 @@ CASES = [
 ]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("script", CASES)
 def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path, monkeypatch):
     figures = tmp_path / "figures.json"
@@ -30,6 +31,7 @@ def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path, monkeypatc
     assert_finite(figures)
 
 
+@pytest.mark.system
 def test_a_benchmark_runs_as_a_process_of_its_own(tmp_path):
     figures = tmp_path / "figures.json"
     command = [sys.executable, ALONE, "--quick", "--json", figures]

@@ -248,7 +248,7 @@ def test_every_test_that_a_page_names_exists():
 
 
 def test_no_test_of_a_guarantee_is_slow():
-    """`make test` checks every guarantee."""
+    """`make test` and `make test-system` check every guarantee."""
     promised = set(re.findall(r"`(test_\w+)`", page("docs/guarantees.md")))
     trees = (ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.glob("tests/**/test_*.py"))
     functions = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))

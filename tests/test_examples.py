@@ -22,6 +22,8 @@ from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.wire.keys import create
 
+pytestmark = pytest.mark.system
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MODULES = [EXAMPLES / "node_modules" / name for name in ("zeromq", "@msgpack/msgpack")]
 

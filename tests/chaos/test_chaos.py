@@ -12,6 +12,8 @@ from catstream.box import Box
 from catstream.evaluation.metrics import score
 from catstream.settings import Settings
 
+pytestmark = pytest.mark.system
+
 
 @pytest.mark.parametrize(
     "faults",

@@ -17,6 +17,8 @@ from catstream.services.supervisor import NAMES
 from catstream.settings import Settings
 from catstream.wire.keys import allow, create
 
+pytestmark = pytest.mark.system
+
 CUT_SECONDS = 2.0
 
 

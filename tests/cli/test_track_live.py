@@ -100,6 +100,7 @@ def found(row, story):
     return bool(box) and max(box.overlap(truth) for _, truth in story) > 0.6
 
 
+@pytest.mark.system
 def test_tracking_resumes_with_the_learned_model_after_a_server_freezes_and_dies(rtsp, following, story):
     server, port = rtsp()
     with following(f"rtsp://127.0.0.1:{port}/one") as run:

@@ -219,6 +219,7 @@ def test_a_head_that_does_not_run_is_said_to_be_unreachable(token):
         cluster.probe(address, token)
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fleet")
 def test_the_nodes_of_a_fleet_have_their_names_cores_and_versions():
     found = {facts.name: facts for facts in cluster.nodes() if facts.alive}
@@ -227,6 +228,7 @@ def test_the_nodes_of_a_fleet_have_their_names_cores_and_versions():
     assert all(facts.versions == cluster.versions() for facts in found.values())
 
 
+@pytest.mark.system
 def test_a_fleet_is_found_again_by_its_folder(fleet):
     other = LocalFleet(fleet.folder)
     assert other.running
@@ -235,6 +237,7 @@ def test_a_fleet_is_found_again_by_its_folder(fleet):
     cluster.connect(other.address, other.token_file)  # to the same one again
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fleet")
 def test_a_process_uses_one_fleet_at_a_time(token):
     with pytest.raises(FleetError, match="one fleet at a time"):
@@ -265,17 +268,20 @@ fleet.Fleet(name="site", address="10.0.0.1:6400", token_file={str(token)!r}).mov
     assert "FleetError: nothing was imported" in done.stderr
 
 
+@pytest.mark.system
 def test_a_wrong_token_is_refused_by_the_head(fleet, token):
     with pytest.raises(FleetError, match="refuses the token"):
         keeper._check_head("stranger", fleet.address, token)
 
 
+@pytest.mark.system
 def test_every_port_of_a_local_fleet_is_on_the_loopback_interface(fleet):
     listening = [port for name in ("head", "node-1", "node-2") for port in PORTS["listening"](fleet, name)]
     assert len(listening) >= 1 + 3 * 3  # the GCS; node manager, object manager and runtime environments of each node
     assert {port.address for port in listening} == {"127.0.0.1"}
 
 
+@pytest.mark.system
 def test_a_node_that_was_killed_is_dead_at_once(fleet, until):
     fleet.start_node("fragile", 0, {"site": "north"})
     try:
@@ -288,6 +294,7 @@ def test_a_node_that_was_killed_is_dead_at_once(fleet, until):
         fleet.stop_node("fragile")
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("token", [None, "0" * 64], ids=["without a token", "with a wrong token"])
 def test_a_stranger_on_this_machine_is_refused_at_every_port(fleet, token):
     calls = [
@@ -308,6 +315,7 @@ def test_a_stranger_on_this_machine_is_refused_at_every_port(fleet, token):
     assert refused >= {*calls[:5], *calls[6:]}  # a worker's port is there only if an actor runs
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fleet")
 def test_ray_opens_no_port_for_its_client_or_its_dashboard_whatever_is_installed():
     check = (

@@ -16,6 +16,8 @@ from catstream.fleet.store import Store
 from catstream.loadtest.nodes import kill_node
 from catstream.video.live_demo import first_box
 
+pytestmark = pytest.mark.system
+
 FRAMES = 32
 LIVE = "demo:1?rate=10"
 

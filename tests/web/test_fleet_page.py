@@ -12,6 +12,8 @@ import pytest
 
 from catstream.web import fleet_feed
 
+pytestmark = pytest.mark.system
+
 HERE = Path(__file__).parent
 
 

@@ -18,6 +18,8 @@ from catstream.video.writer import VideoWriter
 from catstream.web.app import pipeline_site
 from catstream.web.server import Server
 
+pytestmark = pytest.mark.system
+
 HERE = Path(__file__).parent
 SIZE = (320, 240)
 LEAVES = 475  # frame of the demo in which the object has left the picture

@@ -14,6 +14,8 @@ import pytest
 from catstream.web.app import pipeline_site
 from catstream.web.server import Server
 
+pytestmark = pytest.mark.system
+
 HERE = Path(__file__).parent
 SEVERAL = ("three objects", "another one chosen", "drawing one more", "forgetting", "two objects")
 
