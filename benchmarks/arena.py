@@ -26,7 +26,7 @@ from catstream.job import Job
 from catstream.messages import Answer, End, ObjectPosition, Position, Track, Tracks
 from catstream.services.loop import PERMANENT_FAILURE
 from catstream.services.start import service_command
-from catstream.services.supervisor import NAMES
+from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.steering import Control, control
 from catstream.wire.acknowledged import Receiver

@@ -33,7 +33,7 @@ from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.metrics import score
 from catstream.messages import Track
 from catstream.multi import MultiTracker
-from catstream.services.supervisor import NAMES
+from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.video.source import open_source
 

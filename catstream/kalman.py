@@ -6,29 +6,23 @@ trainer smooths with it.
 
 from __future__ import annotations
 
-from functools import cache
-from threading import Thread
-from typing import TYPE_CHECKING
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from filterpy.kalman import KalmanFilter
 
-__all__ = ["OBSERVED", "TRANSITION", "constant_velocity", "prepare"]
+__all__ = ["OBSERVED", "TRANSITION", "constant_velocity"]
 
 TRANSITION = np.eye(4) + np.eye(4, k=2)  #: each position moves on by its velocity
 OBSERVED = np.eye(2, 4)  #: of the state, x and y are measured
-
-
-@cache
-def prepare() -> None:
-    """Import filterpy in a thread, once; returns at once.
-
-    filterpy imports scipy.stats, which takes half a second. A filter that is needed meanwhile waits for the import, so
-    that no result depends on its end.
-    """
-    Thread(target=_imported, name="filterpy").start()  # no daemon: an interpreter must not end inside an import
 
 
 def constant_velocity(
@@ -48,14 +42,63 @@ def constant_velocity(
     >>> kalman.x
     array([13., 20.,  3.,  0.])
     """
-    kalman = _imported()(dim_x=4, dim_z=2)
+    kalman: KalmanFilter = _KalmanFilter(dim_x=4, dim_z=2)
     kalman.F, kalman.H = TRANSITION, OBSERVED
     kalman.x, kalman.P, kalman.Q, kalman.R = mean, covariance, process, observation
     return kalman
 
 
-def _imported() -> type[KalmanFilter]:
+def _kalman_filter() -> type[KalmanFilter]:
+    """filterpy's class, from its two files alone.
+
+    The packages of filterpy import scipy.stats for their other filters, which costs a second of processor time. If the
+    program has imported filterpy, the class is that of the program.
+    """
+    if "filterpy.kalman" not in sys.modules:
+        package = find_spec("filterpy")
+        if package is not None and package.origin is not None:
+            folder = Path(package.origin).parent
+            common = _loaded("filterpy.common.helpers", folder / "common" / "helpers.py")
+            stats = ModuleType("filterpy.stats")
+            stats.logpdf = _logpdf  # type: ignore[attr-defined]
+            with _modules({common.__name__.removesuffix(".helpers"): common, stats.__name__: stats}):
+                module = _loaded("filterpy.kalman.kalman_filter", folder / "kalman" / "kalman_filter.py")
+            return module.KalmanFilter  # type: ignore[no-any-return]
     from filterpy.kalman import KalmanFilter
 
-    kind: type[KalmanFilter] = KalmanFilter
-    return kind
+    return KalmanFilter  # type: ignore[no-any-return]
+
+
+def _loaded(name: str, file: Path) -> ModuleType:
+    """A module from its file; the packages that contain it are not imported."""
+    spec = spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{file} is not a module: install filterpy again")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@contextmanager
+def _modules(modules: dict[str, ModuleType]) -> Iterator[None]:
+    """Let these modules be found by an import inside the `with`."""
+    before = {name: sys.modules.get(name) for name in modules}
+    sys.modules.update(modules)
+    try:
+        yield
+    finally:
+        for name, module in before.items():
+            if module is None:
+                del sys.modules[name]
+            else:
+                sys.modules[name] = module
+
+
+def _logpdf(*values: Any, **options: Any) -> float:
+    """`filterpy.stats.logpdf`, for the likelihood of a filter, which is computed only if it is asked for."""
+    from filterpy.stats import logpdf
+
+    return float(logpdf(*values, **options))
+
+
+_KalmanFilter = _kalman_filter()

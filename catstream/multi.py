@@ -16,7 +16,7 @@ from typing import Self
 
 import numpy as np
 
-from catstream import kalman, storage
+from catstream import storage
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
@@ -287,7 +287,6 @@ class MultiTracker:
         tracks = unpack(Tracks, arrays, metadata["tracks"], "tracks")
         check_message(tracks)
         self._tracks = tracks.tracks
-        kalman.prepare()
         return self
 
     def _resume(self, detector: Detector, model: Model) -> None:
@@ -302,5 +301,3 @@ class MultiTracker:
         self._tracks = tracks.tracks
         for sample in self.forest.take(features, learned):
             self.detectors.adopt(self.trainer.train(sample))
-        if tracks.frame >= self.settings.search.motion_frames // 2:
-            kalman.prepare()  # after twice as many frames, a sample has the centres

@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Self
 
 from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
-from catstream.features import COMPILING
 from catstream.job import Job, Results
 from catstream.learned import Learned
 from catstream.messages import End, Health, ObjectPosition, Position, Track, Tracks
 from catstream.names import UNNAMED, Boxes, boxes_by_name, check_boxes, check_name
+from catstream.services.start_server import start_server, start_server_lines
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.state import began, learned, locked, position
@@ -39,7 +39,7 @@ from catstream.wire.readable import readable
 
 __all__ = ["Pipeline"]
 
-_CHECK_SECONDS = 0.1
+_CHECK_SECONDS = 0.02
 _EXIT_SECONDS = 12.0  # time for the detector to exit after the end of the stream was received
 _TURN_SECONDS = 0.01
 
@@ -143,6 +143,7 @@ class Pipeline:
     ) -> None:
         if state is not None and resume is not None:
             raise SettingsError("state starts a new run, and resume continues one: give one of them")
+        start_server()  # it imports while this process opens the source
         self._resumed_job = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         given = settings.changed() if isinstance(settings, Settings) else settings or {}
@@ -427,9 +428,8 @@ class Pipeline:
         """Receive the health, restart processes that died, and log warnings for the user."""
         self._receive_health()
         self._children.check_children()
-        for line in self._children.new_lines("detector"):
-            if self.live or line == COMPILING:  # a live source was lost or is available again
-                _log.warning("%s", line)
+        for line in [*start_server_lines(), *(self._children.new_lines("detector") if self.live else ())]:
+            _log.warning("%s", line)  # kernels are compiled; a live source was lost or is available again
         if self._children.finished:
             raise ServiceError("the processes ended before the video did: this should not happen, please report it")
 

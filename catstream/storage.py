@@ -119,6 +119,12 @@ def is_writable(folder: Path) -> bool:
         return False
 
 
+def prepare() -> None:
+    """Import what reading, writing and locking files need."""
+    import filelock  # noqa: F401
+    import safetensors.numpy  # noqa: F401
+
+
 def lock(handle: int, seconds: float = 0.0) -> bool:
     """Lock an open file or folder for this process alone; False if another process keeps it locked for `seconds`.
 

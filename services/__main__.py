@@ -10,18 +10,15 @@ from catstream.threads import limit_process
 
 limit_process()  # before anything imports numpy
 
-import logging
 import sys
-from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import click
 
 from catstream.errors import CatstreamError
 from catstream.job import Job
-from catstream.services.loop import Parent, run
+from catstream.services.loop import Parent, log_as, run, run_child
 from catstream.services.options import with_model, with_object, with_part, with_settings
 
 _PATH = click.Path(path_type=Path)
@@ -61,7 +58,7 @@ def detector(**options: Any) -> None:
 
     With --record, it waits until the compressor has subscribed to the tracks.
     """
-    _run("detector", Job(**options))
+    sys.exit(run("detector", Job(**options)))
 
 
 @main.command()
@@ -71,14 +68,14 @@ def detector(**options: Any) -> None:
 @with_settings
 def compressor(**options: Any) -> None:
     """Compress the features in coreset trees; send samples."""
-    _run("compressor", Job(**options))
+    sys.exit(run("compressor", Job(**options)))
 
 
 @main.command()
 @with_settings
 def trainer(**options: Any) -> None:
     """Train models on the samples; send models."""
-    _run("trainer", Job(**options))
+    sys.exit(run("trainer", Job(**options)))
 
 
 @main.command()
@@ -90,7 +87,7 @@ def supervisor(**options: Any) -> None:
     """Start the other three processes for SOURCE, and restart any that dies."""
     from catstream.services import supervisor
 
-    _log_as("supervisor")
+    log_as("supervisor")
     sys.exit(supervisor.main(Job(**options)))
 
 
@@ -102,24 +99,7 @@ def supervisor(**options: Any) -> None:
 @click.option("--restarted", is_flag=True, help="Continue the work of a process that died.")
 def child(name: str, file: Path, parent: int, watchdog: int | None, restarted: bool) -> None:
     """Run one process of the job in a file."""
-    job = Job.load(file)
-    _run(name, replace(job, resume=job.resume or restarted), Parent(parent, watchdog))
-
-
-def _run(name: str, job: Job, parent: Parent | None = None) -> NoReturn:
-    """Run one of the three processes, and exit with its code."""
-    _log_as(name)
-    if name == "detector":
-        import cv2
-
-        cv2.setNumThreads(1)
-    service = import_module(f"catstream.services.{name}")
-    sys.exit(run(name, service.main, job, parent))
-
-
-def _log_as(name: str) -> None:
-    """Begin each line of the log with the name of the process; the supervisor selects the lines by it."""
-    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
+    sys.exit(run_child(name, file, Parent(parent, watchdog), restarted=restarted))
 
 
 def start() -> None:

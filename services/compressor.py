@@ -6,6 +6,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+from catstream import storage
 from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
@@ -22,14 +23,20 @@ from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import FEATURES, SAMPLES
 from catstream.wire.newest import Publisher
 
-__all__ = ["main", "reading_seconds"]
+__all__ = ["main", "prepare", "reading_seconds"]
 
 _SENDER_SECONDS = 5.0  # limit for the detector to send the end, once all processes were asked to end
 _END_SECONDS = 5.0  # limit for the end of the tracks, after that of the features
 _STORE_SECONDS = 60.0  # limit for a slow disk
+_MODEL_SECONDS = 60.0  # limit for reading a saved model and training from it
 _READ_SECONDS = 1e-7  # limit for reading one byte
-_IMPORT_SECONDS = 60.0  # limit for importing a library from a slow disk
 _LOCK_SECONDS = 10.0  # limit for an earlier compressor to end
+
+
+def prepare() -> None:
+    """Import everything that a reduction and a checkpoint need."""
+    reduce.prepare()
+    storage.prepare()
 
 
 def main(process: Process) -> None:
@@ -62,7 +69,6 @@ class CompressorLoop:
         self._forest = self._checkpoints.load(settings) if self._checkpoints is not None else Forest(settings)
         position = self._forest.position
         self._progress = Progress(position, position.seq, time.monotonic())
-        self._prepared = False
         self._recorder = None
         if job.record is not None:
             process.allow(reading_seconds(job.record))
@@ -84,8 +90,6 @@ class CompressorLoop:
     def receive(self) -> Features | End | None:
         """The next message, None if none arrives in a tenth of a second."""
         message = self._features.receive(0.1)
-        if message is None:
-            self._prepare()
         if self._recorder is not None:
             self._recorder.receive()
         return message
@@ -94,21 +98,13 @@ class CompressorLoop:
         """Insert features into the trees, and send the sample if there is a new one."""
         if self._recorder is not None:  # before a checkpoint: the recording then contains all of its features
             self._recorder.write(features)
-        self._prepare()
         before = self._forest.compressors.keys()
         if any(part.model for part in features.objects.values()):
-            self._process.allow(_IMPORT_SECONDS)
+            self._process.allow(_MODEL_SECONDS)
         for sample in self._forest.take(features, begun(features, self._process.settings)):
             self._samples.send(sample)
         if self._forest.compressors.keys() != before:
             self._samples.keep_only(self._forest.compressors)
-
-    def _prepare(self) -> None:
-        """Import what the first reduction needs, after a detector that waits for the position has got its answer."""
-        if not self._prepared:
-            self._process.allow(_IMPORT_SECONDS)
-            reduce.prepare()
-            self._prepared = True
 
     def store_and_acknowledge(self, message: Features | End | None) -> None:
         """Write a checkpoint if one is due, then answer position requests and acknowledge the message."""

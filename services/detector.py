@@ -13,7 +13,10 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from typing import TypeVar
 
-from catstream import kalman
+import cv2
+
+from catstream import ridge, storage
+from catstream.detection import objects
 from catstream.detection.detector import Detector, Result
 from catstream.detection.objects import Detectors
 from catstream.errors import ProtocolError, VideoError
@@ -30,6 +33,7 @@ from catstream.services.outputs import DataSender, Outputs
 from catstream.services.pacing import Awaited, awaited
 from catstream.services.resume import agree, start
 from catstream.state import SEARCHED
+from catstream.video import source
 from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password
 from catstream.video.source import open_source
@@ -37,7 +41,7 @@ from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import MODELS
 from catstream.wire.newest import Subscriber
 
-__all__ = ["main", "opening_seconds"]
+__all__ = ["main", "opening_seconds", "prepare"]
 
 Message = TypeVar("Message", Features | End, Tracks | End)
 
@@ -51,6 +55,14 @@ _SUBSCRIBERS_SECONDS = 5.0  # limit for announced subscribers to connect
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
 _log = logging.getLogger(__name__)
+
+
+def prepare() -> None:
+    """Import everything that tracking needs, and limit OpenCV to the thread that calls it."""
+    ridge.prepare()
+    source.prepare()
+    storage.prepare()
+    cv2.setNumThreads(1)
 
 
 def main(process: Process) -> None:
@@ -89,6 +101,7 @@ class DetectorLoop:
     def __init__(self, process: Process, stack: ExitStack) -> None:
         state = process.job.state
         file = state / _FILE if state is not None else None
+        objects.prepare(process.settings)
         self.detectors = Detectors(process.settings)
         self._process, self._model_files = process, ModelFiles(state / SEARCHED if state is not None else None)
         self._commands = CommandHandler(self.detectors, _desired(process, self._model_files), self._model_files)
@@ -133,8 +146,6 @@ class DetectorLoop:
         models: dict[str, Model] = {}
         commands = self._commands
         positions = [self._position(sender) for sender in self._outputs.senders]
-        if any(position.seq for position in positions):  # a model may contain the motion
-            kalman.prepare()
         while not agree(positions, models, commands.desired):
             if (model := self._models.receive(_TURN_SECONDS)) is not None:
                 models[model.object] = model
@@ -282,8 +293,6 @@ class DetectorLoop:
         self._outputs.publish_features(features)
         self._deliver(self._outputs.features, features)
         self._outputs.show(tracks.frame, frame.image, tracks.tracks)
-        if tracks.frame >= self._process.settings.search.motion_frames // 2:
-            kalman.prepare()  # a model contains the motion after twice as many frames
 
     def wait_for_model(self) -> None:
         """Wait until the models are recent enough: see `catstream.services.pacing`."""

@@ -8,18 +8,22 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
 from typing import NamedTuple
 
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.job import Job
 from catstream.messages import Health, Run
+from catstream.services.process_title import set_process_title
 from catstream.services.watchdog import PATIENCE, Watchdog
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 from catstream.wire.rejects import rejects
 
-__all__ = ["PERMANENT_FAILURE", "SOURCE_FAILED", "Parent", "Process", "die_with", "run"]
+__all__ = ["PERMANENT_FAILURE", "SOURCE_FAILED", "Parent", "Process", "die_with", "log_as", "run", "run_child"]
 
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
 PERMANENT_FAILURE = 2
@@ -127,8 +131,24 @@ class Process:
         self._stop_moment = min(self._stop_moment, time.monotonic())
 
 
-def run(name: str, main: Callable[[Process], None], job: Job, parent: Parent | None) -> int:
-    """Run a service; return its exit code.
+def run_child(name: str, file: Path, parent: Parent, *, restarted: bool) -> int:
+    """Run one process of the job in a file; return its exit code, as `run` does.
+
+    Parameters
+    ----------
+    restarted : whether it continues the work of a process that died
+    """
+    log_as(name)
+    try:
+        job = Job.load(file)
+    except CatstreamError as error:
+        _log.error("%s", error)
+        return PERMANENT_FAILURE
+    return run(name, replace(job, resume=job.resume or restarted), parent)
+
+
+def run(name: str, job: Job, parent: Parent | None = None) -> int:
+    """Run the detector, the compressor or the trainer; return its exit code.
 
     The code is 0 at the end of the stream or after SIGTERM, `SOURCE_FAILED` if the source failed, and
     `PERMANENT_FAILURE` for an error that would occur again.
@@ -139,10 +159,14 @@ def run(name: str, main: Callable[[Process], None], job: Job, parent: Parent | N
     """
     if parent is not None:
         die_with(parent.pid)
+    set_process_title(name)
+    log_as(name)
+    service = import_module(f"catstream.services.{name}")
+    service.prepare()
     try:
         process = Process(name, job, parent.watchdog if parent else None)
         try:
-            main(process)
+            service.main(process)
         finally:
             process.close()
     except StreamRewoundError as error:
@@ -152,6 +176,11 @@ def run(name: str, main: Callable[[Process], None], job: Job, parent: Parent | N
         _log.error("%s", error)
         return PERMANENT_FAILURE
     return SOURCE_FAILED if process.source_failed else 0
+
+
+def log_as(name: str) -> None:
+    """Begin each line of the log with the name of the process; the supervisor selects the lines by it."""
+    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO, force=True)
 
 
 def die_with(parent: int) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 from catstream import errors
 
-__all__ = ["SPAWN", "environment", "import_path", "service_command"]
+__all__ = ["SPAWN", "environment", "import_path", "python_command", "service_command"]
 
 
 def service_command(*arguments: str) -> list[str]:
@@ -29,11 +29,13 @@ def service_command(*arguments: str) -> list[str]:
     ServiceError
         If no Python interpreter is known.
     """
+    return python_command("from catstream.services.__main__ import start; start()", *arguments)
+
+
+def python_command(program: str, *arguments: str) -> list[str]:
+    """The command that runs a program with the modules of this process; otherwise like `service_command`."""
     # Folders that only the interpreter knows come last; `-P` and no PYTHONPATH keep the current folder off its list.
-    start = (
-        f"import sys; sys.path[:] = dict.fromkeys({import_path()!r} + sys.path); "
-        "from catstream.services.__main__ import start; start()"
-    )
+    start = f"import sys; sys.path[:] = dict.fromkeys({import_path()!r} + sys.path); {program}"
     return [_interpreter(), "-P", "-c", start, *arguments]
 
 

@@ -14,17 +14,15 @@ from catstream.errors import ServiceError
 from catstream.job import Job
 from catstream.services.child import Child
 from catstream.services.loop import PERMANENT_FAILURE, SOURCE_FAILED
+from catstream.services.start_server import NAMES
 from catstream.video.frames import without_password
 from catstream.video.source import is_live
 from catstream.wire.endpoint import meeting_place, private_folder
 
-__all__ = ["NAMES", "Supervisor", "main"]
-
-#: The processes, in the order in which they end.
-NAMES = ("detector", "compressor", "trainer")
+__all__ = ["Supervisor", "main"]
 
 _RESTARTS, _PER_SECONDS = 5, 60.0
-_FIRST_PAUSE = 0.1
+_PAUSE_SECONDS = 0.1  # before the second restart in a minute; doubled for each further one
 _SHUTDOWN_SECONDS = 12.0  # time for all children to end before they are killed
 _APART_SECONDS = 3.0  # the most between the end of another process and that of the detector, if both end well
 
@@ -34,8 +32,8 @@ _log = logging.getLogger(__name__)
 class Supervisor:
     """The children of one pipeline.
 
-    Call `check_children` ten times a second. It restarts a child that died or hangs, after a pause that doubles each
-    time, and at most five times a minute.
+    Call `check_children` at least ten times a second. It restarts a child that died or hangs: at once, then after a
+    pause that doubles each time, and at most five times a minute.
 
     Parameters
     ----------
@@ -71,11 +69,11 @@ class Supervisor:
     def failure(self) -> str:
         """Error of the source, once the detector has ended; empty if the source did not fail."""
         detector = self._children["detector"]
-        return detector.last_line() if detector.code == SOURCE_FAILED else ""
+        return detector.log.last_line() if detector.code == SOURCE_FAILED else ""
 
     def new_lines(self, name: str) -> list[str]:
         """The lines that a child has logged since the last call."""
-        return self._children[name].new_lines()
+        return self._children[name].log.new_lines()
 
     def check_children(self) -> None:
         """Restart the children that died, and kill those that hang; both are logged.
@@ -111,18 +109,21 @@ class Supervisor:
             child.kill()
 
     def _restart(self, child: Child, code: int, now: float) -> None:
-        """Schedule the restart of a child that died with an exit code."""
+        """Restart a child that died with an exit code, or schedule that."""
         if code == PERMANENT_FAILURE:
-            raise ServiceError(child.last_line())
+            raise ServiceError(child.log.last_line())
         child.restarts.append(now)
         recent = sum(now - moment < _PER_SECONDS for moment in child.restarts)
         if recent > _RESTARTS:
             raise ServiceError(
                 f"the {child.name} died {recent} times in a minute, the last time with {_ending(code)}: "
-                f"{child.last_line()}"
+                f"{child.log.last_line()}"
             )
-        _log.warning("the %s died with %s, and is restarted: %s", child.name, _ending(code), child.last_line())
-        child.schedule(now + _FIRST_PAUSE * 2 ** (recent - 1) * random.uniform(0.5, 1))
+        _log.warning("the %s died with %s, and is restarted: %s", child.name, _ending(code), child.log.last_line())
+        if recent == 1:
+            child.start()
+        else:
+            child.schedule(now + _PAUSE_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1))
 
     def stop(self) -> None:
         """End all children: each is asked to end, and killed if it does not."""

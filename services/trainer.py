@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from catstream import kalman
+from catstream import ridge
 from catstream.messages import End
 from catstream.services.loop import Process
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.newest import Publisher, Subscriber
 
-__all__ = ["main"]
+__all__ = ["main", "prepare"]
 
 _NONE = {"version": 0.0, "trained": 0.0}
-_TRAIN_SECONDS = 60.0  # limit for training a model, and for the imports of the first one
+_TRAIN_SECONDS = 60.0  # limit for training a model
+
+
+def prepare() -> None:
+    """Import everything that training needs."""
+    ridge.prepare()
 
 
 def main(process: Process) -> None:
@@ -30,8 +35,6 @@ def main(process: Process) -> None:
             if message is not None and message.version != trained.get(message.object, _NONE)["version"]:
                 process.allow(_TRAIN_SECONDS)
                 models.send(trainer.train(message))
-                if message.frame >= process.settings.search.motion_frames // 2:
-                    kalman.prepare()  # a sample contains the centres after twice as many frames
                 count = trained.pop(message.object, _NONE)["trained"] + 1
                 trained[message.object] = {"version": float(message.version), "trained": count}
                 if len(trained) > process.settings.run.objects_most:  # the longest ago: it was forgotten

@@ -49,7 +49,7 @@ IMPORTERS = {
         "catstream/summaries/images.py",
         "catstream/threads.py",
         "catstream/evaluation/peers.py",
-        "services/__main__.py",
+        "services/detector.py",
     ],
     "filterpy": ["catstream/kalman.py"],
     "numba": ["catstream/features/compiler.py"],

@@ -20,7 +20,7 @@ from catstream.errors import CatstreamError
 from catstream.messages import Health
 from catstream.services.__main__ import main
 from catstream.services.start import environment, service_command
-from catstream.services.supervisor import NAMES
+from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.subscription import subscribe
 from catstream.web.app import pipeline_site

@@ -1,41 +1,45 @@
-"""filterpy is imported while frames are followed: nobody waits for it, and no result depends on it."""
+"""filterpy's Kalman filter is used without the imports of filterpy's other modules, which take a second."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
+FILTERED = """
+import sys
 import numpy as np
+{first}
+from catstream.kalman import constant_velocity
 
-from catstream import kalman
-from catstream.settings import Settings
-from catstream.tracker import Tracker
-
-
-def test_the_first_models_need_no_filterpy_and_its_import_begins_half_a_block_of_centres_ahead(monkeypatch, rng):
-    begun = []
-    monkeypatch.setitem(sys.modules, "filterpy.kalman", None)  # an import of it fails
-    monkeypatch.setattr(kalman, "prepare", lambda: begun.append(tracker.track.frame))
-    frame, tracker = (
-        rng.integers(0, 256, (120, 160, 3), np.uint8),
-        Tracker(Settings(search={"motion_frames": 8})),
-    )
-    tracker.init(frame, (60, 40, 40, 40))
-    for _ in range(4):
-        assert not begun
-        tracker.update(frame)
-    assert begun == [4]
-    assert tracker.track.model_version
-
-
-def test_a_filter_requested_during_the_import_waits_for_it_without_output():
-    code = """
-import numpy as np
-from catstream.kalman import constant_velocity, prepare
-prepare()
-kalman = constant_velocity(np.ones(4), np.eye(4), np.eye(4), np.eye(2))
+kalman = constant_velocity(np.array([1.0, 2, 3, 4]), np.eye(4), np.eye(4), np.eye(2))
 kalman.predict()
+kalman.update(np.array([4.5, 6.5]))
 print(*kalman.x)
+{then}
 """
-    ended = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60)
-    assert (ended.stdout, ended.stderr) == ("2.0 2.0 1.0 1.0\n", "")
+
+
+def output(first="", then=""):
+    """What a new process prints that uses the filter; an import before it, and a statement after it."""
+    program = FILTERED.format(first=first, then=then)
+    ended = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
+    return ended.stdout.splitlines()
+
+
+def test_the_filter_needs_no_other_module_of_filterpy():
+    then = "print(*(name for name in sys.modules if name.startswith(('filterpy', 'scipy', 'matplotlib'))))"
+    assert output(then=then) == ["4.375 6.375 3.25 4.25", ""]
+
+
+def test_a_program_that_uses_filterpy_gets_the_same_class_and_the_same_numbers():
+    then = "print(type(kalman) is filterpy.kalman.KalmanFilter)"
+    assert output("import filterpy.kalman", then) == ["4.375 6.375 3.25 4.25", "True"]
+
+
+def test_a_program_may_import_filterpy_afterwards():
+    then = (
+        "import filterpy.kalman; print(round(kalman.log_likelihood, 4), filterpy.kalman.UnscentedKalmanFilter.__name__)"
+    )
+    assert output(then=then)[1] == "-2.9992 UnscentedKalmanFilter"

@@ -299,6 +299,11 @@ def read_image(path: Path) -> np.ndarray | None:
         cv2.utils.logging.setLogLevel(level)
 
 
+def prepare() -> None:
+    """Import what reading a video needs."""
+    import av.video.reformatter  # noqa: F401
+
+
 def _open_video(path: Path, *, part: slice, start: int, skip_damaged: bool) -> Source:
     import av  # imported here because it takes 0.1 s and folders do not need it
 

@@ -13,7 +13,7 @@ import pytest
 from hosts import Hosts
 
 from catstream.errors import CatstreamError
-from catstream.services.supervisor import NAMES
+from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.wire.keys import allow, create
 

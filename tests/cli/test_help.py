@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from catstream.cli import VERBS
-from catstream.services.supervisor import NAMES
+from catstream.services.start_server import NAMES
 
 
 @pytest.fixture

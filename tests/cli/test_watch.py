@@ -16,7 +16,7 @@ import pytest
 from catstream.features.layout import row_length
 from catstream.messages import End, Health, Track
 from catstream.pipeline import Pipeline
-from catstream.services.supervisor import NAMES
+from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.wire.channels import HEALTH, TRACKS
 from catstream.wire.endpoint import Endpoint

@@ -12,7 +12,6 @@ import pytest
 
 from catstream.video.source import open_source
 
-#: Fewer than half a block of centres (`search.motion_frames`): no process imports the Kalman filter.
 FRAMES = 32
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from catstream.errors import ServiceError, SilenceError
 from catstream.pipeline import Pipeline
-from catstream.services.supervisor import NAMES
+from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.subscription import subscribe
 from catstream.wire.keys import allow, create

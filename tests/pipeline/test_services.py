@@ -17,7 +17,8 @@ from catstream.job import Job
 from catstream.messages import End, Track
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
-from catstream.services.supervisor import NAMES, Supervisor
+from catstream.services.start_server import NAMES
+from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.state import TREES
 from catstream.video.source import open_source
@@ -79,7 +80,8 @@ def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, f
 def test_no_process_outlives_its_supervisor(video, service, number, code, until, alive):
     path, boxes = video
     supervisor = service("supervisor", path, "--box", ",".join(map(str, boxes[0])))
-    children = until(lambda: len(found := psutil.Process(supervisor.pid).children()) == len(NAMES) and found)
+    started = psutil.Process(supervisor.pid)
+    children = until(lambda: len(found := started.children(recursive=True)) == 1 + len(NAMES) and found)
     supervisor.send_signal(number)
     assert supervisor.wait(30) == code
     until(lambda: not any(alive(child.pid) for child in children))

@@ -1,0 +1,407 @@
+"""The start server: a process that has imported what the processes of a pipeline need, and forks them.
+
+These imports take a process half a second, and a fork some milliseconds. The first pipeline of a program starts the
+server; all pipelines of the program share it, and it ends with the program.
+
+    program                      start server                     detector, compressor, trainer
+       │ ─── log, watchdog, ... ──> │ ─────────────────────── fork ─> │
+       │ <── process id ─────────── │                                 │
+       │ <── exit code ──────────── │ <─────────────────────── exit ─ │
+
+A request is one packet of JSON on a Unix socket, with three descriptors: the log, the watchdog, and a socket for the
+two answers, which is of this process alone. The program does not wait for them: requests stay in the socket while the
+server still imports.
+
+The server has one thread: a fork copies only the thread that calls it, and a lock that another one holds would stay
+locked in the copy. If a library has started a thread, the server starts each process without forking, and logs that.
+
+The kernel kills these processes when the server ends, and the server ends with its program, however that ended. If the
+server is killed, its processes are restarted like any that died, by a new server.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import json
+import logging
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import BinaryIO, cast
+from weakref import WeakSet
+
+from catstream.errors import ServiceError
+from catstream.services.process_log import ProcessLog
+from catstream.services.process_title import set_process_title
+from catstream.services.start import environment, import_path, python_command, service_command
+from catstream.threads import limit_process
+
+__all__ = ["NAMES", "Request", "StartServer", "StartedProcess", "main", "start_server", "start_server_lines"]
+
+#: The processes that a server can start, in the order in which a pipeline starts and ends them.
+NAMES = ("detector", "compressor", "trainer")
+
+_ANSWER = struct.Struct("=i")  # the process id, 0 if it could not be started; the exit code, or minus the signal
+_REQUEST_BYTES = 65536
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A process to start.
+
+    name       one of `NAMES`
+    job        file of its job
+    folder     its current folder
+    restarted  whether it continues the work of a process that died
+    """
+
+    name: str
+    job: str
+    folder: str
+    restarted: bool
+
+
+class StartedProcess:
+    """A process that a server starts or has started; used like a `subprocess.Popen`.
+
+    Parameters
+    ----------
+    answers : socket on which the server sends the process id, and later the exit code
+    """
+
+    def __init__(self, answers: socket.socket) -> None:
+        self._answers = answers
+        self._pid: int | None = None
+        self._code: int | None = None
+
+    @property
+    def pid(self) -> int:
+        """Process id; waits until the server has started the process. 0 if it could not be started."""
+        while self._pid is None and self._code is None:
+            self._receive(None)
+        return self._pid or 0
+
+    def poll(self) -> int | None:
+        """Exit code, negative for the signal that ended the process; None while it runs or is being started."""
+        while self._code is None and self._receive(0):
+            pass
+        return self._code
+
+    def wait(self, seconds: float) -> bool:
+        """Wait at most this long for the end of the process; returns whether it has ended."""
+        while self._code is None and self._receive(seconds):
+            pass
+        return self._code is not None
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the process, unless it has ended."""
+        if self.poll() is None and self.pid:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def close(self) -> None:
+        """Kill the process if it runs, and wait until it has ended."""
+        self.send_signal(signal.SIGKILL)
+        while self._code is None:
+            self._receive(None)
+        self._answers.close()
+
+    def _receive(self, seconds: float | None) -> bool:
+        """Receive the next answer; returns whether one arrived in time."""
+        self._answers.settimeout(seconds)
+        try:
+            data = self._answers.recv(_ANSWER.size)
+        except (BlockingIOError, TimeoutError):
+            return False
+        except ConnectionError:
+            data = b""
+        if not data:  # the server has ended, and the kernel kills the process
+            self._code = -signal.SIGKILL
+        elif self._pid is None:
+            self._pid = int(_ANSWER.unpack(data)[0])
+        else:
+            self._code = int(_ANSWER.unpack(data)[0])
+        return True
+
+
+class StartServer:
+    """A start server, as its program sees it.
+
+    Attributes
+    ----------
+    log : what it logged: that kernels are compiled, that it cannot fork
+    """
+
+    def __init__(self) -> None:
+        self._program = os.getpid()
+        self._environment, self._path = environment(), import_path()
+        self._processes: WeakSet[StartedProcess] = WeakSet()
+        self.log = ProcessLog("start server", cast(BinaryIO, tempfile.TemporaryFile()))  # noqa: SIM115
+        self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self._process = subprocess.Popen(
+                python_command(
+                    f"from catstream.services.start_server import main; main({theirs.fileno()}, {self._program})"
+                ),
+                env=self._environment,
+                cwd="/",
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,  # a reader of the program's output would wait for the server's end
+                stderr=self.log.fileno(),
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,  # Ctrl-C is for the program, which then ends its processes in order
+            )
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def is_owned(self) -> bool:
+        """Whether this process has started it; a copy of this process that was forked has not."""
+        return self._program == os.getpid()
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether it runs, and would start processes with the present environment of its program."""
+        same = (self._environment, self._path) == (environment(), import_path())
+        return self.is_owned and same and self._process.poll() is None
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether all its processes have ended."""
+        return all(process.poll() is not None for process in self._processes)
+
+    def start(self, request: Request, log: int, watchdog: int) -> StartedProcess:
+        """Request a process, and return without waiting for its start.
+
+        Parameters
+        ----------
+        log : descriptor of the file that becomes its standard error
+        watchdog : descriptor of the memory of its watchdog
+
+        Raises
+        ------
+        OSError
+            If the server has ended.
+        """
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            try:
+                data = json.dumps(asdict(request)).encode()
+                socket.send_fds(self._requests, [data], [log, watchdog, theirs.fileno()])
+            except OSError:
+                ours.close()
+                raise
+        process = StartedProcess(ours)
+        self._processes.add(process)
+        return process
+
+    def close(self) -> None:
+        """End the server, and its processes with it."""
+        self._requests.close()
+        self._process.kill()  # it may be in a long import
+        self._process.wait()
+        self.log.close()
+
+
+_servers: list[StartServer] = []
+_lock = threading.Lock()
+
+
+def start_server() -> StartServer:
+    """The server of this program. One is started if there is none, it has ended, or the environment has changed."""
+    with _lock:
+        for server in [*_servers]:
+            if server.is_owned and not server.is_usable and server.is_idle:
+                server.close()
+                _servers.remove(server)
+        usable = next((server for server in _servers if server.is_usable), None)
+        if usable is None:
+            usable = StartServer()
+            _servers.append(usable)
+        return usable
+
+
+def start_server_lines() -> list[str]:
+    """The lines that the start servers of this program have logged since the last call."""
+    return [line for server in [*_servers] if server.is_owned for line in server.log.new_lines()]
+
+
+@atexit.register
+def _close_all() -> None:
+    for server in _servers:
+        if server.is_owned:
+            server.close()
+
+
+def _unlock() -> None:
+    """Replace the lock in a copy of this process, where another thread of the original may have held it."""
+    global _lock
+    _lock = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_unlock)
+
+
+class _Server:
+    """The server itself.
+
+    Parameters
+    ----------
+    requests : socket of the requests, which the program closes when it ends
+    program : process id of the program
+    """
+
+    def __init__(self, requests: socket.socket, program: int) -> None:
+        self._requests = requests
+        self._answers: dict[int, socket.socket] = {}  # of the processes that run, by process id
+        self._ended, ended = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.set_wakeup_fd(ended)
+        signal.signal(signal.SIGCHLD, lambda *_: None)  # wakes `poll` up
+        self._descriptors = [self._ended, ended]
+        self._poll = select.poll()
+        self._poll.register(requests, select.POLLIN)
+        self._poll.register(self._ended, select.POLLIN)
+        with suppress(OSError):  # a kernel before 5.3: then only the end of the socket shows the end of the program
+            self._descriptors.append(program_end := os.pidfd_open(program))
+            self._poll.register(program_end, select.POLLIN)
+        self._logged = False
+
+    def serve(self) -> tuple[Request, int] | None:
+        """Start processes until the program ends.
+
+        Returns
+        -------
+        None in the server; in each process that it has forked, its request and the descriptor of its watchdog
+        """
+        to_import = list(NAMES)
+        while True:
+            ready = [descriptor for descriptor, _ in self._poll.poll(0 if to_import else None)]
+            if self._ended in ready:
+                os.read(self._ended, 4096)
+                self._reap()
+            elif self._requests.fileno() in ready:
+                data, descriptors, _, _ = socket.recv_fds(self._requests, _REQUEST_BYTES, 3)
+                if not data:
+                    return None
+                request = Request(**json.loads(data))
+                if request.name in to_import:
+                    to_import.remove(request.name)
+                    _import(request.name)
+                if self._start(request, *descriptors):
+                    return request, descriptors[1]
+            elif ready:
+                return None
+            else:
+                _import(to_import.pop(0))
+
+    def _start(self, request: Request, log: int, watchdog: int, answers: int) -> bool:
+        """Start a process, and send its process id; returns whether this is the new process."""
+        channel = socket.socket(fileno=answers)
+        try:
+            pid = os.fork() if self._can_fork() else _spawn(request, log, watchdog)
+        except (OSError, ServiceError) as error:
+            os.write(log, f"{request.name}: cannot start a process: {error}\n".encode())
+            _answer(channel, 0)
+            _answer(channel, 1)
+            channel.close()
+        else:
+            if not pid:
+                channel.close()
+                self._leave(log, request.folder)
+                return True
+            self._answers[pid] = channel
+            if not _answer(channel, pid):  # the program wants it no more
+                os.kill(pid, signal.SIGKILL)
+        os.close(log)
+        os.close(watchdog)
+        return False
+
+    def _can_fork(self) -> bool:
+        """Whether this process has one thread; if it has more, this is logged once."""
+        threads = len(list(Path("/proc/self/task").iterdir()))
+        if threads > 1 and not self._logged:
+            self._logged = True
+            _log.warning("processes start without a fork, and later: a library has started %d threads", threads - 1)
+        return threads == 1
+
+    def _leave(self, log: int, folder: str) -> None:
+        """Keep nothing of the server in the process that it has forked."""
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        for channel in (self._requests, *self._answers.values()):
+            channel.close()
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        os.setsid()
+        os.dup2(log, sys.stderr.fileno())
+        os.close(log)
+        with suppress(OSError):  # it was removed
+            os.chdir(folder)
+        import_module("numpy").random.seed()  # the module `random` does this by itself
+        gc.enable()
+
+    def _reap(self) -> None:
+        """Send the exit codes of the processes that have ended."""
+        while self._answers:
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if not pid:
+                return
+            with self._answers.pop(pid) as channel:
+                _answer(channel, os.waitstatus_to_exitcode(status))
+
+
+def _answer(channel: socket.socket, number: int) -> bool:
+    """Send an answer; returns False if nobody receives it."""
+    with suppress(OSError):
+        return bool(channel.send(_ANSWER.pack(number)))
+    return False
+
+
+def _import(name: str) -> None:
+    """Import what a process needs; an error is left to the process, which has a log."""
+    with suppress(Exception):
+        import_module(f"catstream.services.{name}").prepare()
+    gc.freeze()  # a later collection leaves the memory alone that all processes share
+
+
+def _spawn(request: Request, log: int, watchdog: int) -> int:
+    """Start a process without forking; returns its process id."""
+    os.set_inheritable(watchdog, True)
+    command = service_command("child", request.name, request.job, "--parent", str(os.getpid()))
+    command += ["--watchdog", str(watchdog), *["--restarted"] * request.restarted]
+    return os.posix_spawn(command[0], command, environment(), file_actions=[(os.POSIX_SPAWN_DUP2, log, 2)], setsid=True)
+
+
+def main(requests: int, program: int) -> None:
+    """Run a start server; in a process that it has forked, run that.
+
+    Parameters
+    ----------
+    requests : descriptor of the socket of the requests
+    program : process id of the program
+    """
+    limit_process()  # before anything imports numpy
+    from catstream.services.loop import Parent, run_child
+
+    set_process_title("start server")
+    logging.basicConfig(format="start server: %(message)s", level=logging.INFO)
+    gc.disable()  # nothing of what is imported is garbage
+    server = os.getpid()
+    if (forked := _Server(socket.socket(fileno=requests), program).serve()) is not None:
+        request, watchdog = forked
+        sys.exit(run_child(request.name, Path(request.job), Parent(server, watchdog), restarted=request.restarted))
