@@ -80,7 +80,7 @@ def test_a_health_report_after_the_last_track_counts_too(video, until):
     assert pipeline.health["detector"]["sent"] >= sent
 
 
-def test_three_processes_run_while_it_is_open_and_none_afterwards(run, video, alive):
+def test_three_processes_run_while_it_is_open_and_none_afterwards(run, alive):
     _, pipeline, processes = run
     assert set(processes) == set(NAMES)
     for name, (pid, command) in processes.items():
