@@ -219,7 +219,7 @@ class Pipeline:
             if self._save_models:  # from the compressor's last checkpoint
                 stack.enter_context(_saved(self._save_models, self._state or folder, settings))
             supervisor = Supervisor(self._started(str(endpoint)), folder)
-            stack.callback(supervisor.stop)
+            stack.callback(supervisor.stop, self._receive_rest)
             self._endpoint, self._supervisor, self._stack = str(endpoint), supervisor, stack.pop_all()
         return self
 
@@ -440,6 +440,11 @@ class Pipeline:
             if health.trouble and (before is None or before.trouble != health.trouble):
                 _log.warning("%s: %s", health.process, health.trouble)
             self._health[health.process] = health
+
+    def _receive_rest(self) -> None:
+        """Receive the tracks that nobody iterates over any more, so that the detector need not wait for that."""
+        while (message := self._incoming.receive(0)) is not None:
+            self._incoming.acknowledge(Position(message.seq))
 
     def _wait_for_exit(self) -> Iterator[None]:
         """Yield until the detector has exited; it does so once its last message is acknowledged."""

@@ -6,6 +6,7 @@ import contextlib
 import signal
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 from catstream.services.loop import SOURCE_FAILED
@@ -16,6 +17,7 @@ from catstream.services.watchdog import Watchdog
 __all__ = ["Child"]
 
 _STEP_SECONDS = 0.5  # the most that counts between two calls of `hangs`, as the parent itself may have been suspended
+_TURN_SECONDS = 0.01  # from one turn of the parent to the next, while it waits for the end of the process
 _STOPPED_SECONDS = 2.0  # a process that SIGSTOP has stopped for so long counts as hung
 
 
@@ -102,11 +104,13 @@ class Child:
             return Path(f"/proc/{self.pid}/stat").read_text().rpartition(") ")[2][:1] == "T"
         return False
 
-    def terminate(self, seconds: float) -> None:
-        """Ask the process to end, and wait at most `seconds` for it."""
+    def terminate(self, seconds: float, turn: Callable[[], object]) -> None:
+        """Ask the process to end, and wait at most `seconds` for it; `turn` is called again and again meanwhile."""
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
-            self._process.wait(seconds)
+            deadline = time.monotonic() + seconds
+            while not self._process.wait(_TURN_SECONDS) and time.monotonic() < deadline:
+                turn()
 
     def kill(self) -> None:
         """Kill the process, if it runs."""

@@ -7,6 +7,7 @@ import random
 import signal
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,12 +126,17 @@ class Supervisor:
         else:
             child.schedule(now + _PAUSE_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1))
 
-    def stop(self) -> None:
-        """End all children: each is asked to end, and killed if it does not."""
+    def stop(self, turn: Callable[[], object] = lambda: None) -> None:
+        """End all children: each is asked to end, and killed if it does not.
+
+        Parameters
+        ----------
+        turn : called while it waits; receives what the children still send
+        """
         deadline = time.monotonic() + _SHUTDOWN_SECONDS
         try:
             for child in self._children.values():  # the detector first: its last messages need the others
-                child.terminate(max(0.1, deadline - time.monotonic()))
+                child.terminate(max(0.1, deadline - time.monotonic()), turn)
         finally:
             for child in self._children.values():
                 child.close()

@@ -187,6 +187,7 @@ class Subscriber(ChannelSocket[Message]):
         self._newest = channel.keeps == "newest"
         self._passes_over = self._newest and len(channel.senders) == 1 and not every
         super().__init__(zmq.SUB, channel, endpoint, channel.high_water_mark)
+        self._socket.set(zmq.LINGER, 0)  # while a publisher is away, its subscriptions wait to be sent again
         self._arrived: dict[bytes, zmq.Frame] = {}  # newest message of each topic, the topic that waits longest first
         self._last: dict[bytes, bytes] = {}  # digest of the last message of each topic or process, to drop repeats
         self._socket.subscribe(b"" if only is None else opening(only, about))
