@@ -7,6 +7,9 @@ PIP := $(BIN)/pip install --quiet --quiet --disable-pip-version-check
 READY := $(VENV)/.ready
 TOOLS := $(VENV)/.tools
 
+# Tests start hundreds of processes, which would all compile the sources again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help setup develop demo test test-system test-slow lint format docs pythons picture settings protocol bench results lock clean fuzz audit
 
