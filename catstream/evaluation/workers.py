@@ -9,9 +9,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Generator, Sequence
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import TypeVar
 
 from catstream.errors import ServiceError
@@ -52,8 +54,29 @@ def _submit(
     pool: ProcessPoolExecutor, work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]]
 ) -> list[Future[_Result]]:
     """Submit all tasks. The workers are started here, and inherit the blocked SIGINT."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _CTRL_C)
+    with _deferred_ctrl_c():
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _CTRL_C)
+        try:
+            return [pool.submit(work, *task) for task in tasks]
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _deferred_ctrl_c() -> Iterator[None]:
+    """Handle a Ctrl-C that arrives inside a `with` after it.
+
+    A mask alone does not hold it back: the signal arrives in another thread, and Python handles it in the main one. A
+    worker whose start is interrupted would not get the data that it waits for.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python handles signals in the main thread only
+        return
+    received: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
     try:
-        return [pool.submit(work, *task) for task in tasks]
+        yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.signal(signal.SIGINT, before)
+        if received:
+            signal.raise_signal(signal.SIGINT)

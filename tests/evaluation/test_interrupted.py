@@ -7,11 +7,14 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import psutil
 import pytest
 
 from catstream.cli import INTERRUPTED, interruptible
+from catstream.evaluation import workers
 from catstream.evaluation.workers import run_tasks
 
 EVALUATE = [sys.executable, "-c", "from catstream.cli import main; main()", "evaluate"]
@@ -33,6 +36,20 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, 
     assert not psutil.wait_procs(children, timeout=10)[1]
 
 
+def test_ctrl_c_that_another_thread_receives_interrupts_only_after_all_workers_were_started():
+    submitted = []
+    with ThreadPoolExecutor(1) as other:
+        other.submit(abs, 0).result()  # the thread exists, and does not block the signal
+
+        def submit(*task):
+            other.submit(signal.raise_signal, signal.SIGINT).result()
+            submitted.append(task)
+
+        with pytest.raises(KeyboardInterrupt):
+            workers._submit(SimpleNamespace(submit=submit), abs, [(-1,), (-2,)])
+    assert submitted == [(abs, -1), (abs, -2)]
+
+
 def test_ctrl_c_ends_no_worker_because_the_caller_does():
     """A worker that ended on its own would be reported as killed, also by a caller that ignores Ctrl-C."""
     assert list(run_tasks(signal.raise_signal, [(signal.SIGINT,)] * 2, jobs=2)) == [None, None]
@@ -41,9 +58,9 @@ def test_ctrl_c_ends_no_worker_because_the_caller_does():
 def test_a_caller_that_stops_early_leaves_no_worker():
     given = run_tasks(abs, [(-1,), (-2,), (-3,)], jobs=2)
     assert next(given) in {1, 2, 3}
-    workers = multiprocessing.active_children()
+    running = multiprocessing.active_children()
     given.close()
-    assert len(workers) == 2
+    assert len(running) == 2
     assert not multiprocessing.active_children()
 
 
