@@ -5,10 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 
 import pytest
 
 from catstream.cli import VERBS
+from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
 
 STEER = ["set-box", "forget", "pause", "resume", "save", "stop"]
@@ -39,6 +42,25 @@ def status(said, tmp_path):
     return ask
 
 
+@pytest.fixture
+def follow(tmp_path):
+    """Follows a source in the pipeline of this test, in a thread: its tracks follow."""
+    over = Event()
+
+    def tracks(source, box=None):
+        found = []
+        with Pipeline(source, box, {"run.endpoint": str(tmp_path / "run")}) as pipeline:
+            for each in pipeline.by_frame(0.1):
+                found += each.values()
+                if over.is_set():
+                    break
+        return found
+
+    with ThreadPoolExecutor(1) as pool:
+        yield lambda *given: pool.submit(tracks, *given)
+        over.set()
+
+
 def rows(folder):
     return list(csv.DictReader((folder / "demo.csv").read_text().splitlines()))
 
@@ -64,11 +86,9 @@ def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, stee
     assert len(rows(tmp_path / "out")) == 32
 
 
-def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(
-    video, catstream, said, steer, status, until, tmp_path
-):
+def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, said, steer, status, until, tmp_path):
     source, box = video
-    run = catstream("track", source, "--set", f"run.endpoint={tmp_path / 'run'}")  # it waits for a box
+    run = follow(source)  # it waits for a box
     assert steer("pause")[0] == 0
     assert steer("set-box", f"anna={box}")[0] == 0
     code, answer = steer("set-box", "ben=20,150,70,60")
@@ -85,15 +105,14 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(
     assert steer("forget")[1].endswith("no object is left, so the run waits for a box")
     assert status()["state"] == "waiting for a box"
     assert steer("stop")[0] == 0
-    assert run.wait(120) == 0
+    assert {track.object for track in run.result(120)} == {"anna", "ben"}
 
 
-def test_a_saved_model_finds_the_object_in_another_run(video, catstream, said, steer, camera, until, tmp_path):
+def test_a_saved_model_finds_the_object_in_another_run(video, follow, said, steer, camera, until, tmp_path):
     source, box = video
     with open_source(source) as film:
         image = next(film).image
-    url = camera(lambda _: image).url
-    run = catstream("track", url, "--box", box, "--set", f"run.endpoint={tmp_path / 'run'}")
+    run = follow(camera(lambda _: image).url, box)
 
     def saved():
         code, answer = steer("save", tmp_path / "one")
@@ -102,21 +121,18 @@ def test_a_saved_model_finds_the_object_in_another_run(video, catstream, said, s
     until(lambda: saved() >= 3)
     code, answer = steer("stop")
     assert (code, answer.startswith("the stream ends after frame")) == (0, True)
-    assert run.wait(120) == 0
+    assert run.result(120)
     code, _, errors = said("track", source, "--model", tmp_path / "one", "--output", tmp_path / "out")
     assert code == 0, errors
     found = rows(tmp_path / "out")
     assert [row["state"] for row in found[3:]] == ["present"] * 29  # each frame is searched for one of three sizes
     assert int(found[0]["model_version"]) >= 1
-    run = catstream("track", source, "--output", tmp_path / "later", "--set", f"run.endpoint={tmp_path / 'run'}")
+    run = follow(source)
     code, answer = steer("search", f"anna={tmp_path / 'out'}")
     assert (code, "there is no saved model" in answer) == (1, True)
     code, answer = steer("search", f"anna={tmp_path / 'one'}")
     assert (code, answer.startswith("anna is searched for from frame 0 on, by model ")) == (0, True)
-    assert run.wait(120) == 0
-    with (tmp_path / "later" / "demo.csv").open() as file:
-        later = list(csv.DictReader(file))
-    assert [row["state"] for row in later] == [row["state"] for row in found]
+    assert [track.state for track in run.result(120)] == [row["state"] for row in found]
 
 
 def test_a_box_and_a_model_for_one_object_are_an_error(video, said, tmp_path):

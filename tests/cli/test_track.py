@@ -110,14 +110,14 @@ def started(process, results):
     return [child.pid for child in psutil.Process(process.pid).children()]
 
 
-def test_a_truncated_video_is_followed_up_to_the_break(video, said_by_process, tmp_path):
+def test_a_truncated_video_is_followed_up_to_the_break(video, said, tmp_path):
     source, box = video
     broken = tmp_path / "broken.mpg"
     whole = encoded(source, tmp_path / "whole.mpg")
     broken.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     good = readable(broken)
     assert 0 < good < 32
-    code, _, errors = said_by_process("track", broken, "--box", box, "--output", tmp_path / "out")
+    code, _, errors = said("track", broken, "--box", box, "--output", tmp_path / "out")
     assert code == 1
     assert f"is damaged at frame {good}" in one_line(errors)
     assert len((tmp_path / "out" / "broken.txt").read_text().splitlines()) == good
