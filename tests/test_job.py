@@ -41,7 +41,7 @@ jobs = st.builds(
 
 @given(jobs)
 def test_a_job_is_read_as_it_was_written(tmp_path_factory, job):
-    folder = tmp_path_factory.mktemp("job")
+    folder = tmp_path_factory.getbasetemp()
     assert Job.load(job.save(folder)) == Job.load(folder) == job
 
 

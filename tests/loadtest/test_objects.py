@@ -26,7 +26,7 @@ def test_all_objects_can_be_tracked_and_none_overlaps_the_first():
 
 def test_an_image_without_room_for_all_objects_is_an_error():
     with pytest.raises(SettingsError, match="has room for 1 objects, not 2"):
-        several(np.zeros_like(IMAGE), BOX, 2)
+        several(np.zeros((120, 160, 3), np.uint8), BOX, 2)
 
 
 def test_a_plan_has_at_most_as_many_objects_as_the_settings_allow():

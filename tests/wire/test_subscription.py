@@ -8,11 +8,13 @@ import threading
 
 import numpy as np
 import pytest
+import zmq
 
 import catstream
 from catstream.box import Box
 from catstream.errors import ObjectError, ServiceError, SilenceError
 from catstream.messages import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
+from catstream.wire import socket
 from catstream.wire.announced import Announcement, readers_of
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
 from catstream.wire.endpoint import Endpoint
@@ -150,8 +152,16 @@ def test_one_object_is_asked_for_by_a_valid_name(endpoint):
         catstream.subscribe(str(endpoint), "tracks", object="an na")
 
 
+@pytest.fixture
+def small_buffers(monkeypatch):
+    """Keeps the buffers of tcp from growing to many megabytes."""
+    for option in (zmq.SNDBUF, zmq.RCVBUF):
+        monkeypatch.setitem(socket._OPTIONS, option, 1 << 14)
+
+
+@pytest.mark.usefixtures("small_buffers")
 def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks):
-    count = 200_000  # more than all buffers on the way hold: those of tcp grow to many megabytes
+    count = 30_000  # more than all buffers on the way hold
     with attached(endpoint, tracks) as subscription:
         for seq in range(2, count):
             tracks.send(track(seq))
