@@ -58,7 +58,7 @@ class Child:
         self._watchdog, self.killed = Watchdog(), False
         self._turns = self.silent = self._stopped = 0.0
         self.seen = time.monotonic()
-        request = Request(self.name, str(self._job), _current_folder(), restarted=bool(self.restarts))
+        request = Request.here(self.name, self._job, restarted=bool(self.restarts))
         try:
             self._process = start_server().start(request, self.log.fileno(), self._watchdog.handle)
         except OSError:  # the server has ended just now
@@ -127,9 +127,3 @@ class Child:
         if self._process is not None:
             self._process.close()
             self._process = None
-
-
-def _current_folder() -> str:
-    with contextlib.suppress(FileNotFoundError):  # it was removed
-        return str(Path.cwd())
-    return "/"

@@ -8,9 +8,9 @@ server; all pipelines of the program share it, and it ends with the program.
        │ <── process id ─────────── │                                 │
        │ <── exit code ──────────── │ <─────────────────────── exit ─ │
 
-A request is one packet of JSON on a Unix socket, with three descriptors: the log, the watchdog, and a socket for the
-two answers, which is of this process alone. The program does not wait for them: requests stay in the socket while the
-server still imports.
+A request is a packet on a Unix socket that only carries descriptors: a file with the request in JSON, the log, the
+watchdog, and a socket for the two answers, which is of this process alone. The program does not wait for them: requests
+stay in the socket while the server still imports.
 
 The server has one thread: a fork copies only the thread that calls it, and a lock that another one holds would stay
 locked in the copy. If a library has started a thread, the server starts each process without forking, and logs that.
@@ -53,7 +53,8 @@ __all__ = ["NAMES", "Request", "StartServer", "StartedProcess", "main", "start_s
 NAMES = ("detector", "compressor", "trainer")
 
 _ANSWER = struct.Struct("=i")  # the process id, 0 if it could not be started; the exit code, or minus the signal
-_REQUEST_BYTES = 65536
+#: Beginnings of the environment variables that libraries read when they are imported.
+_READ_BY_IMPORTS = ("LD_", "MKL_", "NPY_", "NUMBA_", "OMP_", "OPENBLAS_", "OPENCV_", "PYTHON", "XDG_CACHE_HOME")
 _log = logging.getLogger(__name__)
 
 
@@ -61,16 +62,27 @@ _log = logging.getLogger(__name__)
 class Request:
     """A process to start.
 
-    name       one of `NAMES`
-    job        file of its job
-    folder     its current folder
-    restarted  whether it continues the work of a process that died
+    name         one of `NAMES`
+    job          file of its job
+    restarted    whether it continues the work of a process that died
+    folder       its current folder
+    environment  its environment variables
     """
 
     name: str
     job: str
-    folder: str
     restarted: bool
+    folder: str
+    environment: dict[str, str]
+
+    @classmethod
+    def here(cls, name: str, job: Path, *, restarted: bool) -> Request:
+        """With the folder and the environment of this process."""
+        try:
+            folder = str(Path.cwd())
+        except FileNotFoundError:  # it was removed
+            folder = "/"
+        return cls(name, str(job), restarted, folder, environment())
 
 
 class StartedProcess:
@@ -145,8 +157,7 @@ class StartServer:
     """
 
     def __init__(self) -> None:
-        self._program = os.getpid()
-        self._environment, self._path = environment(), import_path()
+        self._program, self._imports = os.getpid(), _imports()
         self._processes: WeakSet[StartedProcess] = WeakSet()
         self.log = ProcessLog("start server", cast(BinaryIO, tempfile.TemporaryFile()))  # noqa: SIM115
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -155,7 +166,7 @@ class StartServer:
                 python_command(
                     f"from catstream.services.start_server import main; main({theirs.fileno()}, {self._program})"
                 ),
-                env=self._environment,
+                env=environment(),
                 cwd="/",
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,  # a reader of the program's output would wait for the server's end
@@ -176,9 +187,8 @@ class StartServer:
 
     @property
     def is_usable(self) -> bool:
-        """Whether it runs, and would start processes with the present environment of its program."""
-        same = (self._environment, self._path) == (environment(), import_path())
-        return self.is_owned and same and self._process.poll() is None
+        """Whether it runs, and has imported what this program would import now."""
+        return self.is_owned and self._imports == _imports() and self._process.poll() is None
 
     @property
     def is_idle(self) -> bool:
@@ -199,10 +209,11 @@ class StartServer:
             If the server has ended.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
+        with theirs, tempfile.TemporaryFile() as file:
+            file.write(json.dumps(asdict(request)).encode())
+            file.seek(0)
             try:
-                data = json.dumps(asdict(request)).encode()
-                socket.send_fds(self._requests, [data], [log, watchdog, theirs.fileno()])
+                socket.send_fds(self._requests, [b"start"], [file.fileno(), log, watchdog, theirs.fileno()])
             except OSError:
                 ours.close()
                 raise
@@ -218,12 +229,17 @@ class StartServer:
         self.log.close()
 
 
+def _imports() -> tuple[list[str], dict[str, str]]:
+    """What decides what a process imports: its import path, and some of its environment variables."""
+    return import_path(), {name: value for name, value in environment().items() if name.startswith(_READ_BY_IMPORTS)}
+
+
 _servers: list[StartServer] = []
 _lock = threading.Lock()
 
 
 def start_server() -> StartServer:
-    """The server of this program. One is started if there is none, it has ended, or the environment has changed."""
+    """The server of this program; a new one if there is none, or if the program would import something else now."""
     with _lock:
         for server in [*_servers]:
             if server.is_owned and not server.is_usable and server.is_idle:
@@ -295,15 +311,17 @@ class _Server:
                 os.read(self._ended, 4096)
                 self._reap()
             elif self._requests.fileno() in ready:
-                data, descriptors, _, _ = socket.recv_fds(self._requests, _REQUEST_BYTES, 3)
+                data, descriptors, _, _ = socket.recv_fds(self._requests, 16, 4)
                 if not data:
                     return None
-                request = Request(**json.loads(data))
+                file, log, watchdog, answers = descriptors
+                with os.fdopen(file, "rb") as content:
+                    request = Request(**json.loads(content.read()))
                 if request.name in to_import:
                     to_import.remove(request.name)
                     _import(request.name)
-                if self._start(request, *descriptors):
-                    return request, descriptors[1]
+                if self._start(request, log, watchdog, answers):
+                    return request, watchdog
             elif ready:
                 return None
             else:
@@ -322,7 +340,7 @@ class _Server:
         else:
             if not pid:
                 channel.close()
-                self._leave(log, request.folder)
+                self._leave(log, request)
                 return True
             self._answers[pid] = channel
             if not _answer(channel, pid):  # the program wants it no more
@@ -339,7 +357,7 @@ class _Server:
             _log.warning("processes start without a fork, and later: a library has started %d threads", threads - 1)
         return threads == 1
 
-    def _leave(self, log: int, folder: str) -> None:
+    def _leave(self, log: int, request: Request) -> None:
         """Keep nothing of the server in the process that it has forked."""
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -350,8 +368,12 @@ class _Server:
         os.setsid()
         os.dup2(log, sys.stderr.fileno())
         os.close(log)
+        os.environ.clear()
+        os.environ.update(request.environment)
+        limit_process()
+        tempfile.tempdir = None  # it follows from the environment
         with suppress(OSError):  # it was removed
-            os.chdir(folder)
+            os.chdir(request.folder)
         import_module("numpy").random.seed()  # the module `random` does this by itself
         gc.enable()
 

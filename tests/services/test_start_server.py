@@ -1,0 +1,209 @@
+"""The start server forks the processes of a program's pipelines, and ends with the program."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from catstream.job import Job
+from catstream.services import start_server as module
+from catstream.services.process_log import ProcessLog
+from catstream.services.start_server import Request, start_server
+from catstream.services.watchdog import Watchdog
+
+
+@pytest.fixture
+def server(monkeypatch):
+    """A start server of the test's own, the one that `start_server` returns."""
+    monkeypatch.setattr(module, "_servers", [])
+    yield start_server()
+    for each in module._servers:
+        each.close()
+
+
+@pytest.fixture
+def start(server, folder, tmp_path):  # noqa: ARG001  its processes end before the server
+    """Starts a trainer, which runs until it is ended; its process, its watchdog and its log."""
+    started = []
+
+    def trainer(job=None):
+        file = job or Job(endpoint=str(folder)).save(tmp_path)
+        log, watchdog = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), Watchdog()
+        request = Request.here("trainer", file, restarted=False)
+        process = start_server().start(request, log.fileno(), watchdog.handle)
+        started.append((process, watchdog, log))
+        return started[-1]
+
+    yield trainer
+    for process, watchdog, log in started:
+        process.close()
+        watchdog.close()
+        log.close()
+
+
+def sockets(pid):
+    """The sockets and pipes that a process has open."""
+    opened = [str(name.readlink()) for name in Path(f"/proc/{pid}/fd").iterdir()]
+    return [place for place in opened if place.startswith(("socket:", "pipe:"))]
+
+
+def prefixed(monkeypatch, statements):
+    """Let the next servers run other statements first."""
+    command = module.python_command
+    monkeypatch.setattr(module, "python_command", lambda program: command(statements + program))
+
+
+def test_a_process_is_a_fork_of_the_server_with_a_title_a_session_and_a_folder_of_its_own(server, start, until):
+    started, watchdog, _ = start()
+    until(lambda: watchdog.turns > 0)
+    process = psutil.Process(started.pid)
+    assert process.ppid() == server.pid
+    assert "".join(process.cmdline()) == "catstream trainer"
+    assert process.name() == "trainer"
+    assert os.getsid(process.pid) == process.pid
+    assert "".join(psutil.Process(server.pid).cmdline()) == "catstream start server"
+
+
+def test_a_process_has_its_own_descriptors_and_none_of_the_server(start, until):
+    process, watchdog, log = start()
+    until(lambda: watchdog.turns > 0)
+    opened = {name.name: str(name.readlink()) for name in Path(f"/proc/{process.pid}/fd").iterdir()}
+    assert opened["0"] == opened["1"] == "/dev/null"
+    assert opened["2"] == str(Path(f"/proc/self/fd/{log.fileno()}").readlink())
+    of_the_server = set(sockets(psutil.Process(process.pid).ppid()))
+    assert not of_the_server & set(sockets(process.pid))
+
+
+def test_the_server_has_one_thread(server, start):
+    start()[0].pid  # noqa: B018  the server has imported what a trainer needs
+    assert psutil.Process(server.pid).num_threads() == 1
+
+
+def test_the_exit_code_of_a_process_is_known(start, until):
+    process, watchdog, _ = start()
+    until(lambda: watchdog.turns > 0)
+    assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60)
+    assert process.poll() == 0
+
+
+def test_the_signal_that_ended_a_process_is_known(start):
+    process, _, _ = start()
+    process.send_signal(signal.SIGKILL)
+    assert process.wait(60)
+    assert process.poll() == -signal.SIGKILL
+
+
+def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_path):
+    (tmp_path / "job").write_text("not a job")
+    process, _, log = start(tmp_path / "job")
+    assert process.wait(60)
+    assert process.poll() == 2
+    assert "job" in log.last_line()
+
+
+def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_server(server, start, until):
+    process, watchdog, _ = start()
+    until(lambda: watchdog.turns > 0)
+    running = psutil.Process(process.pid)
+    os.kill(server.pid, signal.SIGKILL)
+    assert process.wait(60)
+    assert process.poll() == -signal.SIGKILL
+    until(lambda: not running.is_running())
+    again, watchdog, _ = start()
+    until(lambda: watchdog.turns > 0)
+    assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
+
+
+def test_a_process_has_the_environment_and_the_folder_that_its_program_has_now(
+    server, start, monkeypatch, tmp_path, until
+):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    assert start_server() is server
+    monkeypatch.chdir(tmp_path)
+    started, watchdog, _ = start()
+    until(lambda: watchdog.turns > 0)
+    process = psutil.Process(started.pid)
+    assert process.cwd() == str(tmp_path)
+
+
+def test_a_variable_that_libraries_read_needs_another_server_and_an_idle_one_ends(server, start, monkeypatch):
+    start()[0].close()
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    other = start_server()
+    assert other.pid != server.pid
+    assert not psutil.pid_exists(server.pid)
+    assert psutil.Process(start()[0].pid).ppid() == other.pid
+
+
+def test_a_server_whose_processes_run_is_kept_although_the_environment_has_changed(server, start, monkeypatch):
+    process = start()[0]
+    assert process.pid
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert start_server().pid != server.pid
+    assert process.poll() is None
+
+
+def test_a_server_with_more_than_one_thread_starts_processes_without_forking_and_says_so_once(
+    server, start, monkeypatch, until
+):
+    prefixed(monkeypatch, "import threading; threading.Thread(target=threading.Event().wait, daemon=True).start(); ")
+    server.close()
+    for _ in range(2):
+        process, watchdog, _ = start()
+        until(lambda turns=watchdog: turns.turns > 0)
+        assert psutil.Process(process.pid).ppid() == start_server().pid
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60)
+        assert process.poll() == 0
+    (line,) = module.start_server_lines()
+    assert "without a fork" in line
+
+
+def test_processes_of_one_server_have_random_numbers_of_their_own(server, start, monkeypatch):
+    numbers = "print(random.random(), numpy.random.random(), file=sys.stderr)"
+    prefixed(
+        monkeypatch,
+        "from catstream.threads import limit_process; limit_process(); "
+        "import numpy, random, sys; from catstream.services import loop; "
+        f"loop.run_child = lambda *_, **__: {numbers} or 0; ",
+    )
+    server.close()
+    drawn = []
+    for _ in range(2):
+        process, _, log = start()
+        assert process.wait(60)
+        drawn += log.last_line().split()
+    assert len(set(drawn)) == 4
+
+
+def test_nothing_outlives_a_program_that_is_killed(until):
+    program = (
+        "import time; from catstream.services.start_server import start_server; "
+        "print(start_server().pid, flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as owner:
+        server = psutil.Process(int(owner.stdout.readline()))
+        owner.kill()
+    until(lambda: not server.is_running() or server.status() == psutil.STATUS_ZOMBIE)
+
+
+def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own(server):
+    reading, writing = os.pipe()
+    if not (pid := os.fork()):
+        copy = start_server()
+        os.write(writing, str(copy.pid).encode())
+        copy.close()
+        os._exit(0)
+    assert os.waitpid(pid, 0)[1] == 0
+    assert int(os.read(reading, 100)) != server.pid
+    assert psutil.pid_exists(server.pid)
+    os.close(reading)
+    os.close(writing)
