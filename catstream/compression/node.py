@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -41,7 +40,7 @@ class Node:
         """c of the paper, the energy that all reductions below it lost: ||A||^2 = ||C||^2 + c."""
         return self.energy - energy(self.rows)
 
-    @cached_property
+    @property
     def directions(self) -> np.ndarray:
         """Its rows rotated so that they are orthogonal, strongest first."""
         # Leaves are rotated only if a sample is made of them: most are merged before.

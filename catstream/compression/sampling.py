@@ -9,12 +9,15 @@ makes every row the mean plus a variation.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import takewhile
 
 import numpy as np
 
 from catstream.compression.node import Node
 
 __all__ = ["sample", "share", "spread"]
+
+_NOTHING = np.empty((0, 0), np.float32)
 
 
 def share(level: int, top: int, size: int) -> int:
@@ -26,26 +29,36 @@ def share(level: int, top: int, size: int) -> int:
     return size >> (top - level)
 
 
-def sample(nodes: Sequence[Node], size: int) -> np.ndarray:
+def sample(nodes: Sequence[Node], size: int, sampled: Sequence[Node] = (), known: np.ndarray = _NOTHING) -> np.ndarray:
     """The first n w rows of each node, reflected and rescaled so that each has the weight of one original row.
 
     Parameters
     ----------
     nodes : oldest first, levels strictly falling
     size : n
+    sampled, known : nodes of an earlier sample, and its rows: those of the nodes that both begin with are not computed
+        again
 
     Returns
     -------
     float32 (r, d), r <= 2n; (0, 0) for no nodes
     """
     if not nodes:
-        return np.empty((0, 0), np.float32)
+        return _NOTHING
     counts = [share(node.level, nodes[0].level, size) for node in nodes]
-    rows = np.empty((sum(counts), nodes[0].rows.shape[1]), np.float32)
-    for node, part in zip(nodes, np.split(rows, np.cumsum(counts[:-1])), strict=True):
-        if count := len(part):
-            np.multiply(node.directions[:count], np.float32(np.sqrt(count / node.count)), out=part)
-            spread(part)
+    # If the oldest node is the same, as many rows are taken of each of the others that are.
+    same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], zip(nodes, sampled, strict=False)))
+    drawn = known[: sum(counts[:same])]
+    if same == len(nodes):
+        return drawn
+    new = [_drawn(node, count) for node, count in zip(nodes[same:], counts[same:], strict=True) if count]
+    return np.concatenate([drawn, *new] if same else new)
+
+
+def _drawn(node: Node, count: int) -> np.ndarray:
+    """The first rows of a node, reflected and rescaled."""
+    rows: np.ndarray = node.directions[:count] * np.float32(np.sqrt(count / node.count))
+    spread(rows)
     return rows
 
 

@@ -59,6 +59,8 @@ class CoresetTree:
         self.nodes: list[Node] = []
         self._leaf = np.empty((0, 0), np.float32)  # memory for the next leaf, and its number of rows so far
         self._filled = 0
+        self._sampled: list[Node] = []  # nodes of the last sample, and its rows
+        self._rows = np.empty((0, 0), np.float32)
 
     @property
     def pending(self) -> np.ndarray:
@@ -169,9 +171,14 @@ class CoresetTree:
             self.insert(other.pending)
 
     def sample(self) -> Summary:
-        """A hierarchical sample of at most 2n rows (paper, "Coreset Appearance Model")."""
+        """A hierarchical sample of at most 2n rows (paper, "Coreset Appearance Model").
+
+        The rows of nodes that the last sample had are kept: most nodes are the same for many frames.
+        """
+        self._rows = sampling.sample(self.nodes, self.size, self._sampled, self._rows)
+        self._sampled = list(self.nodes)
         return Summary(
-            rows=sampling.sample(self.nodes, self.size),
+            rows=self._rows,
             mean=(self.sum / max(self.rows_seen, 1)).astype(np.float32),
             count=self.rows_seen,
             levels=tuple(node.level for node in self.nodes),

@@ -85,6 +85,24 @@ def test_same_rows_same_bits(stream):
     assert_array_equal(grown(stream).sample().rows, grown(stream.copy()).sample().rows)
 
 
+@given(st.lists(st.integers(0, 40), max_size=12), st.integers(0, 2**32 - 1))
+def test_a_sample_after_many_others_is_that_of_a_tree_that_made_none(cuts, seed):
+    rows = np.random.default_rng(seed).normal(size=(sum(cuts), 9)).astype(np.float32)
+    tree, start = CoresetTree(4), 0
+    for count in cuts:
+        tree.insert(rows[start : start + count])
+        start += count
+        assert_array_equal(tree.sample().rows, grown(rows[:start], size=4).sample().rows)
+
+
+def test_two_trees_merged_are_sampled_as_a_tree_that_was_not_sampled_before(stream):
+    tree, other = grown(stream[:75]), grown(stream[75:])
+    fresh = tree.merged(other).sample()
+    tree.sample()
+    tree.merge(other)
+    assert_array_equal(tree.sample().rows, fresh.rows)
+
+
 @pytest.mark.parametrize("count", [0, SIZE - 1])
 def test_before_the_first_leaf_there_is_nothing_to_sample(count):
     summary = grown(np.ones((count, 3))).sample()
