@@ -1,11 +1,13 @@
-"""Types of arrays by their dtype; the docstrings say their shapes."""
+"""Types of arrays by their dtype; the docstrings say their shapes. And whether an array is finite."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Bool", "Float32", "Float64", "Int64", "UInt8", "UInt16", "UInt32"]
+__all__ = ["Bool", "Float32", "Float64", "Int64", "UInt8", "UInt16", "UInt32", "is_finite"]
 
 Bool = npt.NDArray[np.bool_]
 UInt8 = npt.NDArray[np.uint8]
@@ -14,3 +16,13 @@ UInt32 = npt.NDArray[np.uint32]
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+
+
+def is_finite(array: np.ndarray) -> bool:
+    """Whether all numbers are finite, in one pass without a temporary array.
+
+    >>> is_finite(np.array([1.0, 1e200])), is_finite(np.array([1.0, np.nan]))
+    (True, False)
+    """
+    # The sum of the squares is finite only if all numbers are; otherwise it may have overflown.
+    return math.isfinite(np.vdot(array, array)) or bool(np.isfinite(array).all())

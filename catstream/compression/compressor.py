@@ -222,7 +222,8 @@ def _rows_of(head: Head, training: TrainingRows) -> Float32:
     if head.label is not None:
         of_label: Bool = training.labels == head.label
         return rows[of_label]
-    wide = np.empty((len(rows), rows.shape[1] + 2), np.float32)
-    wide[:, :-2], wide[:, -2], wide[:, -1] = rows, 1, training.labels
     roots: Float32 = np.sqrt(training.weights, dtype=np.float32)
-    return wide * roots[:, None]
+    wide = np.empty((len(rows), rows.shape[1] + 2), np.float32)
+    np.multiply(rows, roots[:, None], out=wide[:, :-2])
+    wide[:, -2], wide[:, -1] = roots, training.labels * roots
+    return wide

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from catstream import storage
-from catstream.arrays import Float64
+from catstream.arrays import Float64, is_finite
 from catstream.compression import sampling
 from catstream.compression.node import Node
 from catstream.compression.reduce import shrink
@@ -247,7 +247,7 @@ class CoresetTree:
                 f"rows have shape {rows.shape}, this tree was built for (any, {self.width or 'any'}): "
                 "start all services with the same settings"
             )
-        if not np.isfinite(rows).all():
+        if not is_finite(rows):
             raise ProtocolError("rows hold a number that is not finite: check the source of the features")
         return rows
 
@@ -264,7 +264,7 @@ class CoresetTree:
                 raise ValueError(f"a node of {node.rows.dtype} {node.rows.shape}")
             if not 0 <= node.level < _LEVELS or not self._is_count(node.count, node.level):
                 raise ValueError(f"a node of level {node.level} and {node.count} rows")
-            if not (np.isfinite(node.rows).all() and np.isfinite(node.sum).all() and np.isfinite(node.energy)):
+            if not (is_finite(node.rows) and is_finite(node.sum) and np.isfinite(node.energy)):
                 raise ValueError(f"a node of level {node.level} with numbers that are not finite")
 
 

@@ -12,6 +12,7 @@ from typing import Any, get_origin
 
 import numpy as np
 
+from catstream.arrays import is_finite
 from catstream.box import Box, Window
 from catstream.errors import ObjectError, ProtocolError
 from catstream.names import check_name
@@ -124,6 +125,7 @@ def _check_names(found: dict[str, Any], named: Named, where: str) -> None:
 def _array(limits: Array, where: str) -> _Check:
     dtype, shape = np.dtype(limits.dtype), limits.shape
     letters = ", ".join(map(str, shape))
+    bounded = any(map(math.isfinite, (limits.low, limits.high, limits.above)))
 
     def checked(array: np.ndarray, lengths: _Lengths) -> None:
         fits = array.ndim == len(shape) and array.dtype == dtype
@@ -134,10 +136,10 @@ def _array(limits: Array, where: str) -> _Check:
                 f"{where}: expected {dtype} ({letters}), got {array.dtype} {array.shape} with {lengths}",
                 "dtype" if array.dtype != dtype else "shape",
             )
-        if array.size and not limits.may_be_nan:
-            least, most = float(np.minimum.reduce(array, axis=None)), float(np.maximum.reduce(array, axis=None))
-            if not (math.isfinite(least) and math.isfinite(most)):  # NaN is the least and the most
-                raise ProtocolError(f"{where}: holds numbers that are not finite", "finite")
+        if not limits.may_be_nan and not is_finite(array):
+            raise ProtocolError(f"{where}: holds numbers that are not finite", "finite")
+        if bounded and array.size:
+            least, most = float(array.min()), float(array.max())
             if not (limits.low <= least and most <= limits.high and least > limits.above):
                 raise ProtocolError(f"{where}: expected numbers{limits.range()}, got {least:g} to {most:g}", "range")
 

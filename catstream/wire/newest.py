@@ -35,7 +35,7 @@ _MOST_KEPT = 256  # newest messages that are kept, one of each object
 _MOST_TOPICS = 1024  # topics that a publisher knows the subscribers of, and that a subscriber knows the last message of
 _MAX_CHANGES = 1000  # subscriptions that are processed at once
 _MAX_SUBSCRIPTION_BYTES = 4096
-_COMPARED_BYTES = 1 << 16  # at either end of a message, by which a repeat is known
+_COMPARED_BYTES = 1 << 12  # at either end of a message, by which a repeat is known
 _REPEAT_SECONDS = 0.2  # without a newer message, after which the last ones are sent again; doubled each time
 _READER = b"\xffreader "  # begins the topic that makes an announced subscriber known; no message begins with it
 
