@@ -5,9 +5,11 @@ By the push-through identity an r x r system is solved in place of a d x d one: 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-__all__ = ["between", "fit", "prepare"]
+__all__ = ["Regression", "between", "prepare"]
 
 
 def prepare() -> None:
@@ -30,35 +32,41 @@ def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.n
     -------
     float32 (d,)
     """
-    centred = (background - background.mean(axis=0)) / np.float32(np.sqrt(len(background)))
-    inner = _solve(centred @ centred.T, penalty, centred @ towards)
-    direction: np.ndarray = (towards - centred.T @ inner) / np.float32(penalty)
+    centred = background - background.mean(axis=0)
+    solve = _solver(centred @ centred.T, penalty * len(centred))
+    direction: np.ndarray = (towards - centred.T @ solve(centred @ towards)) / np.float32(penalty)
     return direction
 
 
-def fit(rows: np.ndarray, penalty: float) -> tuple[np.ndarray, float]:
+class Regression:
     """The weights and the bias that minimise ||A [w; b; -1]||^2 / r + penalty ||w||^2.
+
+    The system depends on the features only: it is factored once, and solved for any labels in O(r d).
 
     Parameters
     ----------
     rows : float32 (r, d + 2), A: rows [x, 1, y], or any left rotation of them
     penalty : lambda
-
-    Returns
-    -------
-    w, float32 (d,), and b
     """
-    scaled = rows / np.float32(np.sqrt(len(rows)))
-    x, ones, y = scaled[:, :-2], scaled[:, -2], scaled[:, -1]
-    solved = _solve(x @ x.T, penalty, np.stack([y, ones], axis=1))
-    bias = (ones @ solved[:, 0]) / (ones @ solved[:, 1])
-    weights: np.ndarray = x.T @ (solved[:, 0] - bias * solved[:, 1])
-    return weights, float(bias)
+
+    def __init__(self, rows: np.ndarray, penalty: float) -> None:
+        self.rows = rows
+        x = rows[:, :-2]
+        self._solve = _solver(x @ x.T, penalty * len(rows))
+
+    def fit(self, labels: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+        """w, float32 (d,), and b; for other labels (r,) than those of the rows, if given."""
+        x, ones = self.rows[:, :-2], self.rows[:, -2]
+        solved = self._solve(np.stack([self.rows[:, -1] if labels is None else labels, ones], axis=1))
+        bias = (ones @ solved[:, 0]) / (ones @ solved[:, 1])
+        weights: np.ndarray = x.T @ (solved[:, 0] - bias * solved[:, 1])
+        return weights, float(bias)
 
 
-def _solve(gram: np.ndarray, penalty: float, right: np.ndarray) -> np.ndarray:
+def _solver(gram: np.ndarray, penalty: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Solves (gram + penalty I) z = right for any right side, by its Cholesky factor; changes the array."""
     import scipy.linalg  # imported late: a restarted detector has its model, and does not need scipy
 
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
-    solved: np.ndarray = scipy.linalg.solve(gram, right, assume_a="pos", overwrite_a=True, check_finite=False)
-    return solved
+    factor = scipy.linalg.cho_factor(gram, overwrite_a=True, check_finite=False)
+    return lambda right: scipy.linalg.cho_solve(factor, right, check_finite=False)

@@ -31,6 +31,7 @@ class Trainer:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
+        self._regressions: dict[str, dict[str, ridge.Regression]] = {}  # of the last samples, by object and head
         ridge.prepare()  # before the first sample, because the detector waits for its model
 
     def train(self, sample: Sample) -> Model:
@@ -44,6 +45,9 @@ class Trainer:
         ProtocolError
             If object and background are the same in the sample.
         """
+        self._regressions[sample.object] = self._regressions.pop(sample.object, {})
+        if len(self._regressions) > self.settings.run.objects_most:  # the longest ago: it was forgotten
+            del self._regressions[next(iter(self._regressions))]
         background_mean = sample.trees["background"].mean
         apart = sample.trees["object"].mean - background_mean
         # Very few rows may give a direction in which the object does not score higher: it is left out.
@@ -55,7 +59,7 @@ class Trainer:
             )
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
         bias = -float(weights @ background_mean)
-        heads, biases = _head_vectors(sample, weights)
+        heads, biases = self._head_vectors(sample, weights)
         return Model(sample.version, sample.frame, weights, bias, motion, heads, biases, sample.object)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
@@ -67,11 +71,35 @@ class Trainer:
         return [
             _between(sample),
             *(
-                ridge.fit(sample.trees[name].rows, head.ridge)[0]
+                self._regression(sample, name, head.ridge).fit()[0]
                 for name, head in HEADS.items()
                 if head.adds_to_score and head.ridge is not None
             ),
         ]
+
+    def _head_vectors(self, sample: Sample, weights: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+        """The vectors of the heads that do not add to the score, and the biases of those that have one.
+
+        The others are fitted to the residual of the labels, label - weights @ row: detection adds both products when it
+        chooses size and aspect.
+        """
+        vectors, biases = {}, {}
+        for name, head in HEADS.items():
+            if head.ridge is None or head.adds_to_score or name not in sample.trees:
+                continue
+            regression, rows = self._regression(sample, name, head.ridge), sample.trees[name].rows
+            if head.has_bias:
+                vectors[name], biases[name] = regression.fit()
+            else:
+                vectors[name], _ = regression.fit(rows[:, -1] - rows[:, :-2] @ weights)
+        return vectors, biases
+
+    def _regression(self, sample: Sample, name: str, penalty: float) -> ridge.Regression:
+        """The regression of a head, as it was factored for the last sample if that had the same rows."""
+        rows, known = sample.trees[name].rows, self._regressions[sample.object]
+        if name not in known or not np.array_equal(known[name].rows, rows):
+            known[name] = ridge.Regression(rows, penalty)
+        return known[name]
 
 
 def _between(sample: Sample) -> np.ndarray:
@@ -81,25 +109,6 @@ def _between(sample: Sample) -> np.ndarray:
     """
     background = sample.trees["background"]
     return ridge.between(background.rows, sample.trees["object"].mean - background.mean, BETWEEN_RIDGE)
-
-
-def _head_vectors(sample: Sample, weights: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """The vectors of the heads that do not add to the score, and the biases of those that have one.
-
-    The others are fitted to the residual of the labels, label - weights @ row: detection adds both products when it
-    chooses size and aspect.
-    """
-    vectors, biases = {}, {}
-    for name, head in HEADS.items():
-        if head.ridge is None or head.adds_to_score or name not in sample.trees:
-            continue
-        rows = sample.trees[name].rows
-        if head.has_bias:
-            vectors[name], biases[name] = ridge.fit(rows, head.ridge)
-        else:
-            left = rows[:, -1] - rows[:, :-2] @ weights
-            vectors[name], _ = ridge.fit(np.column_stack([rows[:, :-1], left]), head.ridge)
-    return vectors, biases
 
 
 def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | None:

@@ -68,7 +68,7 @@ def test_the_heads_predict_by_how_many_steps_a_window_is_too_large_or_too_wide(d
     for group, wrong in ((SIZE, window.scaled(extent.size(steps))), (ASPECT, window.scaled(*extent.stretch(steps)))):
         rows = training[group]
         table = np.column_stack([rows.rows, np.ones(len(rows)), rows.labels]).astype(np.float32)
-        weights, bias = ridge.fit(table, HEADS[group].ridge)
+        weights, bias = ridge.Regression(table, HEADS[group].ridge).fit()
         row = Cells.within(frame.around(wrong, WINDOW_CELLS)).row(0, 0)
         assert (row @ weights + bias - 0.5) * 16 == pytest.approx(steps, abs=0.7)
 

@@ -37,6 +37,20 @@ def test_the_same_sample_gives_the_same_bits(sample):
     assert one.bias == two.bias
 
 
+def test_a_model_does_not_depend_on_the_samples_before_it(sample, rng):
+    rows = rng.normal(size=sample.trees["size"].rows.shape).astype(np.float32)
+    other = dataclasses.replace(
+        sample, trees=sample.trees | {"size": dataclasses.replace(sample.trees["size"], rows=rows)}
+    )
+    trainer = Trainer(Settings())
+    for each in (sample, other, dataclasses.replace(other, object="anna"), other, sample):
+        model, alone = trainer.train(each), Trainer(Settings()).train(each)
+        assert {name: each.tobytes() for name, each in model.heads.items()} == {
+            name: each.tobytes() for name, each in alone.heads.items()
+        }
+        assert (model.weights.tobytes(), model.biases) == (alone.weights.tobytes(), alone.biases)
+
+
 def test_centres_give_a_motion(sample):
     centres = np.cumsum(np.random.default_rng(0).normal(size=(64, 2)), axis=0)
     assert Trainer(Settings()).train(dataclasses.replace(sample, centres=centres)).motion is not None
