@@ -9,7 +9,7 @@ import numpy as np
 
 from catstream.arrays import Float32
 
-__all__ = ["energy", "prepare", "reduce", "shrink"]
+__all__ = ["energy", "prepare", "products", "reduce", "shrink"]
 
 _TINY = np.float32(1e-30)  # in place of an energy of 0, which nothing can be divided by
 
@@ -30,7 +30,22 @@ def energy(rows: np.ndarray) -> float:
     return float(flat @ flat)
 
 
-def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np.ndarray:
+def products(rows: np.ndarray) -> np.ndarray:
+    """The products of all pairs of rows, float32 (m, m); above the diagonal are zeros.
+
+    >>> products(np.array([[2, 0], [3, 1]], np.float32))
+    array([[ 4.,  0.],
+           [ 6., 10.]], dtype=float32)
+    """
+    from scipy.linalg.blas import ssyrk  # imported late, so that a restarted compressor can answer first
+
+    gram: np.ndarray = ssyrk(1, rows.T, trans=1, lower=1)  # one triangle: the matrix is symmetric
+    return gram
+
+
+def reduce(
+    rows: np.ndarray, size: int, towards: np.ndarray | None = None, gram: np.ndarray | None = None
+) -> np.ndarray:
     """Shrink rows to at most `size`, keeping the strongest directions.
 
     For every orthonormal Y, ||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2 with
@@ -43,6 +58,7 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     size : rows to keep (n in the paper), at least 1
     towards : float (d,), each row gets the sign with which its product with this vector is not negative, because the
         sign of a singular vector is arbitrary; None: the sum of the rows
+    gram : `products` of the rows, if they are known
 
     Returns
     -------
@@ -51,11 +67,13 @@ def reduce(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     >>> reduce(np.ones((6, 4), np.float32), size=2).shape
     (2, 4)
     """
-    _, kept = _strongest(rows, size, towards)
+    _, kept = _strongest(rows, size, towards, gram)
     return kept
 
 
-def shrink(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np.ndarray:
+def shrink(
+    rows: np.ndarray, size: int, towards: np.ndarray | None = None, gram: np.ndarray | None = None
+) -> np.ndarray:
     """Shrink rows to `size` by frequent directions (Liberty 2013): each loses the energy of the strongest dropped one.
 
     With s_i the singular values, strongest first, row i has the energy max(s_i^2 - s_(size + 1)^2, 0). For every unit
@@ -69,21 +87,21 @@ def shrink(rows: np.ndarray, size: int, towards: np.ndarray | None = None) -> np
     >>> (shrink(np.diag([3.0, 2, 1]).astype(np.float32), size=2) ** 2).round().tolist()
     [[8.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
     """
-    energies, kept = _strongest(rows, size + 1, towards)
+    energies, kept = _strongest(rows, size + 1, towards, gram)
     scale = np.sqrt(1 - energies[size] / np.maximum(energies[:size], _TINY))
     shrunk: Float32 = kept[:size] * scale[:, None]
     return shrunk
 
 
-def _strongest(rows: np.ndarray, count: int, towards: np.ndarray | None) -> tuple[Float32, Float32]:
+def _strongest(
+    rows: np.ndarray, count: int, towards: np.ndarray | None, gram: np.ndarray | None
+) -> tuple[Float32, Float32]:
     """Energies and rows s_i v_i of the `count` strongest directions, all of them if there are fewer rows."""
-    from scipy.linalg.blas import ssyrk  # imported late, so that a restarted compressor can answer first
     from scipy.linalg.lapack import ssyevd
 
     keep = min(count, len(rows))
-    gram = ssyrk(1, rows.T, trans=1, lower=1)  # one triangle: the matrix is symmetric
     # Divide and conquer: other drivers lose orthogonality, or vectors, if many eigenvalues are equal.
-    energies, vectors, failed = ssyevd(gram, lower=1, overwrite_a=1)
+    energies, vectors, failed = ssyevd(products(rows) if gram is None else gram, lower=1)
     if failed:
         raise np.linalg.LinAlgError(f"no eigenvectors of the products of {len(rows)} rows were found")
     # The rows of A are weighted by row i of `strongest`, and their sum is s_i v_i.

@@ -57,7 +57,7 @@ def sample(nodes: Sequence[Node], size: int, sampled: Sequence[Node] = (), known
 
 def _drawn(node: Node, count: int) -> np.ndarray:
     """The first rows of a node, reflected and rescaled."""
-    rows: np.ndarray = node.directions[:count] * np.float32(np.sqrt(count / node.count))
+    rows: np.ndarray = node.directions(count) * np.float32(np.sqrt(count / node.count))
     spread(rows)
     return rows
 

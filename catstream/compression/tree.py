@@ -289,7 +289,7 @@ class FrequentDirections(CoresetTree):
 
     def _merged(self, older: Node, newer: Node) -> Node:
         total, count = older.sum + newer.sum, older.count + newer.count
-        rows = shrink(np.vstack([older.rows, newer.rows]), self.size, towards=total)
+        rows = shrink(np.vstack([older.rows, newer.rows]), self.size, total, older.products_with(newer))
         return Node((count // self.size).bit_length() - 1, rows, count, total, older.energy + newer.energy)
 
     def _is_count(self, count: int, level: int) -> bool:
