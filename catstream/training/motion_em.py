@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from catstream.arrays import Float64
+from catstream.arrays import Bool, Float64
 from catstream.kalman import OBSERVED, TRANSITION, constant_velocity
 from catstream.messages import Motion
 
@@ -42,7 +42,7 @@ def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
     >>> learn_motion(walk[:5]) is None
     True
     """
-    present = np.flatnonzero(np.isfinite(centres).all(axis=1))
+    present = np.flatnonzero(_present(centres))
     if len(present) < FEWEST:
         return None
     mean, covariance, motion = _start(centres[present])
@@ -71,9 +71,12 @@ def _smooth(
     A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
     """
     kalman = constant_velocity(mean, covariance, motion.process, motion.observation)
-    measured = [centre if np.isfinite(centre).all() else None for centre in centres]
-    states, covariances, _, _ = kalman.batch_filter(measured, update_first=True)
-    states, covariances, gains, _ = kalman.rts_smoother(states, covariances)
+    kalman.inv = _inverse
+    measured = [centre if seen else None for centre, seen in zip(centres, _present(centres), strict=True)]
+    states, covariances, _, predicted = kalman.batch_filter(measured, update_first=True)
+    # The smoother asks for the inverse of each predicted covariance, the newest first: one call for all is faster.
+    inverses = iter(np.linalg.inv(predicted[-2::-1]))
+    states, covariances, gains, _ = kalman.rts_smoother(states, covariances, inv=lambda _: next(inverses))
     return states, covariances, covariances[1:] @ gains[:-1].transpose(0, 2, 1)
 
 
@@ -84,10 +87,23 @@ def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lag
     spread = covariances[1:].sum(axis=0) + TRANSITION @ covariances[:-1].sum(axis=0) @ TRANSITION.T
     process = (push.T @ push + spread - together - together.T) / len(push)
 
-    seen = np.isfinite(centres).all(axis=1)
+    seen = _present(centres)
     error = centres[seen] - states[seen] @ OBSERVED.T
     observation = error.T @ error / len(error) + OBSERVED @ covariances[seen].mean(axis=0) @ OBSERVED.T
     return Motion(_floored(process, PROCESS_FLOOR), _floored(observation, OBSERVATION_FLOOR))
+
+
+def _present(centres: np.ndarray) -> Bool:
+    """Which centres were measured, (m,)."""
+    present: Bool = np.isfinite(centres).all(axis=1)
+    return present
+
+
+def _inverse(matrix: Float64) -> Float64:
+    """The inverse of a matrix of shape (2, 2), in a quarter of the time of `np.linalg.inv`."""
+    (a, b), (c, d) = matrix.tolist()
+    inverse: Float64 = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
+    return inverse
 
 
 def _floored(covariance: Float64, floor: float) -> Float64:
