@@ -6,6 +6,7 @@ import os
 from functools import cache
 
 import zmq
+import zmq.utils.garbage  # with the first message that is not copied, zmq would import it
 
 __all__ = ["context"]
 
