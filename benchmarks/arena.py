@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import socket
 import subprocess
 import threading
@@ -24,9 +25,9 @@ from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.job import Job
 from catstream.messages import Answer, End, ObjectPosition, Position, Track, Tracks
+from catstream.services.child import Child
 from catstream.services.loop import PERMANENT_FAILURE
-from catstream.services.start import service_command
-from catstream.services.start_server import NAMES
+from catstream.services.start_server import NAMES, start_server
 from catstream.settings import Settings
 from catstream.steering import Control, control
 from catstream.wire.acknowledged import Receiver
@@ -164,7 +165,7 @@ class Arena:
         self._settings, self._source, self._boxes, self._folder = settings, source, boxes, scratch
         self._found = {name: ObjectPosition(box) for name, box in boxes.items()}
         self._clock = scratch / "clock"
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._children: dict[str, Child] = {}
         self._places: dict[str, Endpoint] = {}
         self._last_received = monotonic()
 
@@ -185,9 +186,12 @@ class Arena:
             self._models = stack.enter_context(Subscriber(MODELS, self._places["trainer"]))
             self._control = stack.enter_context(control(str(self._places["detector"]), timeout=_PATIENCE_SECONDS))
             self._pool = stack.enter_context(ThreadPoolExecutor(1))
-            stack.callback(self._stop)
+            path = os.pathsep.join([str(self._folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+            stack.enter_context(_variables({"PYTHONPATH": path, "ARENA_CLOCK": str(self._clock)}))
             for name in NAMES:
-                self._start(name)
+                self._children[name] = Child(name, self._job(name), self._folder)
+                stack.callback(self._children[name].close)
+                self._children[name].start()
             self._stack = stack.pop_all()
         return self
 
@@ -218,13 +222,13 @@ class Arena:
             raise ServiceError(
                 f"no track arrived for {_PATIENCE_SECONDS:.0f} s after {len(self.tracks)}: {self.words()}"
             )
-        for name, process in self._processes.items():
-            code = process.poll()
+        for name, child in self._children.items():
+            code = child.code
             if code == PERMANENT_FAILURE:
                 raise ServiceError(f"the {name} gave up: {self.words()}")
             if code and self.end is None:
                 self.deaths += 1
-                self._start(name)
+                child.start()
 
     def until(self, done: Callable[[], bool]) -> None:
         """Call `turn` until a condition is true or the run has ended."""
@@ -240,7 +244,7 @@ class Arena:
         """Call `turn` until the stream and all processes have ended."""
         self.until(lambda: False)
         over = monotonic() + _PATIENCE_SECONDS
-        while any(process.poll() is None for process in self._processes.values()) and monotonic() < over:
+        while any(child.code is None for child in self._children.values()) and monotonic() < over:
             self.turn()
 
     def command(self, give: Callable[[Control], Answer]) -> Answer | None:
@@ -255,8 +259,13 @@ class Arena:
 
     def signal(self, name: str, number: int) -> None:
         """Send a signal to a process if it runs."""
-        with suppress(ProcessLookupError):
-            self._processes[name].send_signal(number)
+        if (pid := self._children[name].pid) is not None:
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+
+    def kill_start_server(self) -> None:
+        """Kill the process that has forked all the others; they end with it."""
+        os.kill(start_server().pid, signal.SIGKILL)
 
     def set_clock(self, seconds: float) -> None:
         """Shift the wall clock of all processes by some seconds."""
@@ -264,31 +273,30 @@ class Arena:
 
     def words(self) -> str:
         """Return the last log line of each process."""
-        logs = {name: self._folder / f"{name}.log" for name in NAMES}
-        lines = {name: log.read_text(errors="replace").strip().splitlines() for name, log in logs.items()}
-        return "; ".join(f"{name}: {said[-1] if said else 'nothing'}" for name, said in lines.items())
+        return "; ".join(f"{name}: {child.log.last_line()}" for name, child in self._children.items())
 
-    def _start(self, name: str) -> None:
-        # Each process meets the others at a link of its own, so each has a job of its own.
+    def _job(self, name: str) -> Path:
+        """The file of the job of a process: each meets the others at a link of its own."""
         folder = self._folder / f"job-{name}"
         folder.mkdir(exist_ok=True)
         job = Job(self._source, self._boxes, settings=self._settings, owned=True, resume=True)
         state = self.state if name == "compressor" else folder
-        file = replace(job, state=state, endpoint=str(self._places[name])).save(folder)
-        command = service_command("child", name, str(file), "--parent", str(os.getpid()))
-        path = os.pathsep.join([str(self._folder), *filter(None, [os.environ.get("PYTHONPATH")])])
-        with (self._folder / f"{name}.log").open("ab") as log:
-            self._processes[name] = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stderr=log,
-                env={**os.environ, "PYTHONPATH": path, "ARENA_CLOCK": str(self._clock)},
-            )
+        return replace(job, state=state, endpoint=str(self._places[name])).save(folder)
 
-    def _stop(self) -> None:
-        for process in self._processes.values():
-            process.kill()
-            process.wait()
+
+@contextmanager
+def _variables(variables: dict[str, str]) -> Iterator[None]:
+    """Set environment variables of this process, which those that it starts inherit."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 @contextmanager

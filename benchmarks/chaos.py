@@ -60,6 +60,10 @@ def kill(*names: str) -> Fault:
     return strike
 
 
+def kill_start_server(arena: Arena, _: np.random.Generator) -> None:
+    arena.kill_start_server()
+
+
 def freeze(arena: Arena, random: np.random.Generator) -> None:
     name = str(random.choice(NAMES))
     arena.signal(name, signal.SIGSTOP)
@@ -103,6 +107,7 @@ FAULTS: dict[str, tuple[Fault, float]] = {
     "kill -9 compressor": (kill("compressor"), 3),
     "kill -9 trainer": (kill("trainer"), 2),
     "kill -9 all three": (kill(*NAMES), 2),
+    "kill -9 start server": (kill_start_server, 1),
     "SIGSTOP, SIGCONT": (freeze, 2),
     "link cut": (cut, 2),
     "link slow": (slow, 1),
