@@ -106,6 +106,19 @@ def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):
     assert not any(map(alive, [*killed, *pids.values()]))
 
 
+def test_if_the_start_server_is_killed_the_run_continues_without_a_lost_frame(video):
+    path, boxes = video
+    tracks = []
+    with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 4, "lag_frames": 2})) as pipeline:
+        for track in pipeline:
+            tracks.append(track)
+            if track.frame == 5:
+                psutil.Process(pipeline.pids["detector"]).parent().kill()
+        assert pipeline.restarts == len(NAMES)
+    assert [track.frame for track in tracks] == list(range(pipeline.frames))
+    assert pipeline.totals["stored"] == pipeline.totals["sent"] == pipeline.frames
+
+
 def test_a_part_is_followed_whole_though_the_detector_dies(long_video):
     path, boxes = long_video
     part = slice(10, 60, 2)
