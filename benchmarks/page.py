@@ -197,13 +197,19 @@ def _accuracy(found: Mapping[str, Record]) -> str:
 def _figures(found: Mapping[str, Record]) -> str:
     accuracy, speed = found["accuracy"], found["speed"]
     ours, theirs = (accuracy["mean"][name] for name in ("catstream", "csrt"))
-    rates = {row[0]: row[1] for table in speed["tables"] if table["title"] == _PEERS for row in table["rows"]}
+    rates = {row[0]: row[1:3] for table in speed["tables"] if table["title"] == _PEERS for row in table["rows"]}
+    (start, rest), (one_start, one_rest) = rates["catstream, three processes"], rates["catstream, one core"]
+    csrt, threaded = rates["csrt, one core"][1], rates["csrt, all cores"][1]
     sequences = len({row["name"] for row in accuracy["sequences"]})
     return filled(f"""
         On {sequences} public sequences, the area under the success plot (AUC) is **{ours["auc"]:.3f}**; that of
         OpenCV's CSRT is {theirs["auc"]:.3f} (`{accuracy["command"]}`). The defaults were chosen on 20 of the sequences;
-        [Results](docs/results.md) lists the others separately. On one core, catstream processes
-        **{rates["catstream"]:.0f} frames/s**, and CSRT {rates["csrt"]:.0f} (`{speed["command"]}`).""")
+        [Results](docs/results.md) lists the others separately.
+
+        On {speed["machine"]["cores"]} cores, `catstream track` processes **{rest:.0f} frames/s** ({start:.0f} in the
+        first 150 frames), the three processes and the decoding included; `catstream.Tracker` in one process
+        {one_rest:.0f} ({one_start:.0f}). CSRT processes {csrt:.0f} frames/s on one core and {threaded:.0f} on
+        {speed["machine"]["cores"]} (`{speed["command"]}`).""")
 
 
 _HEAD = """
