@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -19,7 +20,7 @@ import numpy as np
 if TYPE_CHECKING:
     from filterpy.kalman import KalmanFilter
 
-__all__ = ["OBSERVED", "TRANSITION", "constant_velocity"]
+__all__ = ["OBSERVED", "TRANSITION", "constant_velocity", "predicted", "updated"]
 
 TRANSITION = np.eye(4) + np.eye(4, k=2)  #: each position moves on by its velocity
 OBSERVED = np.eye(2, 4)  #: of the state, x and y are measured
@@ -42,31 +43,42 @@ def constant_velocity(
     >>> kalman.x
     array([13., 20.,  3.,  0.])
     """
-    kalman: KalmanFilter = _KalmanFilter(dim_x=4, dim_z=2)
+    kalman: KalmanFilter = _filterpy.KalmanFilter(dim_x=4, dim_z=2)
     kalman.F, kalman.H = TRANSITION, OBSERVED
     kalman.x, kalman.P, kalman.Q, kalman.R = mean, covariance, process, observation
     return kalman
 
 
-def _kalman_filter() -> type[KalmanFilter]:
-    """filterpy's class, from its two files alone.
+def predicted(
+    mean: np.ndarray, covariance: np.ndarray, transition: np.ndarray, process: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the state in the next frame, without the working space of a filter's object."""
+    mean, covariance = _filterpy.predict(mean, covariance, transition, process)
+    return mean, covariance
+
+
+def updated(
+    mean: np.ndarray, covariance: np.ndarray, measured: np.ndarray, observation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the state after a measurement of x and y, float64 (2,)."""
+    mean, covariance = _filterpy.update(mean, covariance, measured, observation, OBSERVED)
+    return mean, covariance
+
+
+def _imported() -> ModuleType:
+    """filterpy's Kalman filter, from two files of it alone.
 
     The packages of filterpy import scipy.stats for their other filters, which costs a second of processor time. If the
-    program has imported filterpy, the class is that of the program.
+    program has imported filterpy, the module is that of the program.
     """
-    if "filterpy.kalman" not in sys.modules:
-        package = find_spec("filterpy")
-        if package is not None and package.origin is not None:
-            folder = Path(package.origin).parent
-            common = _loaded("filterpy.common.helpers", folder / "common" / "helpers.py")
-            stats = ModuleType("filterpy.stats")
-            stats.logpdf = _logpdf  # type: ignore[attr-defined]
-            with _modules({common.__name__.removesuffix(".helpers"): common, stats.__name__: stats}):
-                module = _loaded("filterpy.kalman.kalman_filter", folder / "kalman" / "kalman_filter.py")
-            return module.KalmanFilter  # type: ignore[no-any-return]
-    from filterpy.kalman import KalmanFilter
-
-    return KalmanFilter  # type: ignore[no-any-return]
+    if "filterpy.kalman" not in sys.modules and (package := find_spec("filterpy")) is not None and package.origin:
+        folder = Path(package.origin).parent
+        common = _loaded("filterpy.common.helpers", folder / "common" / "helpers.py")
+        stats = ModuleType("filterpy.stats")
+        stats.logpdf = _logpdf  # type: ignore[attr-defined]
+        with _modules({"filterpy.common": common, "filterpy.stats": stats}):
+            return _loaded("filterpy.kalman.kalman_filter", folder / "kalman" / "kalman_filter.py")
+    return import_module("filterpy.kalman")
 
 
 def _loaded(name: str, file: Path) -> ModuleType:
@@ -101,4 +113,4 @@ def _logpdf(*values: Any, **options: Any) -> float:
     return float(logpdf(*values, **options))
 
 
-_KalmanFilter = _kalman_filter()
+_filterpy = _imported()

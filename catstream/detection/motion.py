@@ -20,7 +20,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from catstream.kalman import TRANSITION, constant_velocity
+from catstream import kalman
+from catstream.kalman import TRANSITION
 from catstream.messages import DetectorState, Motion
 
 __all__ = ["at_rest", "expected", "measured", "observed", "predicted"]
@@ -41,16 +42,15 @@ def at_rest(centre: tuple[float, float], motion: Motion) -> np.ndarray:
 
 def predicted(estimate: np.ndarray, motion: Motion, *, lost: bool = False) -> np.ndarray:
     """The estimate in the next frame."""
-    kalman = constant_velocity(estimate[0], estimate[1:], motion.process, motion.observation)
-    kalman.predict(F=_COASTING if lost else TRANSITION)
-    return np.vstack([kalman.x, kalman.P])
+    return np.vstack(kalman.predicted(estimate[0], estimate[1:], _COASTING if lost else TRANSITION, motion.process))
 
 
 def measured(estimate: np.ndarray, motion: Motion, centre: tuple[float, float]) -> np.ndarray:
     """The estimate after a measurement of x and y in this frame."""
-    kalman = constant_velocity(estimate[0], estimate[1:], motion.process, motion.observation)
-    kalman.update(np.array(centre))
-    return at_rest(centre, motion) if kalman.mahalanobis > _JUMP else np.vstack([kalman.x, kalman.P])
+    away = np.array(centre) - estimate[0, :2]
+    if away @ np.linalg.solve(estimate[1:3, :2] + motion.observation, away) > _JUMP**2:
+        return at_rest(centre, motion)
+    return np.vstack(kalman.updated(estimate[0], estimate[1:], np.array(centre), motion.observation))
 
 
 def expected(state: DetectorState) -> DetectorState:

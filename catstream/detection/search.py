@@ -120,8 +120,8 @@ class ScoreMap:
 
     def highest(self, penalty: np.ndarray | float = 0.0) -> tuple[int, int]:
         """Row and column of the window with the highest score less a penalty."""
-        row, column = np.unravel_index((self.scores - penalty).argmax(), self.scores.shape)
-        return int(row), int(column)
+        row, column = divmod(int((self.scores - penalty).argmax()), self.scores.shape[1])
+        return row, column
 
     def best(self, penalty: np.ndarray | float = 0.0) -> Detection:
         """The window with the highest score less a penalty, its place refined between the cells."""
@@ -455,4 +455,4 @@ def vertex(values: np.ndarray, i: int) -> float:
         return 0.0
     before, here, after = float(values[i - 1]), float(values[i]), float(values[i + 1])
     bend = before - 2 * here + after
-    return float(np.clip((before - after) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
+    return min(max((before - after) / (2 * bend), -0.5), 0.5) if bend < 0 else 0.0
