@@ -306,18 +306,16 @@ def _surroundings(
     rows, columns = around.scores.shape
     down, across = np.arange(rows)[:, None] - row, np.arange(columns) - column
     outside = np.maximum(abs(down), abs(across)) > _NEAR + 0.5
-    misses, labels = [], []
-    near = np.argwhere(~outside)
+    near, anywhere = np.argwhere(~outside), np.argwhere(outside)
+    places, labels = [], []
     for place in near[rng.integers(len(near), size=teaching.near_misses)] if len(near) else ():
         distance = math.hypot(down[place[0], 0], across[place[1]])
         if distance > _NEAREST:
-            misses.append(around.row(*place))
+            places.append(place)
             labels.append(_gaussian(distance, _NEAR_SIGMA))
-    places = non_maximum_suppression(np.where(outside, around.scores, -np.inf), hardest, _NEAR)
-    anywhere = np.argwhere(outside)
-    places += list(map(tuple, rng.choice(anywhere, count - len(places), replace=count > len(anywhere))))
-    background = [around.row(*place) for place in places]
-    return _rows([*misses, *background], [*labels, *[0.0] * len(background)], 1, teaching)
+    hard = non_maximum_suppression(np.where(outside, around.scores, -np.inf), hardest, _NEAR)
+    background = [*hard, *rng.choice(anywhere, count - len(hard), replace=count > len(anywhere))]
+    return _rows(around.cells.rows([*places, *background]), [*labels, *[0.0] * len(background)], 1, teaching)
 
 
 def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Settings) -> Training:
@@ -383,7 +381,8 @@ def _rows(
     rows: Sequence[np.ndarray] | np.ndarray, labels: float | list[float], weight: float, teaching: TeachingSettings
 ) -> TrainingRows:
     """Training rows of one weight; the histogram of colours is 0 unless it is used: then no model weighs it."""
-    k, table = len(rows), np.array(rows, np.float32).reshape(len(rows), row_length())
+    k, table = len(rows), np.asarray(rows, np.float32).reshape(len(rows), row_length())
     if not teaching.colours:
+        table = table.copy()
         table[:, COLOURS] = 0
     return TrainingRows(table, np.full(k, labels, np.float32), np.full(k, weight, np.float32))

@@ -5,12 +5,14 @@ A window is 8 x 8 cells. Its feature row holds their HOG and mean colours, and t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from catstream.arrays import Float32
+from catstream.arrays import Float32, Int64, UInt16
 from catstream.features import colours
+from catstream.features.colours import count
 from catstream.features.compiled import kernel
 from catstream.features.hog import grid
 from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, WINDOW, row_length
@@ -50,9 +52,13 @@ class Cells:
 
     def row(self, row: int, column: int) -> np.ndarray:
         """Feature row of the window whose first cell is (row, column), float32 (d,)."""
-        features = np.empty(row_length(), np.float32)
-        features[:_PLACES] = self.grid[row : row + WINDOW, column : column + WINDOW].reshape(-1)
-        colours.histogram(self.shades, row, column, features[COLOURS])
+        features: np.ndarray = self.rows([(row, column)])[0]
+        return features
+
+    def rows(self, places: Sequence[tuple[int, int]]) -> np.ndarray:
+        """Feature rows of the windows whose first cells are at (row, column), float32 (k, d)."""
+        features = np.empty((len(places), row_length()), np.float32)
+        _cut(self.grid.reshape(len(self.grid), -1), self.shades, np.array(places, np.int64).reshape(-1, 2), features)
         return features
 
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
@@ -70,7 +76,7 @@ class Cells:
         """The same scores, but -inf for every window whose score is below `least`.
 
         The colours of a window are not counted if its score would be below `least` with any histogram of colours: this
-        takes a third of the time of `respond` if few windows score that high.
+        takes three quarters of the time of `respond` if few windows score that high.
         """
         reach = least - colours.highest_score(weights[COLOURS])
         scores = self._places(weights, bias)
@@ -80,21 +86,36 @@ class Cells:
         return scores
 
     def _places(self, weights: np.ndarray, bias: float) -> np.ndarray:
-        """Score of every window without its histogram of colours: one matrix product and shifted sums."""
+        """Score of every window without its histogram of colours."""
         rows, columns = self.shape
-        parts = self.grid.reshape(-1, CHANNELS) @ weights[:_PLACES].reshape(-1, CHANNELS).T
         scores = np.full((rows - WINDOW + 1, columns - WINDOW + 1), bias, np.float32)
-        _add_shifted(parts.reshape(rows, columns, WINDOW * WINDOW), scores)
+        # Weights that came over the wire cannot be written, and a kernel takes none of those.
+        weights = np.require(weights[:_PLACES], requirements="W").reshape(WINDOW, -1)
+        _add_scores(self.grid.reshape(rows, -1), weights, scores)
         return scores
 
 
-@kernel("void(float32[:,:,::1], float32[:,::1])")
-def _add_shifted(parts: Float32, scores: Float32) -> None:
-    rows, columns = scores.shape
-    for row in range(rows):
-        for column in range(columns):
-            total = np.float32(0)
-            for i in range(WINDOW):
-                for j in range(WINDOW):
-                    total += parts[row + i, column + j, i * WINDOW + j]
-            scores[row, column] += total
+@kernel("void(float32[:,::1], uint16[:,::1], int64[:,::1], float32[:,::1])")
+def _cut(grid: Float32, shades: UInt16, places: Int64, features: Float32) -> None:
+    """Feature rows of the windows whose first cells are at `places`."""
+    for k in range(len(places)):
+        row, column = places[k, 0], places[k, 1]
+        for i in range(WINDOW):
+            cells = grid[row + i, column * CHANNELS : (column + WINDOW) * CHANNELS]
+            line = features[k, i * WINDOW * CHANNELS : (i + 1) * WINDOW * CHANNELS]
+            for j in range(WINDOW * CHANNELS):
+                line[j] = cells[j]
+        count(shades, row, column, features[k, _PLACES:])
+
+
+@kernel("void(float32[:,::1], float32[:,::1], float32[:,::1])")
+def _add_scores(grid: Float32, weights: Float32, scores: Float32) -> None:
+    """Add the products of each row of cells, (34 columns,), with each row of the windows that it lies in."""
+    for row in range(len(grid)):
+        for column in range(scores.shape[1]):
+            cells = grid[row, column * CHANNELS : (column + WINDOW) * CHANNELS]
+            for i in range(max(row - len(scores) + 1, 0), min(row + 1, WINDOW)):
+                line, total = weights[i], np.float32(0)
+                for j in range(WINDOW * CHANNELS):
+                    total += cells[j] * line[j]
+                scores[row - i, column] += total

@@ -13,16 +13,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from catstream.arrays import Float32, Int64, UInt8, UInt16
+from catstream.arrays import Float32, UInt8, UInt16
 from catstream.features.compiled import kernel
 from catstream.features.layout import CHROMA, LIGHT, SHADES, SIDE, WINDOW
 
-__all__ = ["add_scores", "highest_score", "histogram", "shades"]
+__all__ = ["add_scores", "count", "highest_score", "shades"]
 
 _CHROMA_STEP = 10  # Lab units from one level of a or b to the next
 _WEIGHT = 3.0  # length of a histogram as features; that of a window's HOG is about 9
-_EDGE = SIDE  # shades of a window's first cell, which is not counted
-_COUNTED = WINDOW * SIDE - 2 * _EDGE  # shades along a side of the middle
+_COUNTED = WINDOW - 2  # cells along a side of the middle, whose shades are counted
+_ROOT = np.float32(_WEIGHT / (_COUNTED * SIDE))  # what a count adds up to as a feature is its root times this
 _LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with infinity
 
 
@@ -45,9 +45,15 @@ def shades(image: np.ndarray) -> np.ndarray:
     return found
 
 
-def histogram(found: np.ndarray, row: int, column: int, features: np.ndarray) -> None:
-    """Features of the window whose first cell is (row, column), into float32 (SHADES,)."""
-    _histogram(found, row * SIDE + _EDGE, column * SIDE + _EDGE, _ROOTS, np.empty(SHADES, np.int64), features)
+def count(found: UInt16, row: int, column: int, features: Float32) -> None:
+    """Features of the window whose first cell is (row, column), into float32 (SHADES,): part of a kernel."""
+    for shade in range(len(features)):
+        features[shade] = 0
+    for y in range((row + 1) * SIDE, (row + 1 + _COUNTED) * SIDE):
+        for x in range((column + 1) * SIDE, (column + 1 + _COUNTED) * SIDE):
+            features[found[y, x]] += 1
+    for shade in range(len(features)):
+        features[shade] = _ROOT * np.sqrt(features[shade])
 
 
 def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray, least: float = _LOWEST) -> None:
@@ -61,7 +67,8 @@ def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray, least
     least : windows with a lower score are left out, and their score stays as it is
     """
     # Weights that came over the wire cannot be written, and a kernel takes none of those.
-    _add_scores(found, np.require(weights, requirements="W"), _STEPS, least, np.empty(SHADES, np.int64), scores)
+    strips = np.empty((scores.shape[1] + _COUNTED - 1, SHADES), np.uint16)
+    _add_scores(found, np.require(weights, requirements="W"), least, strips, np.empty(SHADES, np.uint16), scores)
 
 
 def highest_score(weights: np.ndarray) -> float:
@@ -85,9 +92,6 @@ def _table() -> np.ndarray:
 
 
 _TABLE = _table()
-#: What a count adds up to as a feature.
-_ROOTS = (_WEIGHT * np.sqrt(np.arange(_COUNTED**2 + 1) / _COUNTED**2)).astype(np.float32)
-_STEPS = np.diff(_ROOTS)  # and what one more of a shade adds
 
 
 @kernel("void(uint8[:,:,:], uint16[::1], uint16[:,::1])")
@@ -103,44 +107,41 @@ def _look_up(image: UInt8, table: UInt16, found: UInt16) -> None:
             found[y, x] = table[place]
 
 
-@kernel("void(uint16[:,::1], int64, int64, float32[::1], int64[::1], float32[::1])")
-def _histogram(found: UInt16, top: int, left: int, roots: Float32, counts: Int64, features: Float32) -> None:
-    for shade in range(len(counts)):
-        counts[shade] = 0
-    for y in range(top, top + _COUNTED):
-        for x in range(left, left + _COUNTED):
-            counts[found[y, x]] += 1
-    for shade in range(len(features)):
-        features[shade] = roots[counts[shade]]
+@kernel("void(uint16[:,::1], float32[::1], float32, uint16[:,::1], uint16[::1], float32[:,::1])")
+def _add_scores(found: UInt16, weights: Float32, least: float, strips: UInt16, counts: UInt16, scores: Float32) -> None:
+    """Add the score of the histogram of each window.
 
+    A strip is the histogram of the cells of a column that the windows of a row count. From one row of windows to the
+    next, a cell leaves each strip and another enters; from one window to the next, a strip leaves and another enters.
 
-@kernel("void(uint16[:,::1], float32[::1], float32[::1], float32, int64[::1], float32[:,::1])")
-def _add_scores(found: UInt16, weights: Float32, steps: Float32, least: float, counts: Int64, scores: Float32) -> None:
-    for row in range(scores.shape[0]):
-        top, last, total = row * SIDE + _EDGE, -2, 0.0
-        for column in range(scores.shape[1]):
-            if scores[row, column] < least:
-                continue
-            left = column * SIDE
-            if last < column - 1:
-                for shade in range(len(counts)):
-                    counts[shade] = 0
-                total = 0.0
-                for y in range(top, top + _COUNTED):
-                    for x in range(left + _EDGE, left + _EDGE + _COUNTED):
-                        shade = found[y, x]
-                        total += weights[shade] * steps[counts[shade]]
-                        counts[shade] += 1
-            else:
-                # The window moves by one cell: its first column of shades leaves, and the one beside it enters.
-                for y in range(top, top + _COUNTED):
+    Scratch: strips (columns + 5, SHADES), counts (SHADES,).
+    """
+    for row in range(len(scores)):
+        top = (row + 1) * SIDE
+        for column in range(len(strips)):
+            strip, left = strips[column], (column + 1) * SIDE
+            if row:
+                for y in range(top - SIDE, top):
                     for x in range(left, left + SIDE):
-                        shade = found[y, x]
-                        counts[shade] -= 1
-                        total -= weights[shade] * steps[counts[shade]]
-                    for x in range(left + _COUNTED, left + _COUNTED + SIDE):
-                        shade = found[y, x]
-                        total += weights[shade] * steps[counts[shade]]
-                        counts[shade] += 1
-            last = column
-            scores[row, column] += total
+                        strip[found[y, x]] -= 1
+            else:
+                for shade in range(len(strip)):
+                    strip[shade] = 0
+            for y in range(top + (_COUNTED - 1) * SIDE if row else top, top + _COUNTED * SIDE):
+                for x in range(left, left + SIDE):
+                    strip[found[y, x]] += 1
+        for shade in range(len(counts)):
+            counts[shade] = 0
+            for column in range(_COUNTED - 1):
+                counts[shade] += strips[column, shade]
+        for column in range(scores.shape[1]):
+            enters, leaves = strips[column + _COUNTED - 1], strips[column]
+            for shade in range(len(counts)):
+                counts[shade] += enters[shade]
+            if scores[row, column] >= least:
+                total = np.float32(0)
+                for shade in range(len(counts)):
+                    total += weights[shade] * np.sqrt(np.float32(counts[shade]))
+                scores[row, column] += _ROOT * total
+            for shade in range(len(counts)):
+                counts[shade] -= leaves[shade]

@@ -6,7 +6,8 @@ channel with the strongest gradient, then its mean colour in Lab.
 A window of 64 x 64 pixels is 8 x 8 cells.
 
 The kernel goes line by line: what a line's pixels do is written so that the
-compiler does eight of them at once, and only counting them is one by one.
+compiler does eight of them at once. Only counting them is one by one, but
+each pixel is added to its four nearest cells at once.
 """
 
 from __future__ import annotations
@@ -23,15 +24,25 @@ __all__ = ["grid"]
 
 _ORIENTATIONS = 9
 _SIGNED = 2 * _ORIENTATIONS
+_HALF = CELL // 2
 _CLIP = np.float32(0.2)  # a normalised bin is cut here (Dalal and Triggs 2005)
 _TEXTURE = np.float32(0.2357)  # 1 / sqrt(18), as published
 _COLOUR_WEIGHT = 1.5
-_LAB_MIDDLE = np.array([128.0, 128.0, 128.0], np.float32)
+_LAB_MIDDLE = np.float32(128)
 _LAB_SCALE = np.array([1.0, 3.0, 3.0], np.float32) * np.float32(_COLOUR_WEIGHT / 255)
 #: Orientations are 20 degrees apart: the tangents of where one ends and the next begins, from 0 to 90.
 _TAN_10, _TAN_30, _TAN_50, _TAN_70 = np.tan(np.deg2rad([10, 30, 50, 70])).astype(np.float32)
-#: For each pixel of a cell: its share in the cell itself; the rest goes to the neighbour on its side.
-_SHARES = (1 - np.abs((np.arange(CELL) + 0.5) / CELL - 0.5)).astype(np.float32)
+
+
+def _shares() -> np.ndarray:
+    """Share of each pixel between the centres of four cells in each of these, float32 (8, 8, 4): row by row."""
+    far = (np.arange(CELL) + 0.5) / CELL
+    near = 1 - far
+    shares = [np.outer(down, across) for down in (near, far) for across in (near, far)]
+    return np.stack(shares, axis=-1).astype(np.float32)
+
+
+_SHARES = _shares()
 
 
 def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
@@ -53,30 +64,31 @@ def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
     (8, 12, 34)
     """
     rows, columns = image.shape[0] // CELL, image.shape[1] // CELL
-    histogram = np.zeros((rows + 2, (columns + 2) * _SIGNED), np.float32)
-    colour = np.empty((rows, columns, 3), np.uint8)
-    cells = np.empty((max(rows - 2 * margin, 0), max(columns - 2 * margin, 0), CHANNELS), np.float32)
+    inner = max(rows - 2 * margin, 0), max(columns - 2 * margin, 0)
+    cells, colour = np.empty((*inner, CHANNELS), np.float32), np.empty((*inner, 3), np.uint8)
     if cells.size:
-        blue, green, red = channels = [np.asarray(channel, np.uint8) for channel in cv2.split(image)]
-        width = columns * CELL
-        lines, gradients = np.empty((3, 3, width + 2), np.float32), np.empty((3, width), np.float32)
-        orientation, turns = np.empty(width, np.uint8), np.empty((2, histogram.shape[1]), np.float32)
-        _count(blue, green, red, _SHARES, lines, gradients, orientation, turns, histogram)
-        _normalise(histogram, margin, np.empty((rows, columns), np.float32), cells)
-        for i, channel in enumerate(channels):
-            _average(channel, colour[:, :, i])
+        pixels, width = np.ascontiguousarray(image).reshape(len(image), -1), columns * CELL
+        lines, gradients = np.empty((3, 3, width + 2), np.float32), np.empty((3, width + CELL), np.float32)
+        orientation, blocks = np.empty(width + CELL, np.uint8), np.empty((columns + 1, _SIGNED, 4), np.float32)
+        histogram, energy = (
+            np.zeros((rows + 2, columns + 2, _SIGNED), np.float32),
+            np.empty((rows, columns), np.float32),
+        )
+        _describe(pixels, margin, _SHARES, lines, gradients, orientation, blocks, histogram, energy, colour, cells)
         # The mean colour, converted, costs a tenth of the converted colours' mean and differs by little.
-        lab = cv2.cvtColor(colour, cv2.COLOR_BGR2LAB)[margin : rows - margin, margin : columns - margin]
-        cells[:, :, 31:] = (lab - _LAB_MIDDLE) * _LAB_SCALE
+        lab = cv2.cvtColor(colour, cv2.COLOR_BGR2LAB)
+        np.multiply(lab - _LAB_MIDDLE, _LAB_SCALE, out=cells[:, :, 31:])
     return cells
 
 
 def _read(row: UInt8, line: Float32) -> None:
-    """One row of a channel, each pixel at the edge twice."""
-    width = len(row)
-    for x in range(width):
-        line[x + 1] = row[x]
-    line[0], line[width + 1] = row[0], row[width - 1]
+    """The three channels of one row of pixels, the pixels at the edge twice."""
+    width = line.shape[1] - 2
+    for channel in range(3):
+        values = line[channel]
+        for x in range(width):
+            values[x + 1] = row[3 * x + channel]
+        values[0], values[width + 1] = values[1], values[width]
 
 
 def _gradients(
@@ -113,82 +125,75 @@ def _orientations(across: Float32, down: Float32, orientation: UInt8) -> None:
         orientation[x] = np.uint8(float32(0) if o == float32(_SIGNED) else o)
 
 
-@kernel(
-    "void(uint8[:,::1], uint8[:,::1], uint8[:,::1], float32[::1], "
-    "float32[:,:,::1], float32[:,::1], uint8[::1], float32[:,::1], float32[:,::1])"
-)
+def _add(magnitude: Float32, orientation: UInt8, shares: Float32, blocks: Float32) -> None:
+    """Add a line's pixels to the four shares of their orientation in the block of 8 x 8 pixels that they lie in."""
+    for i in range(CELL):  # not block by block: to add to what was just added to is slow
+        above_left, above_right, below_left, below_right = shares[i, 0], shares[i, 1], shares[i, 2], shares[i, 3]
+        for block in range(blocks.shape[0]):
+            strength = magnitude[block * CELL + i]
+            four = blocks[block, orientation[block * CELL + i]]
+            a, b = four[0] + strength * above_left, four[1] + strength * above_right
+            c, d = four[2] + strength * below_left, four[3] + strength * below_right
+            four[0], four[1], four[2], four[3] = a, b, c, d
+
+
 def _count(
-    blue: UInt8,
-    green: UInt8,
-    red: UInt8,
+    image: UInt8,
+    margin: int,
     shares: Float32,
     lines: Float32,
     gradients: Float32,
     orientation: UInt8,
-    turns: Float32,
+    blocks: Float32,
     histogram: Float32,
 ) -> None:
-    """Histograms of the cells, with one cell more on every side, which takes what falls outside.
-
-    Scratch: lines (3, 3, width + 2), the three channels of the rows above, here and below, in turns; gradients
-    (3, width), across, down and their magnitude; orientation (width,); turns (2, columns of the histogram).
-    """
-    columns = histogram.shape[1] // _SIGNED - 2
-    height, width = (histogram.shape[0] - 2) * CELL, columns * CELL
+    """Histograms of the cells within a margin."""
+    rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
+    height, width = rows * CELL, columns * CELL
     across, down, magnitude = gradients[0], gradients[1], gradients[2]
-    # Neighbours often have the same orientation, and adding to what was just added to is slow: they take turns.
-    even, odd = turns[0], turns[1]
-    for y in range(-2, height):
-        below, at = lines[(y + 1) % 3], min(max(y + 1, 0), height - 1)
-        _read(blue[at, :width], below[0])
-        _read(green[at, :width], below[1])
-        _read(red[at, :width], below[2])
-        if y < 0:
-            continue
-        here = lines[y % 3]
-        _gradients(lines[(y - 1) % 3], here, below, across, down, magnitude)
-        _orientations(across, down, orientation)
-        for i in range(len(even)):
-            even[i] = odd[i] = 0
-        for column in range(columns):
-            for i in range(CELL):
-                x = column * CELL + i
-                own = (column + 1) * _SIGNED
-                other = own - _SIGNED if i < CELL // 2 else own + _SIGNED
-                near = magnitude[x] * shares[i]
-                line = odd if i % 2 else even
-                line[own + orientation[x]] += near
-                line[other + orientation[x]] += magnitude[x] - near
-        share = shares[y % CELL]
-        row = histogram[y // CELL + 1]
-        other_row = histogram[y // CELL if y % CELL < CELL // 2 else y // CELL + 2]
-        for i in range(len(row)):
-            row[i] += share * (even[i] + odd[i])
-            other_row[i] += (float32(1) - share) * (even[i] + odd[i])
+    for x in range(len(magnitude)):
+        magnitude[x] = orientation[x] = 0
+    for band in range(margin, rows + 1 - margin):  # of the pixels between the centres of two rows of cells
+        for block in range(columns + 1):
+            for o in range(_SIGNED):
+                for share in range(4):
+                    blocks[block, o, share] = 0
+        top, bottom = max(band * CELL - _HALF, 0), min(band * CELL + _HALF, height)
+        if band == margin:
+            _read(image[max(top - 1, 0)], lines[(top + 2) % 3])
+            _read(image[top], lines[top % 3])
+        for y in range(top, bottom):
+            above, here, below = lines[(y + 2) % 3], lines[y % 3], lines[(y + 1) % 3]
+            _read(image[min(y + 1, height - 1)], below)
+            _gradients(above, here, below, across[:width], down[:width], magnitude[_HALF : _HALF + width])
+            _orientations(across[:width], down[:width], orientation[_HALF : _HALF + width])
+            _add(magnitude, orientation, shares[(y + _HALF) % CELL], blocks)
+        for block in range(margin, columns + 1 - margin):
+            for o in range(_SIGNED):
+                histogram[band, block, o] += blocks[block, o, 0]
+                histogram[band, block + 1, o] += blocks[block, o, 1]
+                histogram[band + 1, block, o] += blocks[block, o, 2]
+                histogram[band + 1, block + 1, o] += blocks[block, o, 3]
 
 
-@kernel("void(uint8[:,::1], uint8[:,:])")
-def _average(channel: UInt8, means: UInt8) -> None:
+def _average(image: UInt8, margin: int, means: UInt8) -> None:
     """The mean of each cell's pixels."""
     for row in range(means.shape[0]):
         for column in range(means.shape[1]):
-            total = CELL * CELL // 2  # half, to round
-            for y in range(row * CELL, (row + 1) * CELL):
-                for x in range(column * CELL, (column + 1) * CELL):
-                    total += channel[y, x]
-            means[row, column] = total // (CELL * CELL)
+            for channel in range(3):
+                total = CELL * CELL // 2  # half, to round
+                for y in range((row + margin) * CELL, (row + margin + 1) * CELL):
+                    for x in range((column + margin) * CELL, (column + margin + 1) * CELL):
+                        total += image[y, 3 * x + channel]
+                means[row, column, channel] = total // (CELL * CELL)
 
 
-@kernel("void(float32[:,::1], int64, float32[:,::1], float32[:,:,::1])")
 def _normalise(histogram: Float32, margin: int, energy: Float32, cells: Float32) -> None:
-    """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in.
-
-    Scratch: energy (rows, columns).
-    """
-    rows, columns = histogram.shape[0] - 2, histogram.shape[1] // _SIGNED - 2
+    """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in."""
+    rows, columns = energy.shape
     for row in range(rows):
         for column in range(columns):
-            bins = histogram[row + 1, (column + 1) * _SIGNED :]
+            bins = histogram[row + 1, column + 1]
             total = float32(0)
             for o in range(_ORIENTATIONS):
                 both = bins[o] + bins[o + _ORIENTATIONS]
@@ -206,7 +211,7 @@ def _normalise(histogram: Float32, margin: int, energy: Float32, cells: Float32)
             b = float32(1) / np.sqrt(above + energy[up, right] + energy[row, right] + small)
             c = float32(1) / np.sqrt(below + energy[down, left] + energy[row, left] + small)
             d = float32(1) / np.sqrt(below + energy[down, right] + energy[row, right] + small)
-            bins = histogram[row + 1, (column + 1) * _SIGNED :]
+            bins = histogram[row + 1, column + 1]
             features = cells[row - margin, column - margin]
             texture_a = texture_b = texture_c = texture_d = float32(0)
             for o in range(_SIGNED):
@@ -225,3 +230,33 @@ def _normalise(histogram: Float32, margin: int, energy: Float32, cells: Float32)
             features[28] = _TEXTURE * texture_b
             features[29] = _TEXTURE * texture_c
             features[30] = _TEXTURE * texture_d
+
+
+@kernel(
+    "void(uint8[:,::1], int64, float32[:,:,::1], float32[:,:,::1], float32[:,::1], uint8[::1], float32[:,:,::1], "
+    "float32[:,:,::1], float32[:,::1], uint8[:,:,::1], float32[:,:,::1])"
+)
+def _describe(
+    image: UInt8,
+    margin: int,
+    shares: Float32,
+    lines: Float32,
+    gradients: Float32,
+    orientation: UInt8,
+    blocks: Float32,
+    histogram: Float32,
+    energy: Float32,
+    means: UInt8,
+    cells: Float32,
+) -> None:
+    """HOG and mean colour, BGR, of the cells within the margin.
+
+    Scratch: lines (3, 3, width + 2), the three channels of the rows above, here and below, in turns; of a row with half
+    a cell more on either side, gradients (3, width + 8), across, down and magnitude, and orientation (width + 8,);
+    blocks (columns + 1, 18, 4), of the pixels between the centres of four cells their shares in each; energy
+    (rows, columns); histogram, filled with 0, (rows + 2, columns + 2, 18), with one cell more on every side, which
+    takes what falls outside.
+    """
+    _count(image, max(margin - 1, 0), shares, lines, gradients, orientation, blocks, histogram)
+    _normalise(histogram, margin, energy, cells)
+    _average(image, margin, means)

@@ -10,7 +10,7 @@ from catstream.features.layout import SHADES
 
 def colour_features(image, row=0, column=0):
     features = np.empty(SHADES, np.float32)
-    colours.histogram(colours.shades(image), row, column, features)
+    colours.count(colours.shades(image), row, column, features)
     return features
 
 
