@@ -149,7 +149,7 @@ def _load(name: str, function: FunctionType, signature: str) -> llvm.ResourceTra
     library = llvm.JITLibraryBuilder().add_object_img(code).add_current_process().export_symbol(ENTRY)
     for symbol, address in _addresses().items():
         library.import_symbol(symbol, address)
-    return library.link(_linker(), name)
+    return library.link(_linker(), f"{name}.{len(_LOADED)}")  # a name cannot be used twice
 
 
 @functools.cache

@@ -6,12 +6,11 @@ import os
 import shutil
 import signal
 
-import numba
 import psutil
 import pytest
 
 from catstream.errors import BoxError, ServiceError, VideoError
-from catstream.features import COMPILING
+from catstream.features import COMPILING, compiled
 from catstream.pipeline import Pipeline
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
@@ -216,8 +215,8 @@ def test_a_missing_source_is_rejected_before_anything_starts(folder):
 
 
 def test_a_first_start_that_compiles_is_logged(video, tmp_path, monkeypatch, caplog):
-    without_one = shutil.ignore_patterns("cells.*.nbi")
-    shutil.copytree(numba.config.CACHE_DIR, tmp_path / "kernels", ignore=without_one)
+    without_one = shutil.ignore_patterns("catstream.features.cells.*")
+    shutil.copytree(compiled._FOLDER, tmp_path / "kernels", ignore=without_one)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     path, truth = video
     with Pipeline(path, truth[0], part=slice(0, 5)) as pipeline:
