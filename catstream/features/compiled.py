@@ -9,15 +9,14 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
-import getpass
 import hashlib
 import inspect
 import logging
 import os
 import re
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.metadata import version
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -174,9 +173,9 @@ def _digest(name: str, function: FunctionType, signature: str) -> str:
 
 @functools.cache
 def _compiler() -> bytes:
-    """Versions of the compiler, and its source code."""
+    """Versions of the compiler and of Python's binary interface, and the source code here."""
     sources = [Path(__file__).with_name(name).read_bytes() for name in ("compiled.py", "compiler.py")]
-    return repr((sys.implementation.cache_tag, version("numba"), llvmlite.__version__, sources)).encode()
+    return repr((EXTENSION_SUFFIXES[0], version("numba"), llvmlite.__version__, sources)).encode()
 
 
 def _described(value: object) -> Iterator[bytes]:
@@ -232,7 +231,7 @@ def _cache_folder() -> Path:
     if os.access(beside, os.W_OK):
         return beside / "__pycache__"
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
-    for folder in (Path(home) / "catstream", Path(tempfile.gettempdir()) / f"catstream-{getpass.getuser()}"):
+    for folder in (Path(home) / "catstream", Path(tempfile.gettempdir()) / f"catstream-{os.getuid()}"):
         with contextlib.suppress(OSError):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():

@@ -156,7 +156,7 @@ def test_a_kernel_is_compiled_again_if_what_it_depends_on_changes(compiles, monk
         (compiled, "version", lambda library: f"{library} of tomorrow"),
         (llvmlite, "__version__", "0.0"),
         (llvm, "get_host_cpu_name", lambda: "another"),
-        (sys.implementation, "cache_tag", "cpython-0"),
+        (compiled, "EXTENSION_SUFFIXES", [".cpython-0.so"]),
     ],
 )
 def test_the_file_of_another_compiler_or_processor_is_not_used(owner, name, value, monkeypatch):
