@@ -10,6 +10,7 @@ import secrets
 import tempfile
 import time
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ Metadata = dict[str, Any]
 
 _KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
 _VERSION = 1  # version of the metadata's format
+#: Names of the types of arrays in the format.
+_TYPES = {"float64": "F64", "float32": "F32", "int64": "I64", "int32": "I32", "uint8": "U8", "bool": "BOOL"}
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
@@ -54,12 +57,17 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o66
     OSError
         If the file cannot be written. The old file stays unchanged.
     """
+    _write_atomically(path, [data], mode)
+
+
+def _write_atomically(path: str | os.PathLike[str], parts: Sequence[bytes | memoryview], mode: int) -> None:
+    """Replace a file atomically by parts, one after the other."""
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     try:
         part.unlink(missing_ok=True)  # a file left by a power cut would keep its old permissions
         with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
-            file.write(data)
+            file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())  # the content must be on disk before the new name
         part.replace(path)
@@ -161,7 +169,7 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode
     OSError
         If the file cannot be written, as in `write_atomically`.
     """
-    write_atomically(path, encode(arrays, metadata), mode)
+    _write_atomically(path, _parts(arrays, metadata), mode)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
@@ -177,11 +185,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
 
 def encode(arrays: Arrays, metadata: Metadata) -> bytes:
     """Return the content of the file that `write` writes."""
-    from safetensors.numpy import save
-
-    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    header = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
-    return save(contiguous, metadata={_KEY: json.dumps(header, sort_keys=True)})
+    return b"".join(_parts(arrays, metadata))
 
 
 def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
@@ -221,6 +225,25 @@ def _sync(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def _parts(arrays: Arrays, metadata: Metadata) -> list[bytes | memoryview]:
+    """The content of a file, in parts: its header, and the memory of each array, of which no copy is made.
+
+    The format is that of safetensors: the length of the header, the header as JSON, and the arrays, those of the
+    longest numbers first.
+    """
+    ordered = sorted(arrays.items(), key=lambda item: (-item[1].itemsize, item[0]))
+    contiguous = {name: np.ascontiguousarray(array) for name, array in ordered}
+    facts = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
+    header: Metadata = {"__metadata__": {_KEY: json.dumps(facts, sort_keys=True)}}
+    end = 0
+    for name, array in contiguous.items():
+        begin, end = end, end + array.nbytes
+        header[name] = {"dtype": _TYPES[array.dtype.name], "shape": array.shape, "data_offsets": [begin, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)  # the arrays begin at a multiple of 8
+    return [len(text).to_bytes(8, "little"), text, *(array.data for array in contiguous.values())]
 
 
 def _checksum(arrays: Arrays, metadata: Metadata) -> int:

@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from catstream import storage
@@ -27,6 +28,18 @@ def test_a_file_without_a_secret_has_the_permissions_of_the_umask(tmp_path, umas
     umask(0o027)
     storage.write(tmp_path / "tree", {}, {})
     assert stat.S_IMODE((tmp_path / "tree").stat().st_mode) == 0o640
+
+
+def test_arrays_of_each_type_are_read_as_they_were_written(tmp_path, rng):
+    numbers = rng.uniform(0, 200, size=(3, 5))
+    arrays = {name: numbers.astype(name) for name in ("uint8", "float32", "bool", "int64", "float64", "int32")}
+    arrays |= {"empty": np.empty((0, 4), np.float32), "columns": np.asfortranarray(numbers), "größe": numbers[0]}
+    storage.write(tmp_path / "tree", arrays, {"size": 3})
+    read, metadata = storage.read(tmp_path / "tree")
+    assert {name: (array.dtype, array.tolist()) for name, array in read.items()} == {
+        name: (array.dtype, array.tolist()) for name, array in arrays.items()
+    }
+    assert metadata == {"size": 3}
 
 
 def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path):
