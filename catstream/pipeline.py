@@ -17,6 +17,7 @@ from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from copy import copy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -219,7 +220,7 @@ class Pipeline:
             if self._save_models:  # from the compressor's last checkpoint
                 stack.enter_context(_saved(self._save_models, self._state or folder, settings))
             supervisor = Supervisor(self._started(str(endpoint)), folder)
-            stack.callback(supervisor.stop, self._receive_rest)
+            stack.callback(supervisor.stop, partial(_receive_rest, self._incoming))  # without a circle: see `__del__`
             self._endpoint, self._supervisor, self._stack = str(endpoint), supervisor, stack.pop_all()
         return self
 
@@ -441,11 +442,6 @@ class Pipeline:
                 _log.warning("%s: %s", health.process, health.trouble)
             self._health[health.process] = health
 
-    def _receive_rest(self) -> None:
-        """Receive the tracks that nobody iterates over any more, so that the detector need not wait for that."""
-        while (message := self._incoming.receive(0)) is not None:
-            self._incoming.acknowledge(Position(message.seq))
-
     def _wait_for_exit(self) -> Iterator[None]:
         """Yield until the detector has exited; it does so once its last message is acknowledged."""
         deadline = time.monotonic() + _EXIT_SECONDS
@@ -461,6 +457,12 @@ class Pipeline:
         if self._supervisor is None:
             raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
         return self._supervisor
+
+
+def _receive_rest(incoming: Receiver[Tracks | End]) -> None:
+    """Receive the tracks that nobody iterates over any more, so that the detector need not wait for that."""
+    while (message := incoming.receive(0)) is not None:
+        incoming.acknowledge(Position(message.seq))
 
 
 def _path(path: str | os.PathLike[str] | None) -> Path | None:
