@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
-from importlib import import_module
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -246,7 +246,7 @@ def test_a_process_uses_one_fleet_at_a_time(token):
 
 def test_ray_that_was_imported_without_a_token_is_refused_at_once(token, monkeypatch):
     monkeypatch.setattr(cluster, "_connected", lambda _: False)
-    monkeypatch.setitem(sys.modules, "ray", import_module("ray"))
+    monkeypatch.setitem(sys.modules, "ray", module_from_spec(find_spec("ray")))
     monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
     with pytest.raises(FleetError, match="Ray was imported before the fleet"):
         cluster.connect("10.0.0.1:6400", token)

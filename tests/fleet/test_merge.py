@@ -171,6 +171,7 @@ def test_the_part_of_a_stream_is_what_its_newest_state_has_learned(store):
             saved_part(store, stream_name, name, named=True)
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fleet")
 def test_the_nodes_merge_the_states_in_the_store_and_only_a_new_model_is_stored(store, tmp_path):
     streams = ["door", "yard", "hall", "gate"]
