@@ -107,7 +107,7 @@ def started(process, results):
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline, "no track came"
         time.sleep(0.01)
-    return [child.pid for child in psutil.Process(process.pid).children()]
+    return [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
 
 
 def test_a_truncated_video_is_followed_up_to_the_break(video, said, tmp_path):

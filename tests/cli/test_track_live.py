@@ -128,8 +128,8 @@ def test_a_stream_over_http_is_followed_by_a_restarted_detector_too(camera, foll
     with following(camera(lambda number: story[number % len(story)][0]).url) as run:
         run.until(lambda counters: counters["model_version"] >= 3)
         frames = len((run.output / "one.csv").read_text().splitlines())
-        (detector,) = (child for child in psutil.Process(run.process.pid).children() if "detector" in child.cmdline())
-        detector.kill()
+        family = psutil.Process(run.process.pid).children(recursive=True)
+        next(process for process in family if process.name() == "detector").kill()
         run.until(lambda counters: counters["sent"] > frames + 40)
         rows, errors = run.stopped()
     assert "processes restarted: 1" in errors

@@ -36,7 +36,7 @@ def checkpoints(folder):
 
 def kill_everything(process):
     """The command and all its children, which die with it."""
-    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children()]
+    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
     for one in family:
         one.kill()
     process.wait()

@@ -52,10 +52,18 @@ def sleepers():
 
 
 def children():
-    """Processes of this one, but for the one that Python leaves to tidy up, and the fleet that other tests share."""
+    """Processes of this one, but for those that stay to its end: two servers, and the fleet that other tests share."""
     tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
     own = [child for child in psutil.Process().children() if child.pid != tracker and not keeps_a_fleet(child)]
-    return own + [process for child in own for process in child.children(recursive=True)]
+    family = own + [process for child in own for process in child.children(recursive=True)]
+    return [process for process in family if not is_start_server(process)]
+
+
+def is_start_server(process):
+    try:
+        return process.name() == "start server"
+    except psutil.Error:  # it has ended
+        return True
 
 
 def keeps_a_fleet(process):
