@@ -23,5 +23,6 @@ def set_process_title(name: str) -> None:
         # The second field is the name of the program, which may contain spaces.
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         begin, end = (int(field) for field in fields[_ARGUMENTS.start - 2 : _ARGUMENTS.stop - 2])
-        title = f"catstream {name}".encode()[: max(end - begin - 1, 0)]
-        ctypes.memmove(begin, title.ljust(end - begin, b"\0"), end - begin)
+        title = f"catstream {name}".encode()[: max(end - begin - 2, 0)]
+        # If the last byte is not 0, the kernel takes the memory for a title, and shows it up to the first 0.
+        ctypes.memmove(begin, title.ljust(end - begin - 1, b"\0") + b".", end - begin)

@@ -64,10 +64,10 @@ def test_a_process_is_a_fork_of_the_server_with_a_title_a_session_and_a_folder_o
     until(lambda: watchdog.turns > 0)
     process = psutil.Process(started.pid)
     assert process.ppid() == server.pid
-    assert "".join(process.cmdline()) == "catstream trainer"
+    assert " ".join(process.cmdline()) == "catstream trainer"
     assert process.name() == "trainer"
     assert os.getsid(process.pid) == process.pid
-    assert "".join(psutil.Process(server.pid).cmdline()) == "catstream start server"
+    assert " ".join(psutil.Process(server.pid).cmdline()) == "catstream start server"
 
 
 def test_a_process_has_its_own_descriptors_and_none_of_the_server(start, until):
