@@ -55,6 +55,7 @@ NAMES = ("detector", "compressor", "trainer")
 _ANSWER = struct.Struct("=i")  # the process id, 0 if it could not be started; the exit code, or minus the signal
 #: Beginnings of the environment variables that libraries read when they are imported.
 _READ_BY_IMPORTS = ("LD_", "MKL_", "NPY_", "NUMBA_", "OMP_", "OPENBLAS_", "OPENCV_", "PYTHON", "XDG_CACHE_HOME")
+_END_SECONDS = 5.0  # limit for the end of a process that was killed
 _log = logging.getLogger(__name__)
 
 
@@ -118,16 +119,20 @@ class StartedProcess:
         return self._code is not None
 
     def send_signal(self, number: int) -> None:
-        """Send a signal to the process, unless it has ended."""
-        if self.poll() is None and self.pid:
+        """Send a signal to the process, unless it has ended. One that was not started yet is not started any more."""
+        if self.poll() is not None:
+            return
+        if self._pid is None:  # nobody will receive the server's answer: it kills the process at once
+            self._answers.close()
+            self._code = -number
+        elif self._pid:
             with suppress(ProcessLookupError):
-                os.kill(self.pid, number)
+                os.kill(self._pid, number)
 
     def close(self) -> None:
         """Kill the process if it runs, and wait until it has ended."""
         self.send_signal(signal.SIGKILL)
-        while self._code is None:
-            self._receive(None)
+        self.wait(_END_SECONDS)
         self._answers.close()
 
     def _receive(self, seconds: float | None) -> bool:
@@ -403,10 +408,18 @@ def _import(name: str) -> None:
 
 def _spawn(request: Request, log: int, watchdog: int) -> int:
     """Start a process without forking; returns its process id."""
-    os.set_inheritable(watchdog, True)
     command = service_command("child", request.name, request.job, "--parent", str(os.getpid()))
-    command += ["--watchdog", str(watchdog), *["--restarted"] * request.restarted]
-    return os.posix_spawn(command[0], command, environment(), file_actions=[(os.POSIX_SPAWN_DUP2, log, 2)], setsid=True)
+    process = subprocess.Popen(
+        [*command, "--watchdog", str(watchdog), *["--restarted"] * request.restarted],
+        env=request.environment,
+        cwd=request.folder,
+        stdin=subprocess.DEVNULL,
+        stderr=log,
+        pass_fds=[watchdog],
+        start_new_session=True,
+    )
+    process.returncode = 0  # the server waits for its end as for that of the others
+    return process.pid
 
 
 def main(requests: int, program: int) -> None:

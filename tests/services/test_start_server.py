@@ -96,9 +96,21 @@ def test_the_exit_code_of_a_process_is_known(start, until):
 
 def test_the_signal_that_ended_a_process_is_known(start):
     process, _, _ = start()
+    assert process.pid
     process.send_signal(signal.SIGKILL)
     assert process.wait(60)
     assert process.poll() == -signal.SIGKILL
+
+
+def test_a_process_that_is_ended_before_it_was_started_does_not_run(server, start, until):
+    os.kill(server.pid, signal.SIGSTOP)
+    process, watchdog, _ = start()
+    process.send_signal(signal.SIGTERM)
+    os.kill(server.pid, signal.SIGCONT)
+    assert process.poll() == -signal.SIGTERM
+    assert start()[0].pid  # requests are processed in order
+    until(lambda: len(psutil.Process(server.pid).children()) == 1)
+    assert watchdog.turns == 0
 
 
 def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_path):
