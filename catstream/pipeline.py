@@ -431,7 +431,7 @@ class Pipeline:
         self._children.check_children()
         for line in [*start_server_lines(), *(self._children.new_lines("detector") if self.live else ())]:
             _log.warning("%s", line)  # kernels are compiled; a live source was lost or is available again
-        if self._children.finished:
+        if self._children.finished and self._end is None:
             raise ServiceError("the processes ended before the video did: this should not happen, please report it")
 
     def _receive_health(self) -> None:

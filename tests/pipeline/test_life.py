@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from catstream import pipeline as module
 from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
+from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 
 SETTINGS = Settings(run={"unstored_frames": 4})
@@ -30,6 +32,19 @@ def test_it_is_iterated_without_with_and_leaves_no_process(pipeline):
     assert not pipeline.pids
     with pytest.raises(ServiceError, match="a pipeline runs once"):
         next(iter(pipeline))
+
+
+def test_a_detector_that_has_ended_with_the_stream_is_no_failure(pipeline, monkeypatch, until):
+    check = Supervisor.check_children
+
+    def check_late(supervisor):
+        if pipeline.totals:  # the end was received: the detector may end before it is looked at
+            until(lambda: supervisor.finished)
+        check(supervisor)
+
+    monkeypatch.setattr(Supervisor, "check_children", check_late)
+    monkeypatch.setattr(module, "_CHECK_SECONDS", -1)
+    assert [track.frame for track in pipeline] == list(range(20))
 
 
 def test_a_loop_that_is_left_ends_the_run(pipeline, alive):
