@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -111,11 +112,22 @@ class DetectorLoop:
         self._source: Source | None = None
         self._skipped = 0  # frames that were skipped while the run was paused or waited for a box
         self._tracks = Tracks(0, 0, {})  # the last ones
+        self._sent_before = math.inf if process.job.resume else 0  # the last message of an earlier detector
 
     @property
     def end_reason(self) -> str:
         """Reason for which no more frames are tracked; empty while frames are tracked."""
         return "it was stopped" if self._process.stop_requested else self._commands.end_reason
+
+    @property
+    def _repeats(self) -> bool:
+        """Whether an earlier detector has sent the next message already: commands and pauses apply after those."""
+        return self.detectors.seq < self._sent_before
+
+    @property
+    def _holds(self) -> bool:
+        """Whether no frames are tracked, because the run is paused or waits for a box."""
+        return self._commands.desired.holds and not self._repeats
 
     def turn(self, sender: DataSender | None = None) -> None:
         """One turn of a waiting loop: process acknowledgements and commands, and publish the health.
@@ -128,7 +140,7 @@ class DetectorLoop:
     def _serve(self) -> None:
         """Serve late joiners, carry out the commands that have arrived, and publish the health."""
         self._outputs.serve_late_joiners()
-        commanded = self._control.carry_out()
+        commanded = not self._repeats and self._control.carry_out()
         self._process.beat(self._counters, self._object_counters, now=commanded)
 
     def wait_for_subscribers(self) -> None:
@@ -158,6 +170,7 @@ class DetectorLoop:
             self._seek_again(name, each, models)
         for sender, position in zip(self._outputs.senders, positions, strict=True):
             sender.resume(begin.seq, position.seq)
+        self._sent_before = max(position.seq for position in positions)
 
     def _seek_again(self, name: str, each: DesiredObject, models: dict[str, Model]) -> None:
         """Continue to search for an object by its saved model, unless it was found before the restart."""
@@ -224,7 +237,7 @@ class DetectorLoop:
         given = self._given(pyramid, frame) or self._hold(pyramid, frame)
         if not given and self.end_reason:
             return None
-        if not given and self._commands.desired.holds:
+        if not given and self._holds:
             self._skipped += 1
             return None
         return self._step(pyramid, frame, given)
@@ -236,11 +249,11 @@ class DetectorLoop:
         -------
         the results of the objects whose boxes commands have set for it
         """
-        if self._commands.desired.holds:
+        if self._holds:
             kept = {name: each for name, each in self._tracks.tracks.items() if name in self._commands.desired.objects}
             self._outputs.show(self.detectors.seq, frame.image, kept)  # the other objects, while a box is drawn
         live = self._source is not None and self._source.live
-        while self._commands.desired.holds and not self.end_reason and not live:
+        while self._holds and not self.end_reason and not live:
             time.sleep(_TURN_SECONDS)
             self.turn()
             if given := self._given(pyramid, frame):
