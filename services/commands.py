@@ -25,6 +25,9 @@ __all__ = ["STOPPED", "CommandHandler"]
 #: The reason of a stream's end, if a command stopped it.
 STOPPED = "it was stopped by a command"
 
+#: Commands whose effect does not depend on the frame at which they arrive.
+_AT_ANY_FRAME = ("pause", "resume", "stop")
+
 
 class CommandHandler:
     """Carries out commands and returns their answers: exactly one for each command.
@@ -46,6 +49,7 @@ class CommandHandler:
         self.desired, self.end_reason = desired, STOPPED if desired.stopped else ""
         self.models, self._detectors = models, detectors
         self._boxes: deque[Command] = deque()  # to be applied to the next frame
+        self._waiting: list[Command] = []  # that arrived while frames are repeated
 
     @property
     def has_box(self) -> bool:
@@ -62,11 +66,20 @@ class CommandHandler:
         """The counters for the health of the process."""
         return {"paused": float(self.desired.paused), "waiting": float(not self.desired.objects)}
 
-    def carry_out(self, commands: Iterable[Command]) -> list[Answer]:
-        """Carry out commands; return the answers. The answers to boxes follow from `begin`, with the next frame."""
+    def carry_out(self, commands: Iterable[Command], *, repeats: bool = False) -> list[Answer]:
+        """Carry out commands; return the answers. The answers to boxes follow from `begin`, with the next frame.
+
+        Parameters
+        ----------
+        repeats : whether an earlier detector has sent the next message already: commands for objects then wait until
+            this ends, because their objects begin or end with a message that nobody has received yet
+        """
         answers = []
-        for command in commands:
-            if self.end_reason and command.verb != "save":
+        arrived, self._waiting = [*self._waiting, *commands], []
+        for command in arrived:
+            if repeats and not self.end_reason and command.verb not in _AT_ANY_FRAME:
+                self._waiting.append(command)
+            elif self.end_reason and command.verb != "save":
                 answers.append(self._answer(command, False, f"the pipeline is ending: {self.end_reason}"))
             elif command.verb == "set-box":
                 self._boxes.append(command)
@@ -130,7 +143,7 @@ class CommandHandler:
     def end(self, reason: str) -> list[Answer]:
         """Mark the end of the stream: from now on, every command except `save` is rejected."""
         self.end_reason = reason
-        return self.reject_boxes(f"the pipeline is ending: {reason}")
+        return [*self.reject_boxes(f"the pipeline is ending: {reason}"), *self.carry_out([])]
 
     def clear_stop(self) -> None:
         """Clear the command `stop` at the end of the run, so that a resumed detector does not stop at once."""

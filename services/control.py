@@ -43,12 +43,17 @@ class CommandChannel(Responder[Command, Answer]):
         self._kept: DesiredState | None = None
         self._conclude([])
 
-    def carry_out(self) -> bool:
-        """Carry out the commands that have arrived; return whether there were any."""
+    def carry_out(self, *, repeats: bool = False) -> bool:
+        """Carry out the commands that have arrived; return whether there were any.
+
+        Parameters
+        ----------
+        repeats : as for `CommandHandler.carry_out`
+        """
         commands = self.receive_all()
         if any(command.model is not None for command in commands):
             self._allow(_MODEL_SECONDS)
-        self._conclude(self._handler.carry_out(commands))
+        self._conclude(self._handler.carry_out(commands, repeats=repeats))
         return bool(commands)
 
     def begin(self, frame: Pyramid, time: float) -> dict[str, Result]:

@@ -140,7 +140,7 @@ class DetectorLoop:
     def _serve(self) -> None:
         """Serve late joiners, carry out the commands that have arrived, and publish the health."""
         self._outputs.serve_late_joiners()
-        commanded = not self._repeats and self._control.carry_out()
+        commanded = self._control.carry_out(repeats=self._repeats)
         self._process.beat(self._counters, self._object_counters, now=commanded)
 
     def wait_for_subscribers(self) -> None:

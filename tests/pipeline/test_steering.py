@@ -295,6 +295,7 @@ def test_an_object_is_searched_for_in_a_running_pipeline_as_in_one_process_whoev
         control(pipeline.endpoint, timeout=SECONDS) as steering,
         ThreadPoolExecutor(1) as pool,
     ):
+        tracks.append(next(iter(pipeline)))  # an answer before the first frame has the number of that frame
         for _ in range(2):  # the second one takes the place of the first
             first.add(taken(pipeline, tracks, pool.submit(steering.search, saved, "anna")).frame + 1)
             for victim in victims:

@@ -240,3 +240,22 @@ def test_a_handler_that_is_released_forgets_that_it_was_stopped():
     handler.clear_stop()
     assert handler.desired == desired
     assert handler.end_reason == STOPPED
+
+
+def test_commands_for_objects_wait_until_all_frames_of_an_earlier_detector_are_repeated():
+    detectors = Detectors(QUICK)
+    handler = CommandHandler(detectors, DesiredState({"anna": DesiredObject(BOXES[0], 1)}), ModelFiles(None))
+    given = [Command("1", "forget", object="anna"), Command("2", "pause")]
+    assert [(answer.id, answer.done) for answer in handler.carry_out(given, repeats=True)] == [("2", True)]
+    assert list(handler.desired.objects) == ["anna"]
+    detectors.seq = 7
+    (answer,) = handler.carry_out([])
+    assert (answer.id, answer.done) == ("1", True)
+    assert handler.desired.past == (PastObject("anna", DesiredObject(BOXES[0], 1), 7),)
+
+
+def test_commands_that_wait_when_the_stream_ends_are_rejected():
+    handler = CommandHandler(Detectors(QUICK), DesiredState(), ModelFiles(None))
+    assert handler.carry_out([Command("1", "forget", object="anna")], repeats=True) == []
+    (answer,) = handler.end("it was stopped")
+    assert (answer.id, answer.done, answer.reason) == ("1", False, "the pipeline is ending: it was stopped")
