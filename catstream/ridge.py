@@ -65,7 +65,7 @@ class Regression:
 
 def _solver(gram: np.ndarray, penalty: float) -> Callable[[np.ndarray], np.ndarray]:
     """Solves (gram + penalty I) z = right for any right side, by its Cholesky factor; changes the array."""
-    import scipy.linalg  # imported late: a restarted detector has its model, and does not need scipy
+    import scipy.linalg  # imported late: a program that only starts a pipeline needs no scipy
 
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
     factor = scipy.linalg.cho_factor(gram, overwrite_a=True, check_finite=False)

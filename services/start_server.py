@@ -235,7 +235,7 @@ class StartServer:
 
 
 def _imports() -> tuple[list[str], dict[str, str]]:
-    """What decides what a process imports: its import path, and some of its environment variables."""
+    """The import path and the environment variables on which the imports of a process depend."""
     return import_path(), {name: value for name, value in environment().items() if name.startswith(_READ_BY_IMPORTS)}
 
 

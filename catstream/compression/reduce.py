@@ -37,7 +37,7 @@ def products(rows: np.ndarray) -> np.ndarray:
     array([[ 4.,  0.],
            [ 6., 10.]], dtype=float32)
     """
-    from scipy.linalg.blas import ssyrk  # imported late, so that a restarted compressor can answer first
+    from scipy.linalg.blas import ssyrk  # imported late: a program that only starts a pipeline needs no scipy
 
     gram: np.ndarray = ssyrk(1, rows.T, trans=1, lower=1)  # one triangle: the matrix is symmetric
     return gram
