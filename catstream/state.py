@@ -81,14 +81,13 @@ def files(folder: Path) -> dict[str, bytes]:
     Empty if there is no checkpoint yet. The pipeline may be running.
     """
     for _ in range(_ATTEMPTS):
-        checkpoints = sorted((folder / TREES).glob("[0-9]*.safetensors"))
-        names = [
-            *(name for name in _SMALL if (folder / name).exists()),
-            *(f"{path.parent.name}/{path.name}" for path in (folder / SEARCHED).glob("[0-9a-f]*.safetensors")),
-            *(f"{TREES}/{path.name}" for path in checkpoints[-1:]),
-        ]
         with contextlib.suppress(FileNotFoundError):  # a newer file has just taken its place
-            return {name: (folder / name).read_bytes() for name in names} if checkpoints else {}
+            # The desired state is read before the folder of the saved models that it names: they are stored before it.
+            content = {name: (folder / name).read_bytes() for name in _SMALL if (folder / name).exists()}
+            checkpoints = sorted((folder / TREES).glob("[0-9]*.safetensors"))
+            for path in [*(folder / SEARCHED).glob("[0-9a-f]*.safetensors"), *checkpoints[-1:]]:
+                content[f"{path.parent.name}/{path.name}"] = path.read_bytes()
+            return content if checkpoints else {}
     raise ServiceError(f"the state in {str(folder)!r} changes too quickly to be read: try again")
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import glob
 import json
 import os
 import secrets
 import tempfile
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ _KEY = "catstream"  # the only metadata key: with several, their order, and so t
 _VERSION = 1  # version of the metadata's format
 #: Names of the types of arrays in the format.
 _TYPES = {"float64": "F64", "float32": "F32", "int64": "I64", "int32": "I32", "uint8": "U8", "bool": "BOOL"}
+_ABANDONED_SECONDS = 600.0  # after which nothing writes a part of a file any more
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
@@ -63,18 +65,9 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o66
 def _write_atomically(path: str | os.PathLike[str], parts: Sequence[bytes | memoryview], mode: int) -> None:
     """Replace a file atomically by parts, one after the other."""
     path = Path(path)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.unlink(missing_ok=True)  # a file left by a power cut would keep its old permissions
-        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
-            file.writelines(parts)
-            file.flush()
-            os.fsync(file.fileno())  # the content must be on disk before the new name
+    remove_parts(path.parent, _ABANDONED_SECONDS, path.name)
+    with _written_beside(path, parts, mode) as part:
         part.replace(path)
-        _sync(path.parent)
-    finally:
-        with contextlib.suppress(OSError):  # the disk may have become read-only; the next write removes the file
-            part.unlink(missing_ok=True)
 
 
 def create_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o600) -> None:
@@ -92,28 +85,39 @@ def create_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o6
         If the file cannot be written, or the file system has no hard links.
     """
     path = Path(path)
+    with _written_beside(path, [data], mode) as part:
+        os.link(part, path)  # unlike a rename, this fails if the file exists
+
+
+@contextlib.contextmanager
+def _written_beside(path: Path, parts: Sequence[bytes | memoryview], mode: int) -> Iterator[Path]:
+    """A new file in the folder of `path` whose content is on disk; what the block does with it is then on disk, too.
+
+    Its name is its own, so that several may write `path` at the same time. It is removed if the block leaves it there.
+    """
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     try:
         with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.write(data)
+            file.writelines(parts)
             file.flush()
-            os.fsync(file.fileno())
-        os.link(part, path)  # unlike a rename, this fails if the file exists
+            os.fsync(file.fileno())  # the content must be on disk before the new name
+        yield part
         _sync(path.parent)
     finally:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # the disk may have become read-only; a later write removes the file
             part.unlink(missing_ok=True)
 
 
-def remove_parts(folder: Path, seconds: float) -> None:
-    """Remove the unfinished files that processes left in a folder when they were killed in `create_atomically`.
+def remove_parts(folder: Path, seconds: float, name: str = "") -> None:
+    """Remove the unfinished files that processes left in a folder when they were killed while they wrote.
 
     Parameters
     ----------
     seconds : age of a file from which it is removed
+    name : of the file that was to be written; "" for any
     """
-    for part in folder.glob(".*.part"):
-        with contextlib.suppress(FileNotFoundError):
+    for part in folder.glob(f".{glob.escape(name)}{'.' if name else ''}*.part"):
+        with contextlib.suppress(OSError):
             if part.stat().st_mtime < time.time() - seconds:
                 part.unlink()
 

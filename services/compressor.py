@@ -131,7 +131,10 @@ class CompressorLoop:
         """Serve late joiners, send the trees to subscribers, and publish the health."""
         self._samples.serve_late_joiners()
         self._saved_models.turn(self._forest.compressors)
-        self._process.trouble = self._checkpoints.trouble if self._checkpoints is not None else ""
+        trouble = [self._checkpoints.trouble if self._checkpoints is not None else ""]
+        if self._recorder is not None and self._recorder.failed:
+            trouble.append(f"{self._recorder.failed}: the run continues without it")
+        self._process.trouble = "; ".join(filter(None, trouble))
         self._process.beat(self._counters, self._forest.object_counters, now=last)
 
     def end(self, end: End) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from catstream.detection.detector import Result
@@ -26,7 +27,8 @@ class CommandChannel(Responder[Command, Answer]):
     """Connects a `CommandHandler` to its socket and to its file.
 
     The desired state and the saved models that it names are written to disk before a command is answered. If the disk
-    is full, this is logged, and the command is carried out nevertheless.
+    is full, this is logged, the command is carried out nevertheless, its answer says that it is not kept, and the next
+    command tries again.
 
     Parameters
     ----------
@@ -40,7 +42,8 @@ class CommandChannel(Responder[Command, Answer]):
         super().__init__(CONTROL, endpoint, longest=CONTROL.limit)
         self._allow = allow
         self._handler, self._file = handler, file
-        self._kept: DesiredState | None = None
+        self._kept: DesiredState | None = None  # in the file
+        self._tried: DesiredState | None = None  # written last, or not because of an error
         self._conclude([])
 
     def carry_out(self, *, repeats: bool = False) -> bool:
@@ -77,13 +80,17 @@ class CommandChannel(Responder[Command, Answer]):
 
     def _conclude(self, answers: Iterable[Answer]) -> None:
         """Store the desired state if it has changed, then send the answers."""
-        if self._file is not None and self._handler.desired != self._kept:
-            self._kept = self._handler.desired
+        answers, desired = list(answers), self._handler.desired
+        if self._file is not None and desired != self._kept and (answers or desired != self._tried):
+            self._tried = desired
             try:
                 self._handler.models.store()  # before the state that names them
-                self._kept.save(self._file)
+                desired.save(self._file)
+                self._kept = desired
                 self._handler.models.keep_only(self._handler.needed_models)
             except OSError as error:
                 _log.warning("the desired state cannot be written to %s (%s)", self._file, error.strerror)
+                lost = f"; a resumed run will not know it, as {self._file} cannot be written ({error.strerror})"
+                answers = [replace(each, reason=each.reason + lost) if each.done else each for each in answers]
         for answer in answers:
             self.answer(answer)

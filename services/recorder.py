@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from contextlib import ExitStack
 from typing import Self
 
@@ -15,13 +14,11 @@ from catstream.wire.newest import Subscriber
 
 __all__ = ["Recorder"]
 
-_log = logging.getLogger(__name__)
-
 
 class Recorder:
     """Subscribes to a pipeline and writes each message once; a context manager.
 
-    If the disk is full, this is logged once and nothing more is written; the pipeline continues.
+    If the disk is full, no more is written but the `End`, by which a reader knows how many messages are missing.
 
     Parameters
     ----------
@@ -62,13 +59,12 @@ class Recorder:
         """Write a message."""
         if isinstance(message, End):
             self.end = message
-        if self.failed:
+        elif self.failed:
             return
         try:
             self._writer.write(message)
         except RecordingError as error:
             self.failed = str(error)
-            _log.error("%s: the run continues without it", error)
 
     def close(self) -> None:
         """Close the subscriptions."""

@@ -48,7 +48,9 @@ def test_a_job_is_read_as_it_was_written(tmp_path_factory, job):
 def test_the_file_of_a_job_is_private_from_its_first_byte(tmp_path, monkeypatch):
     before = os.umask(0)
     try:
-        (tmp_path / ".job.safetensors.part").write_text("what a power cut left of an older catstream")
+        left = tmp_path / f".job.safetensors.{0:016x}.part"
+        left.write_text("what a power cut left of an older catstream")
+        os.utime(left, (0, 0))
         modes, fsync = [], os.fsync
         monkeypatch.setattr(os, "fsync", lambda handle: (modes.append(os.fstat(handle).st_mode), fsync(handle)))
         file = JOB.save(tmp_path)

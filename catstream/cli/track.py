@@ -17,7 +17,7 @@ from catstream.cli import INTERRUPTED
 from catstream.cli.interrupts import Interrupts
 from catstream.cli.progress import RunProgress
 from catstream.cli.serving import PORT, Address, AddressType, with_token
-from catstream.errors import ServiceError
+from catstream.errors import RecordingError, ServiceError
 from catstream.extras import require_extra
 from catstream.job import Job, Results
 from catstream.messages import Track
@@ -192,6 +192,7 @@ def track(
                 pass
         console.print(_complete(pipeline, resume, output), highlight=False)
         return
+    recording: Recording | None = None
     run = RunProgress(pipeline, files.names() if resume is not None else ())
     serve = partial(_serve, pipeline, view, token, console) if view is not None else None
     try:
@@ -200,13 +201,16 @@ def track(
         if run.frames:
             console.print(run.summary([*([output] if output is not None else []), *files.files]), highlight=False)
             if record is not None:
-                console.print(f"recording: {record}, {Recording(record)}", highlight=False)
+                recording = Recording(record)
+                console.print(f"recording: {record}, {recording}", highlight=False)
     if resume is not None and not run.frames and not interrupted:
         console.print(f"no frames were left to track: the run in {resume} is complete", highlight=False)
     if interrupted:
         hint = f"; to continue: catstream track --resume {state or resume}" if state or resume else ""
         console.print(f"stopped: the results so far are kept{hint}", highlight=False)
         sys.exit(INTERRUPTED)
+    if recording is not None and not recording.complete:
+        raise RecordingError(f"{record} is not complete: see why above, and record the run again if you need it whole")
 
 
 def _run(

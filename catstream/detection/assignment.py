@@ -14,13 +14,13 @@ from catstream.messages import DetectorState
 __all__ = ["assigned"]
 
 _SAME_PLACE = 0.5  # above this overlap, two boxes are at the same place
-_APART = 0.2  # up to this overlap of their first boxes, two objects are apart: they cannot be at the same place
+_SHARED = 0.2  # above this overlap of their first boxes, two objects may be at the same place
 
 
 def assigned(
     found: Mapping[str, Detection], states: Mapping[str, DetectorState], context: float
 ) -> dict[str, Detection]:
-    """Give each place to one object, so that the sum of the scores is the highest.
+    """Give each place to one object: first to the one whose score would fall most without it.
 
     An object that loses its place takes the best other window near it; its score is 0 if there is none.
 
@@ -34,35 +34,36 @@ def assigned(
     -------
     the detection of each object; the same one if no other object claims its place
     """
-    result = dict(found)
     boxes = {name: detection.window.box(context) for name, detection in found.items()}
     firsts = {name: (state.first_frame, _first_box(state, context)) for name, state in states.items()}
-    for names in _conflicts(boxes, firsts):
-        others = {
-            name: _beside(found[name], [boxes[each] for each in names if each != name], context) for name in names
-        }
-        keeps = max(names, key=lambda name: found[name].score - others[name].score)
-        result |= {name: others[name] for name in names if name != keeps}
+    rivals = {
+        name: [other for other in found if other != name and _apart(firsts[name], firsts[other])] for name in found
+    }
+
+    def claimed(name: str, places: Mapping[str, Box]) -> list[Box]:
+        return [places[other] for other in rivals[name] if other in places]
+
+    def taken(name: str, places: Mapping[str, Box]) -> bool:
+        return any(boxes[name].overlap(box) > _SAME_PLACE for box in claimed(name, places))
+
+    contested = [name for name in found if taken(name, boxes)]
+    others = {name: _beside(found[name], claimed(name, boxes), context) for name in contested}
+    given = {name: box for name, box in boxes.items() if name not in contested}
+    result = dict(found)
+    for name in sorted(contested, key=lambda name: found[name].score - others[name].score, reverse=True):
+        if taken(name, given):
+            # Beside what was given, and what the objects that come later may keep.
+            result[name] = _beside(found[name], claimed(name, boxes | given), context)
+        if result[name].score > 0:
+            given[name] = result[name].window.box(context)
+        boxes.pop(name)
     return result
 
 
-def _conflicts(boxes: Mapping[str, Box], firsts: Mapping[str, tuple[int, Box]]) -> list[list[str]]:
-    """The groups of two or more objects that are at the same place, and were apart when they began."""
-
-    def conflict(one: str, other: str) -> bool:
-        if boxes[one].overlap(boxes[other]) <= _SAME_PLACE:
-            return False
-        (frame, box), (other_frame, other_box) = firsts[one], firsts[other]
-        return frame != other_frame or box.overlap(other_box) <= _APART
-
-    groups: list[list[str]] = []
-    for name in boxes:
-        group = next((group for group in groups if any(conflict(name, other) for other in group)), None)
-        if group is None:
-            groups.append([name])
-        else:
-            group.append(name)
-    return [group for group in groups if len(group) > 1]
+def _apart(one: tuple[int, Box], other: tuple[int, Box]) -> bool:
+    """Whether two objects cannot be at the same place, by their first frames and boxes."""
+    (frame, box), (other_frame, other_box) = one, other
+    return frame != other_frame or box.overlap(other_box) <= _SHARED
 
 
 def _beside(found: Detection, claimed: list[Box], context: float) -> Detection:

@@ -85,9 +85,6 @@ class RecordingWriter:
         self.path = Path(path)
         self.written = 0
         continued = resume and self.path.exists() and self.path.stat().st_size > 0
-        earlier = Recording(path) if continued else None
-        if earlier is not None and earlier.run != run:
-            raise RecordingError(f"{path} was recorded with other settings: give another file")
         try:
             self._file = self.path.open("r+b" if continued else "wb" if resume else "xb", buffering=0)
         except FileExistsError:
@@ -99,6 +96,10 @@ class RecordingWriter:
         if not lock(self._file.fileno()):
             self._file.close()
             raise RecordingError(f"another process records to {path}: give another name")
+        earlier = Recording(path) if continued else None  # nobody else may write to it from here on
+        if earlier is not None and earlier.run != run:
+            self._file.close()
+            raise RecordingError(f"{path} was recorded with other settings: give another file")
         self._index, self._size = (earlier.index, earlier.size) if earlier is not None else (Index(), 0)
         if earlier is None:
             self._add(run, opening(_TOPICS))
@@ -217,7 +218,14 @@ class Recording:
         lost = [f"{number} {_NOUNS[kind]}" for kind, number in self.missing.items() if number]
         damaged = f"; {self.damaged} damaged bytes are skipped" * bool(self.damaged)
         torn = f"; {self.torn} torn bytes at its end are skipped" * bool(self.torn)
-        return f"{counts}, {self.size / 1e6:.0f} MB; {' and '.join(lost) or 'none'} missing{damaged}{torn}"
+        cut = "; it ends before the run did" * (self.end is None)
+        return f"{counts}, {self.size / 1e6:.0f} MB; {' and '.join(lost) or 'none'} missing{cut}{damaged}{torn}"
+
+    @property
+    def complete(self) -> bool:
+        """Whether it has all features and tracks from its first frame to the end of the run."""
+        seqs: tuple[set[int], ...] = ({seq for seq, _ in self._features}, self._tracks)
+        return self.end is not None and all(self._missing(each) == min(each, default=1) - 1 for each in seqs)
 
     @property
     def settings(self) -> Settings:

@@ -1,7 +1,11 @@
 """Two objects do not claim the same place of a frame, unless they were given there."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from catstream.box import Box, Window
 from catstream.detection.assignment import assigned
@@ -47,6 +51,29 @@ def test_only_one_of_several_objects_keeps_a_place():
     states = {f"object-{i}": state(100 * i) for i in range(4)}
     scores = {name: each.score for name, each in assigned(found, states, CONTEXT).items()}
     assert scores == {"object-0": 0, "object-1": 0, "object-2": 0, "object-3": 0.8}
+
+
+def test_of_three_objects_in_a_row_two_that_are_apart_keep_their_places():
+    """The one in the middle is at the place of both; in another order, it keeps its place, and they lose theirs."""
+    states = {name: state(100 * i) for i, name in enumerate(("left", "right", "middle"))}
+    for middle, kept in ((0.7, {"left", "right"}), (0.95, {"middle"})):
+        found = {"left": detection(0.9, 100), "right": detection(0.8, 124), "middle": detection(middle, 112)}
+        result = assigned(found, states, CONTEXT)
+        assert {name for name, each in result.items() if each.score > 0} == kept
+
+
+@given(st.lists(st.tuples(st.floats(0.1, 1), st.integers(80, 140)), min_size=2, max_size=5), st.randoms())
+def test_no_two_objects_ever_have_one_place(objects, random):
+    def around(x):
+        scores = np.array([[random.random() for _ in range(9)] for _ in range(3)], np.float32)
+        return ScoreMap(None, scores, (x - 20.0, 40.0), (5.0, 5.0))
+
+    found = {str(i): detection(score, x, around(x)) for i, (score, x) in enumerate(objects)}
+    states = {name: state(100 * i) for i, name in enumerate(found)}
+    result = assigned(found, states, CONTEXT)
+    boxes = [each.window.box(CONTEXT) for each in result.values() if each.score > 0]
+    assert boxes
+    assert all(one.overlap(other) <= 0.5 for one, other in combinations(boxes, 2))
 
 
 def test_objects_whose_first_boxes_overlap_may_stay_at_one_place():

@@ -45,6 +45,9 @@ def test_a_run_continues_if_its_recording_cannot_be_written(long_video, tmp_path
     with Pipeline(path, boxes[0], Settings(coreset={"size": 8}), record=tmp_path / "run.rec") as pipeline:
         assert len(list(pipeline)) == pipeline.frames
         assert pipeline.health["compressor"]["unrecorded"] == 1
+        assert "cannot record" in pipeline.trouble["compressor"]
     recording = Recording(tmp_path / "run.rec")
     assert 0 < recording.counts[Features] < pipeline.frames
+    assert recording.missing[Features] == pipeline.frames - recording.counts[Features], "the end was still written"
+    assert not recording.complete
     assert recording.torn == 0
