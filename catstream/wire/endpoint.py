@@ -269,11 +269,20 @@ def fleets() -> dict[str, Endpoint]:
     return {name: endpoint for endpoint, name in _endpoints(_FLEET_NOTE, _FLEET_NAME)}
 
 
-def _endpoints(note: str, about: str) -> Iterator[tuple[Endpoint, str]]:
-    """The endpoint in each note whose process is running, and the text of the file beside it."""
+def _endpoints(note: str, about: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, str]]:
+    """The endpoint in each note whose process is running, and the text of the file beside it.
+
+    An endpoint whose keys cannot be read is skipped, because it must not hide the others; if `strict`, it is an error.
+    """
     for path, text in notes(set(homes()), f"{_PREFIX}*/{note}"):
         if text:  # empty until the process has written it
-            yield Endpoint.parse(*text.split("\n")), _read(path.with_name(about))
+            try:
+                endpoint = Endpoint.parse(*text.split("\n"))
+            except ServiceError:
+                if strict:
+                    raise
+                continue
+            yield endpoint, _read(path.with_name(about))
 
 
 def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
@@ -301,6 +310,7 @@ def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
             raise ServiceError(f"{len(found)} pipelines follow {source!r}: say which (--endpoint){_listed(found)}")
         return found[0]
     if not endpoints:
+        list(_endpoints(_NOTE, _SOURCE, strict=True))  # one whose keys cannot be read is running: say so
         raise ServiceError("no pipeline of yours is running: start one (catstream track), or give its --endpoint")
     if len(endpoints) > 1:
         raise ServiceError(

@@ -199,3 +199,18 @@ def test_without_a_place_there_must_be_just_one_pipeline(folder, monkeypatch):
         assert find() == first
         with meeting_place("", two), pytest.raises(ServiceError, match="2 pipelines are running: say which"):
             find()
+
+
+def test_a_pipeline_whose_keys_cannot_be_read_does_not_hide_the_others(tmp_path):
+    create(tmp_path / "keys")
+    with (
+        private_folder() as one,
+        meeting_place("", one, source="good.mp4") as good,
+        private_folder() as two,
+        meeting_place("tcp://127.0.0.1:5998", two, str(tmp_path / "keys"), "other.mp4") as other,
+    ):
+        assert {str(good), str(other)} <= {str(endpoint) for endpoint in running()}
+        shutil.move(tmp_path / "keys", tmp_path / "moved")
+        assert str(good) in {str(endpoint) for endpoint in running()}
+        assert str(other) not in {str(endpoint) for endpoint in running()}
+        assert find(source="good.mp4").source == find(str(good)).source == "good.mp4"
