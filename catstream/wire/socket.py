@@ -219,8 +219,9 @@ class ChannelSocket(Generic[Message]):
     def _raise_if_denied(self, event: Event) -> None:
         if event.denied:
             raise ServiceError(
-                f"{self._endpoint} does not let this key take part in {self.channel.name}: "
-                "ask its administrator for a key with that role (catstream keys allow)"
+                f"{self._endpoint} does not let this key in: it was revoked, was never allowed, or lacks the role "
+                f"{self.channel.role}, which {self.channel.name} requires; the pipeline's log says which: "
+                "ask its administrator (catstream keys allow)"
             )
         if event.other_mechanism and self._endpoint.keys is None:
             raise ServiceError(
