@@ -13,6 +13,7 @@ __all__ = [
     "FleetError",
     "FrameError",
     "MissingExtraError",
+    "MissingFileError",
     "ObjectError",
     "ProtocolError",
     "RecordingError",
@@ -71,6 +72,10 @@ class RecordingError(CatstreamError):
 
 class ServiceError(CatstreamError):
     """A process of the pipeline failed or cannot start."""
+
+
+class MissingFileError(ServiceError, FileNotFoundError):
+    """There is no file of the given name."""
 
 
 class StreamRewoundError(ServiceError):

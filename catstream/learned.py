@@ -10,7 +10,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import combinations
 from pathlib import Path
 from typing import Self
 
@@ -22,7 +21,7 @@ from catstream.compression.compressor import Compressor, sample_of
 from catstream.compression.reduce import energy
 from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
 from catstream.detection.likeness import Likeness
-from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.errors import MissingFileError, ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
 from catstream.heads import HEADS
 from catstream.messages import Features, Model
@@ -146,8 +145,8 @@ class Learned:
         ProtocolError
             If it is damaged, another file, or one of other features.
         """
-        if not Path(path).is_file():
-            raise ServiceError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
+        if not Path(path).exists():
+            raise MissingFileError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
         try:
             data = Path(path).read_bytes()
         except OSError as error:
@@ -234,9 +233,11 @@ def merge(parts: Sequence[Learned]) -> Learned:
     """
     if len(parts) < 2:
         raise SettingsError(f"{len(parts)} saved model given: a merge needs two or more")
-    for one, other in combinations(parts, 2):
-        _check_merge(one, other)
-    first = parts[0]
+    first, origins = parts[0], set(parts[0].origins)
+    named = next((part for part in parts if part.object), first)
+    for part in parts[1:]:
+        _check_merge(named if part.object else first, part, origins)
+        origins.update(part.origins)
     trees = {head: reduce(CoresetTree.merged, [part.trees[head] for part in parts]) for head in HEADS}
     name = next((part.object for part in parts if part.object), "")
     centres = next((part.centres for part in parts if len(part.centres)), first.centres)
@@ -253,15 +254,15 @@ def merge(parts: Sequence[Learned]) -> Learned:
     )
 
 
-def _check_merge(one: Learned, other: Learned) -> None:
-    """Raise SettingsError if two saved models cannot be merged."""
+def _check_merge(one: Learned, other: Learned, origins: set[str]) -> None:
+    """Raise SettingsError if a saved model cannot be merged; `origins` are those of all before it."""
     if one.object and other.object and one.object != other.object:
         raise SettingsError(
             f"one saved model is of {one.object!r}, another of {other.object!r}: "
             "only models of the same object can be merged"
         )
     _check_same(one.settings, other.settings, "one saved model was learned", "another")
-    if set(one.origins) & set(other.origins):
+    if origins & set(other.origins):
         raise SettingsError(
             "two of the saved models have learned from the same frames, which would count twice: "
             "merge models of different videos"

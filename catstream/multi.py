@@ -23,7 +23,7 @@ from catstream.compression.forest import Forest
 from catstream.detection.detector import Detector
 from catstream.detection.likeness import Likeness
 from catstream.detection.objects import Detectors, prepare
-from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, ServiceError
+from catstream.errors import BoxError, FrameError, MissingFileError, ObjectError, ProtocolError, ServiceError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.image import as_bgr
@@ -240,7 +240,7 @@ class MultiTracker:
         try:
             storage.write(path, arrays, whole)
         except OSError as error:
-            raise ServiceError(f"cannot write {str(path)!r} ({error}): give another file") from None
+            raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another file") from None
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -253,9 +253,14 @@ class MultiTracker:
         ProtocolError
             If it is damaged, another file, or of a catstream with other features.
         """
-        if not Path(path).is_file():
-            raise ServiceError(f"there is no saved tracker {str(path)!r}: `{cls.__name__}.save` writes one")
-        arrays, metadata = storage.read(path)
+        if not Path(path).exists():
+            raise MissingFileError(f"there is no saved tracker {str(path)!r}: its method `save` writes one")
+        if Path(path).is_dir():
+            raise ServiceError(f"{str(path)!r} is a folder: give a file that the method `save` of a tracker wrote")
+        try:
+            arrays, metadata = storage.read(path)
+        except OSError as error:
+            raise ServiceError(f"cannot read {str(path)!r} ({error.strerror}): give another file") from None
         try:
             if metadata.get("kind") != _KIND:
                 raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")

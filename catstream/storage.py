@@ -213,7 +213,9 @@ def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
         if header["checksum"] != _checksum(arrays, metadata):
             raise ValueError("its checksum does not match")
     except (SafetensorError, KeyError, RecursionError, TypeError, ValueError) as error:
-        raise ProtocolError(f"{name} is not an undamaged file of catstream ({error}): use an older copy") from None
+        raise ProtocolError(
+            f"{name} is not an undamaged file of catstream ({error}): give a file that catstream wrote"
+        ) from None
     return arrays, metadata
 
 

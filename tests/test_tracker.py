@@ -192,6 +192,27 @@ def test_another_process_continues_bit_for_bit_with_any_number_of_threads(video,
     assert told.splitlines() == [str(track) for *_, track in results(tracker, frames[8:])]
 
 
+def test_a_missing_file_and_one_of_something_else_are_told_apart(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"there is no saved tracker 'nothing'.*`save` writes one") as missing:
+        Tracker.load("nothing")
+    assert isinstance(missing.value, ServiceError)
+    with pytest.raises(ServiceError, match="is a folder"):
+        Tracker.load(tmp_path)
+    (tmp_path / "text").write_text("root:x:0:0:root:/root:/bin/sh\n")
+    with pytest.raises(ProtocolError, match="is not an undamaged file of catstream") as other:
+        Tracker.load(tmp_path / "text")
+    assert "older copy" not in str(other.value)
+
+
+def test_an_unwritable_place_is_named_as_it_was_given(video, tmp_path):
+    frames, boxes = video
+    tracker = Tracker()
+    tracker.init(frames[0], boxes[0])
+    with pytest.raises(ServiceError, match="cannot write") as error:
+        tracker.save(tmp_path / "none" / "x")
+    assert ".part" not in str(error.value)
+
+
 def test_nothing_is_saved_before_init(tmp_path):
     with pytest.raises(BoxError, match="call init"):
         Tracker().save(tmp_path / "kept")
