@@ -16,6 +16,7 @@ from catstream.evaluation.datasets import Sequence
 from catstream.features.cells import Cells
 from catstream.features.colours import shades
 from catstream.features.hog import grid
+from catstream.features.pyramid import planes_of
 from catstream.messages import Sample
 from catstream.multi import MultiTracker
 from catstream.names import UNNAMED
@@ -48,10 +49,10 @@ def milliseconds(call: Callable[[], object], runs: int) -> float:
 def detection(sequence: Sequence) -> Iterator[tuple[str, Callable[[], object]]]:
     """Time the detection in one image of 640x480 pixels."""
     image = next(sequence.frames())
-    cells = Cells.of(image)
+    cells, planes = Cells.of(image), planes_of(image)
     weights = cells.row(0, 0)
-    yield "HOG and colour, 640x480", lambda: grid(image)
-    yield "shades of its colours", lambda: shades(image)
+    yield "HOG and colour, 640x480", lambda: grid(planes)
+    yield "shades of its colours", lambda: shades(planes)
     windows = (cells.shape[0] - 7) * (cells.shape[1] - 7)
     yield f"score all {windows} windows of it", lambda: cells.respond(weights, 0.0)
 

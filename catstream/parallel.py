@@ -7,17 +7,35 @@ results is that of the items, and each call is independent: the results do not d
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, lru_cache
 from typing import TypeVar
+
+import numpy as np
 
 from catstream.threads import one_thread
 
-__all__ = ["in_parallel"]
+__all__ = ["Scratch", "in_parallel"]
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+class Scratch(threading.local):
+    """The arrays for intermediate results of a kernel, which a function makes for some sizes.
+
+    Each thread keeps those of the last sizes: to make them for a small image takes a third as long as the kernel.
+
+    Attributes
+    ----------
+    made : the function
+    kept : the same, but arrays that this thread made before are used again
+    """
+
+    def __init__(self, made: Callable[..., tuple[np.ndarray, ...]]) -> None:
+        self.made, self.kept = made, lru_cache(maxsize=16)(made)
 
 
 def in_parallel(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:

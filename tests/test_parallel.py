@@ -1,11 +1,13 @@
 """Calls in threads: the results are those of a loop."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
 from catstream import parallel
-from catstream.parallel import in_parallel
+from catstream.parallel import Scratch, in_parallel
 
 
 @pytest.fixture(params=[1, 3], ids="{} cores".format)
@@ -39,3 +41,12 @@ def test_the_first_error_is_raised(cores):
     with pytest.raises(ValueError, match="1"):
         in_parallel(call, range(4))
     assert set(ended) == ({0, 3} if cores > 1 else {0})
+
+
+def test_scratch_is_kept_for_a_size_and_no_two_threads_share_it():
+    scratch = Scratch(lambda size: (np.empty(size),))
+    (here,) = scratch.kept(3)
+    assert scratch.kept(3)[0] is here
+    assert scratch.kept(4)[0] is not here
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: scratch.kept(3)).result()[0] is not here

@@ -220,7 +220,7 @@ def affine_copies(
         offset = _elsewhere(window, rng) if _is_moved(number, moved) else None
         patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset)
         if number >= max(count - mirrored, 1):
-            patch = cv2.flip(patch, 1)
+            patch = np.ascontiguousarray(patch[:, :, ::-1])
         rows.append(Cells.within(patch).row(0, 0))
     return np.array(rows, np.float32)
 
@@ -255,7 +255,7 @@ def _patch(
 
     Returns
     -------
-    uint8 (96, 96, 3) or (96, 96), as the frame
+    uint8 (3, 96, 96), or (1, 96, 96) of a grey frame
     """
     pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
     x, y = window.centre
@@ -264,8 +264,7 @@ def _patch(
         return patch
     share = _ellipse(window.w / box.w, window.h / box.h)
     background = frame.cut(x + offset[0], y + offset[1], *pixel, _PATCH, turn)
-    blended: np.ndarray = cv2.blendLinear(patch, background, share, 1 - share)
-    return blended
+    return np.stack([cv2.blendLinear(*both, share, 1 - share) for both in zip(patch, background, strict=True)])
 
 
 def _ellipse(across: float, down: float) -> np.ndarray:

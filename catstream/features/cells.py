@@ -16,6 +16,7 @@ from catstream.features.colours import count
 from catstream.features.compiled import kernel
 from catstream.features.hog import grid
 from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, WINDOW, row_length
+from catstream.features.pyramid import planes_of
 
 __all__ = ["Cells"]
 
@@ -36,13 +37,14 @@ class Cells:
     @classmethod
     def of(cls, image: np.ndarray) -> Cells:
         """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells."""
-        return cls(grid(image), colours.shades(image))
+        planes = planes_of(image)
+        return cls(grid(planes), colours.shades(planes))
 
     @classmethod
-    def within(cls, image: np.ndarray) -> Cells:
-        """The same without the margin, whose features depend on pixels beyond the image."""
+    def within(cls, planes: np.ndarray) -> Cells:
+        """Cells of a patch, uint8 (3, h, w), without the margin, whose features depend on pixels beyond it."""
         edge = MARGIN * CELL
-        return cls(grid(image, MARGIN), colours.shades(image[edge:-edge, edge:-edge]))
+        return cls(grid(planes, MARGIN), colours.shades(planes[:, edge:-edge, edge:-edge]))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -10,10 +10,10 @@ Four pixels are averaged to one first: a cell has 4 x 4 shades.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from catstream.arrays import Float32, UInt8, UInt16
+from catstream.features import lab
 from catstream.features.compiled import kernel
 from catstream.features.layout import CHROMA, LIGHT, SHADES, SIDE, WINDOW
 
@@ -26,22 +26,22 @@ _ROOT = np.float32(_WEIGHT / (_COUNTED * SIDE))  # what a count adds up to as a 
 _LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with infinity
 
 
-def shades(image: np.ndarray) -> np.ndarray:
+def shades(planes: np.ndarray) -> np.ndarray:
     """The shade of every 2 x 2 pixels.
 
     Parameters
     ----------
-    image : uint8 (h, w, 3) BGR; h and w are even
+    planes : uint8 (3, h, w), blue, green and red; h and w are even
 
     Returns
     -------
     uint16 (h // 2, w // 2), below `SHADES`
 
-    >>> len(set(shades(np.array([[0, 0, 90, 90], [0, 0, 90, 90]], np.uint8)[:, :, None].repeat(3, axis=2)).ravel()))
+    >>> len(set(shades(np.array([[0, 0, 90, 90], [0, 0, 90, 90]], np.uint8)[None].repeat(3, axis=0)).ravel()))
     2
     """
-    found = np.empty((image.shape[0] // 2, image.shape[1] // 2), np.uint16)
-    _look_up(image, _TABLE, found)
+    found = np.empty((planes.shape[1] // 2, planes.shape[2] // 2), np.uint16)
+    _look_up(planes, _TABLE, found)
     return found
 
 
@@ -84,9 +84,9 @@ def _table() -> np.ndarray:
     """Shade of every BGR colour of 5 bits each, blue first."""
     levels = np.arange(4, 256, 8, dtype=np.uint8)
     colours = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1)
-    lab = cv2.cvtColor(colours.reshape(-1, 1, 3), cv2.COLOR_BGR2LAB).reshape(-1, 3).astype(int)
-    light = lab[:, 0] * LIGHT // 256
-    chroma = ((lab[:, 1:] - 128) // _CHROMA_STEP + CHROMA // 2).clip(0, CHROMA - 1)
+    found = lab.converted(colours.reshape(-1, 3)).astype(int)
+    light = found[:, 0] * LIGHT // 256
+    chroma = ((found[:, 1:] - 128) // _CHROMA_STEP + CHROMA // 2).clip(0, CHROMA - 1)
     bins: np.ndarray = ((light * CHROMA + chroma[:, 0]) * CHROMA + chroma[:, 1]).astype(np.uint16)
     return bins
 
@@ -95,13 +95,13 @@ _TABLE = _table()
 
 
 @kernel("void(uint8[:,:,:], uint16[::1], uint16[:,::1])")
-def _look_up(image: UInt8, table: UInt16, found: UInt16) -> None:
+def _look_up(planes: UInt8, table: UInt16, found: UInt16) -> None:
     for y in range(found.shape[0]):
         for x in range(found.shape[1]):
             place = 0  # the first 5 bits of each channel's mean, one after the other
             for channel in range(3):
-                above = np.int64(image[2 * y, 2 * x, channel]) + image[2 * y, 2 * x + 1, channel]
-                below = np.int64(image[2 * y + 1, 2 * x, channel]) + image[2 * y + 1, 2 * x + 1, channel]
+                above = np.int64(planes[channel, 2 * y, 2 * x]) + planes[channel, 2 * y, 2 * x + 1]
+                below = np.int64(planes[channel, 2 * y + 1, 2 * x]) + planes[channel, 2 * y + 1, 2 * x + 1]
                 mean = (above + below + 2) >> 2
                 place = place << 5 | mean >> 3
             found[y, x] = table[place]

@@ -12,13 +12,14 @@ each pixel is added to its four nearest cells at once.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy import float32
 
 from catstream.arrays import Float32, UInt8
 from catstream.features.compiled import kernel
+from catstream.features.lab import of_colour
 from catstream.features.layout import CELL, CHANNELS
+from catstream.parallel import Scratch
 
 __all__ = ["grid"]
 
@@ -28,8 +29,10 @@ _HALF = CELL // 2
 _CLIP = np.float32(0.2)  # a normalised bin is cut here (Dalal and Triggs 2005)
 _TEXTURE = np.float32(0.2357)  # 1 / sqrt(18), as published
 _COLOUR_WEIGHT = 1.5
-_LAB_MIDDLE = np.float32(128)
-_LAB_SCALE = np.array([1.0, 3.0, 3.0], np.float32) * np.float32(_COLOUR_WEIGHT / 255)
+_LIGHT_SCALE = np.float32(_COLOUR_WEIGHT / 255)
+_CHROMA_SCALE = np.float32(3) * _LIGHT_SCALE
+_LAB_MIDDLE = 128
+_MOST_KEPT = 1024  # cells of an image whose scratch is kept: a patch, and no whole frame
 #: Orientations are 20 degrees apart: the tangents of where one ends and the next begins, from 0 to 90.
 _TAN_10, _TAN_30, _TAN_50, _TAN_70 = np.tan(np.deg2rad([10, 30, 50, 70])).astype(np.float32)
 
@@ -45,7 +48,7 @@ def _shares() -> np.ndarray:
 _SHARES = _shares()
 
 
-def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
+def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:
     """Features of every whole cell of an image.
 
     A cell's features depend on pixels up to `MARGIN` cells away: the grid of a
@@ -53,41 +56,45 @@ def grid(image: np.ndarray, margin: int = 0) -> np.ndarray:
 
     Parameters
     ----------
-    image : uint8 (h, w, 3) BGR
+    planes : uint8 (3, h, w), blue, green and red of the image
     margin : cells along each edge that are left out
 
     Returns
     -------
     float32 (h // 8 - 2 margin, w // 8 - 2 margin, 34)
 
-    >>> grid(np.zeros((64, 96, 3), np.uint8)).shape
+    >>> grid(np.zeros((3, 64, 96), np.uint8)).shape
     (8, 12, 34)
     """
-    rows, columns = image.shape[0] // CELL, image.shape[1] // CELL
-    inner = max(rows - 2 * margin, 0), max(columns - 2 * margin, 0)
-    cells, colour = np.empty((*inner, CHANNELS), np.float32), np.empty((*inner, 3), np.uint8)
+    rows, columns = planes.shape[1] // CELL, planes.shape[2] // CELL
+    cells = np.empty((max(rows - 2 * margin, 0), max(columns - 2 * margin, 0), CHANNELS), np.float32)
     if cells.size:
-        pixels, width = np.ascontiguousarray(image).reshape(len(image), -1), columns * CELL
-        lines, gradients = np.empty((3, 3, width + 2), np.float32), np.empty((3, width + CELL), np.float32)
-        orientation, blocks = np.empty(width + CELL, np.uint8), np.empty((columns + 1, _SIGNED, 4), np.float32)
-        histogram, energy = (
-            np.zeros((rows + 2, columns + 2, _SIGNED), np.float32),
-            np.empty((rows, columns), np.float32),
-        )
-        _describe(pixels, margin, _SHARES, lines, gradients, orientation, blocks, histogram, energy, colour, cells)
-        # The mean colour, converted, costs a tenth of the converted colours' mean and differs by little.
-        lab = cv2.cvtColor(colour, cv2.COLOR_BGR2LAB)
-        np.multiply(lab - _LAB_MIDDLE, _LAB_SCALE, out=cells[:, :, 31:])
+        arrays = _scratch.kept if rows * columns <= _MOST_KEPT else _scratch.made
+        _describe(planes, margin, _SHARES, cells, *arrays(rows, columns))
     return cells
 
 
-def _read(row: UInt8, line: Float32) -> None:
+@Scratch
+def _scratch(rows: int, columns: int) -> tuple[np.ndarray, ...]:
+    """The arrays for intermediate results of `_describe`."""
+    width = columns * CELL
+    return (
+        np.empty((3, 3, width + 2), np.float32),
+        np.empty((3, width + CELL), np.float32),
+        np.empty(width + CELL, np.uint8),
+        np.empty((columns + 1, _SIGNED, 4), np.float32),
+        np.empty((rows + 2, columns + 2, _SIGNED), np.float32),
+        np.empty((rows, columns), np.float32),
+    )
+
+
+def _read(planes: UInt8, y: int, line: Float32) -> None:
     """The three channels of one row of pixels, the pixels at the edge twice."""
     width = line.shape[1] - 2
     for channel in range(3):
-        values = line[channel]
+        values, row = line[channel], planes[channel, y]
         for x in range(width):
-            values[x + 1] = row[3 * x + channel]
+            values[x + 1] = row[x]
         values[0], values[width + 1] = values[1], values[width]
 
 
@@ -138,7 +145,7 @@ def _add(magnitude: Float32, orientation: UInt8, shares: Float32, blocks: Float3
 
 
 def _count(
-    image: UInt8,
+    planes: UInt8,
     margin: int,
     shares: Float32,
     lines: Float32,
@@ -153,6 +160,10 @@ def _count(
     across, down, magnitude = gradients[0], gradients[1], gradients[2]
     for x in range(len(magnitude)):
         magnitude[x] = orientation[x] = 0
+    for row in range(rows + 2):
+        for column in range(columns + 2):
+            for o in range(_SIGNED):
+                histogram[row, column, o] = 0
     for band in range(margin, rows + 1 - margin):  # of the pixels between the centres of two rows of cells
         for block in range(columns + 1):
             for o in range(_SIGNED):
@@ -160,11 +171,11 @@ def _count(
                     blocks[block, o, share] = 0
         top, bottom = max(band * CELL - _HALF, 0), min(band * CELL + _HALF, height)
         if band == margin:
-            _read(image[max(top - 1, 0)], lines[(top + 2) % 3])
-            _read(image[top], lines[top % 3])
+            _read(planes, max(top - 1, 0), lines[(top + 2) % 3])
+            _read(planes, top, lines[top % 3])
         for y in range(top, bottom):
             above, here, below = lines[(y + 2) % 3], lines[y % 3], lines[(y + 1) % 3]
-            _read(image[min(y + 1, height - 1)], below)
+            _read(planes, min(y + 1, height - 1), below)
             _gradients(above, here, below, across[:width], down[:width], magnitude[_HALF : _HALF + width])
             _orientations(across[:width], down[:width], orientation[_HALF : _HALF + width])
             _add(magnitude, orientation, shares[(y + _HALF) % CELL], blocks)
@@ -176,16 +187,25 @@ def _count(
                 histogram[band + 1, block + 1, o] += blocks[block, o, 3]
 
 
-def _average(image: UInt8, margin: int, means: UInt8) -> None:
-    """The mean of each cell's pixels."""
-    for row in range(means.shape[0]):
-        for column in range(means.shape[1]):
-            for channel in range(3):
-                total = CELL * CELL // 2  # half, to round
-                for y in range((row + margin) * CELL, (row + margin + 1) * CELL):
-                    for x in range((column + margin) * CELL, (column + margin + 1) * CELL):
-                        total += image[y, 3 * x + channel]
-                means[row, column, channel] = total // (CELL * CELL)
+def _average(plane: UInt8, row: int, column: int) -> int:
+    """The mean of one channel of a cell's pixels."""
+    total = CELL * CELL // 2  # half, to round
+    for y in range(row * CELL, (row + 1) * CELL):
+        for x in range(column * CELL, (column + 1) * CELL):
+            total += plane[y, x]
+    return total // (CELL * CELL)
+
+
+def _colour(planes: UInt8, margin: int, cells: Float32) -> None:
+    """The mean colour of each cell, converted to Lab (decision 11)."""
+    for row in range(cells.shape[0]):
+        for column in range(cells.shape[1]):
+            y, x = row + margin, column + margin
+            blue, green, red = _average(planes[0], y, x), _average(planes[1], y, x), _average(planes[2], y, x)
+            light, a, b = of_colour(blue, green, red)
+            cells[row, column, 31] = float32(light - _LAB_MIDDLE) * _LIGHT_SCALE
+            cells[row, column, 32] = float32(a - _LAB_MIDDLE) * _CHROMA_SCALE
+            cells[row, column, 33] = float32(b - _LAB_MIDDLE) * _CHROMA_SCALE
 
 
 def _normalise(histogram: Float32, margin: int, energy: Float32, cells: Float32) -> None:
@@ -233,30 +253,29 @@ def _normalise(histogram: Float32, margin: int, energy: Float32, cells: Float32)
 
 
 @kernel(
-    "void(uint8[:,::1], int64, float32[:,:,::1], float32[:,:,::1], float32[:,::1], uint8[::1], float32[:,:,::1], "
-    "float32[:,:,::1], float32[:,::1], uint8[:,:,::1], float32[:,:,::1])"
+    "void(uint8[:,:,::1], int64, float32[:,:,::1], float32[:,:,::1], float32[:,:,::1], float32[:,::1], uint8[::1], "
+    "float32[:,:,::1], float32[:,:,::1], float32[:,::1])"
 )
 def _describe(
-    image: UInt8,
+    planes: UInt8,
     margin: int,
     shares: Float32,
+    cells: Float32,
     lines: Float32,
     gradients: Float32,
     orientation: UInt8,
     blocks: Float32,
     histogram: Float32,
     energy: Float32,
-    means: UInt8,
-    cells: Float32,
 ) -> None:
-    """HOG and mean colour, BGR, of the cells within the margin.
+    """HOG and mean colour of the cells within the margin.
 
     Scratch: lines (3, 3, width + 2), the three channels of the rows above, here and below, in turns; of a row with half
     a cell more on either side, gradients (3, width + 8), across, down and magnitude, and orientation (width + 8,);
     blocks (columns + 1, 18, 4), of the pixels between the centres of four cells their shares in each; energy
-    (rows, columns); histogram, filled with 0, (rows + 2, columns + 2, 18), with one cell more on every side, which
-    takes what falls outside.
+    (rows, columns); histogram (rows + 2, columns + 2, 18), with one cell more on every side, which takes what falls
+    outside.
     """
-    _count(image, max(margin - 1, 0), shares, lines, gradients, orientation, blocks, histogram)
+    _count(planes, max(margin - 1, 0), shares, lines, gradients, orientation, blocks, histogram)
     _normalise(histogram, margin, energy, cells)
-    _average(image, margin, means)
+    _colour(planes, margin, cells)

@@ -12,8 +12,9 @@ from catstream.arrays import Float32, UInt8, UInt32
 from catstream.box import Window
 from catstream.features.compiled import kernel
 from catstream.features.layout import CELL, MARGIN, WINDOW
+from catstream.parallel import Scratch
 
-__all__ = ["Pyramid", "Region"]
+__all__ = ["Pyramid", "Region", "planes_of"]
 
 _MOST_CELLS = 62_500  # of the region around a tiny window, which bounds the cost of a large frame
 _OVERLAP = WINDOW + 2 * MARGIN  # cells that adjacent parts of a region share, at least: a window and its margin
@@ -97,7 +98,7 @@ class Pyramid:
         return self._halves[level], 1 << level
 
     def around(self, window: Window, side: int) -> np.ndarray:
-        """A patch of `side` x `side` cells around a window and a margin, in which the window is 64 x 64 pixels."""
+        """A patch of `side` x `side` cells around a window and a margin, as `cut`; the window has 64 x 64 pixels."""
         x, y = window.centre
         step = window.w / WINDOW, window.h / WINDOW
         return self.cut(x, y, step[0] / CELL, step[1] / CELL, (side + 2 * MARGIN) * CELL)
@@ -156,26 +157,37 @@ class Pyramid:
 
         Returns
         -------
-        uint8 (size, size, 3) or (size, size), as the frame
+        uint8 (3, size, size), blue, green and red, or (1, size, size) of a grey frame
         """
         image, wide = self.near(min(across, down))
         x, y, across, down = x / wide - 0.5, y / wide - 0.5, across / wide, down / wide
         middle = (size - 1) / 2
         if not turn:
-            found = np.empty((size, size, *image.shape[2:]), np.uint8)
-            corner = x - middle * across, y - middle * down
-            channels = found.size // size**2
-            columns = size * channels
-            pixels, share = np.empty((2, columns), np.uint32), np.empty(columns, np.float32)
-            line = np.empty(image[0].size, np.float32)
-            sampled = found.reshape(size, -1)
-            _sample(image.reshape(len(image), -1), channels, *corner, across, down, pixels, share, line, sampled)
+            found = np.empty((1 if image.ndim == 2 else 3, size, size), np.uint8)
+            lines = image.reshape(len(image), -1)
+            scratch = _scratch.kept(size, lines.shape[1])
+            _sample(lines, x - middle * across, y - middle * down, across, down, found, *scratch)
             return found
         cos, sin = np.cos(turn), np.sin(turn)
         matrix = np.array([[across * cos, -down * sin, x], [across * sin, down * cos, y]])
         matrix[:, 2] -= matrix[:, :2] @ np.full(2, middle)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return planes_of(cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def planes_of(image: np.ndarray) -> np.ndarray:
+    """The channels of an image, uint8 (h, w, 3) or (h, w), one after the other: uint8 (3, h, w) or (1, h, w)."""
+    if image.ndim == 2:
+        return image[None]
+    planes = np.empty((3, *image.shape[:2]), np.uint8)
+    cv2.split(image, list(planes))  # into these
+    return planes
+
+
+@Scratch
+def _scratch(size: int, columns: int) -> tuple[np.ndarray, ...]:
+    """The arrays for intermediate results of `_sample`."""
+    return np.empty((2, size), np.uint32), np.empty(size, np.float32), np.empty(columns, np.float32)
 
 
 def _half(image: np.ndarray) -> np.ndarray:
@@ -185,36 +197,34 @@ def _half(image: np.ndarray) -> np.ndarray:
 
 
 @kernel(
-    "void(uint8[:,::1], int64, float64, float64, float64, float64, "
-    "uint32[:,::1], float32[::1], float32[::1], uint8[:,::1])"
+    "void(uint8[:,::1], float64, float64, float64, float64, uint8[:,:,::1], uint32[:,::1], float32[::1], float32[::1])"
 )
 def _sample(
     image: UInt8,
-    channels: int,
     left: float,
     top: float,
     across: float,
     down: float,
+    found: UInt8,
     pixels: UInt32,
     share: Float32,
     line: Float32,
-    found: UInt8,
 ) -> None:
     """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row.
 
-    Scratch, of each number of a row found: pixels (2, columns), where in the line the two pixels are that it lies
+    Scratch, of each pixel of a row found: pixels (2, columns), where in the line the two pixels are that it lies
     between; share (columns,) of the second one; line (columns of the image,).
     """
-    rows, columns = found.shape
+    channels, rows, columns = found.shape
     height, width = image.shape[0], image.shape[1] // channels
     begin = min(max(int(np.floor(left)), 0), width - 1)
-    end = min(max(int(np.floor(left + (columns // channels - 1) * across)) + 2, begin + 1), width)
+    end = min(max(int(np.floor(left + (columns - 1) * across)) + 2, begin + 1), width)
     first, second = pixels[0], pixels[1]
     for i in range(columns):
-        x, channel = left + i // channels * across, i % channels
+        x = left + i * across
         pixel = int(np.floor(x))
-        first[i] = (min(max(pixel, begin), end - 1) - begin) * channels + channel
-        second[i] = (min(max(pixel + 1, begin), end - 1) - begin) * channels + channel
+        first[i] = (min(max(pixel, begin), end - 1) - begin) * channels
+        second[i] = (min(max(pixel + 1, begin), end - 1) - begin) * channels
         share[i] = x - np.floor(x)
     for row in range(rows):
         y = top + row * down
@@ -225,6 +235,8 @@ def _sample(
         for i in range((end - begin) * channels):
             value = np.float32(above[i])
             line[i] = value + part * (np.float32(below[i]) - value) + np.float32(0.5)  # half, to round
-        for i in range(columns):
-            value = line[first[i]]
-            found[row, i] = np.uint8(value + share[i] * (line[second[i]] - value))
+        for channel in range(channels):
+            values, line_found = line[channel:], found[channel, row]
+            for i in range(columns):
+                value = values[first[i]]
+                line_found[i] = np.uint8(value + share[i] * (values[second[i]] - value))

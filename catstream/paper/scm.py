@@ -154,7 +154,7 @@ class SparseCollaborativeModel:
         across = self._first.w / _SIDE * np.exp(states[:, 2] + states[:, 3])
         down = self._first.h / _SIDE * np.exp(states[:, 2] - states[:, 3])
         places = zip(states[:, 0], states[:, 1], across, down, states[:, 4], strict=True)
-        return np.array([grey.cut(x, y, w, h, _SIDE, turn) for x, y, w, h, turn in places])
+        return np.array([grey.cut(x, y, w, h, _SIDE, turn)[0] for x, y, w, h, turn in places])
 
 
 class _Discriminative:

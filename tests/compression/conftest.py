@@ -10,6 +10,7 @@ import pytest
 
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, MARGIN, WINDOW
+from catstream.features.pyramid import planes_of
 
 ROWS = 208  #: 13 leaves of 16: levels 3, 2 and 0
 
@@ -35,7 +36,7 @@ def hog_rows(rng: np.random.Generator) -> np.ndarray:
         turn[:, 2] += 10 * np.sin([frame / 11, frame / 17]) - 120 + side / 2
         image = cv2.warpAffine(texture, turn, (side, side)) * (0.8 + 0.2 * np.cos(frame / 40))
         image = np.clip(image + rng.normal(scale=4, size=image.shape), 0, 255).astype(np.uint8)
-        rows.append(Cells.within(image).row(0, 0))
+        rows.append(Cells.within(planes_of(image)).row(0, 0))
     return np.array(rows)
 
 

@@ -8,7 +8,7 @@ from catstream.detection.colour_centroid import recentred
 from catstream.detection.search import ScoreMap
 from catstream.features import colours
 from catstream.features.layout import COLOURS, row_length
-from catstream.features.pyramid import Pyramid
+from catstream.features.pyramid import Pyramid, planes_of
 from catstream.messages import Model
 
 RED, GREEN = (40, 40, 200), (60, 160, 60)
@@ -19,7 +19,7 @@ SLACK = 0.14
 def model():
     """Red has a positive weight, green a negative one."""
     weights = np.zeros(row_length(), np.float32)
-    red, green = (colours.shades(np.full((2, 2, 3), colour, np.uint8))[0, 0] for colour in (RED, GREEN))
+    red, green = (colours.shades(planes_of(np.full((2, 2, 3), colour, np.uint8)))[0, 0] for colour in (RED, GREEN))
     weights[COLOURS][red], weights[COLOURS][green] = 1, -1
     return Model(1, 0, weights, 0.0)
 

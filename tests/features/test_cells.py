@@ -5,6 +5,7 @@ import pytest
 
 from catstream.features.cells import Cells
 from catstream.features.layout import COLOURS, row_length
+from catstream.features.pyramid import planes_of
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def test_a_row_is_the_windows_cells_and_then_its_colours(cells):
 
 def test_cells_within_a_margin_are_those_of_the_larger_image(rng):
     image = rng.integers(0, 256, (128, 160, 3), np.uint8)
-    whole, inner = Cells.of(image), Cells.within(image[16:112, 24:120])
+    whole, inner = Cells.of(image), Cells.within(planes_of(image[16:112, 24:120]))
     np.testing.assert_array_equal(inner.row(0, 0), whole.row(4, 5))
 
 

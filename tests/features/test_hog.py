@@ -4,14 +4,19 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.features.hog import grid
+from catstream.features import hog
 from catstream.features.layout import CELL, CHANNELS, MARGIN
+from catstream.features.pyramid import planes_of
 
 
 @pytest.fixture
 def image(rng):
     noise = rng.integers(0, 256, (120, 168, 3), np.uint8)
     return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
+
+
+def grid(image, margin=0):
+    return hog.grid(planes_of(image), margin)
 
 
 def plain_hog(image):
