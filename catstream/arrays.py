@@ -1,4 +1,4 @@
-"""Types of arrays by their dtype; the docstrings say their shapes. And whether an array is finite."""
+"""Types of arrays by dtype; the docstrings say their shapes. And whether an array is finite, or can be written."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Bool", "Float32", "Float64", "Int64", "UInt8", "UInt16", "UInt32", "is_finite"]
+__all__ = ["Bool", "Float32", "Float64", "Int64", "UInt8", "UInt16", "UInt32", "is_finite", "writable"]
 
 Bool = npt.NDArray[np.bool_]
 UInt8 = npt.NDArray[np.uint8]
@@ -26,3 +26,8 @@ def is_finite(array: np.ndarray) -> bool:
     """
     # The sum of the squares is finite only if all numbers are; otherwise it may have overflown.
     return math.isfinite(np.vdot(array, array)) or bool(np.isfinite(array).all())
+
+
+def writable(array: np.ndarray) -> np.ndarray:
+    """The array, or a copy if it cannot be written, as one that came over the wire: a kernel takes none of those."""
+    return array if array.flags.writeable else array.copy()

@@ -47,8 +47,9 @@ def predicted(estimate: np.ndarray, motion: Motion, *, lost: bool = False) -> np
 
 def measured(estimate: np.ndarray, motion: Motion, centre: tuple[float, float]) -> np.ndarray:
     """The estimate after a measurement of x and y in this frame."""
-    away = np.array(centre) - estimate[0, :2]
-    if away @ np.linalg.solve(estimate[1:3, :2] + motion.observation, away) > _JUMP**2:
+    x, y = (np.array(centre) - estimate[0, :2]).tolist()
+    (a, b), (c, d) = (estimate[1:3, :2] + motion.observation).tolist()
+    if d * x * x - (b + c) * x * y + a * y * y > _JUMP**2 * (a * d - b * c):  # the distance by the inverse of 2 x 2
         return at_rest(centre, motion)
     return np.vstack(kalman.updated(estimate[0], estimate[1:], np.array(centre), motion.observation))
 

@@ -303,17 +303,19 @@ def _surroundings(
     """Near misses of a window, and `count` background windows: the `hardest` highest ones, the rest at random."""
     row, column = around.place(window)
     rows, columns = around.scores.shape
-    down, across = np.arange(rows)[:, None] - row, np.arange(columns) - column
-    outside = np.maximum(abs(down), abs(across)) > _NEAR + 0.5
-    near, anywhere = np.argwhere(~outside), np.argwhere(outside)
+    down, across = abs(np.arange(rows) - row), abs(np.arange(columns) - column)
+    outside = np.maximum.outer(down, across) > _NEAR + 0.5
+    near, anywhere = np.flatnonzero(~outside), np.flatnonzero(outside)  # numbers of windows, row by row
     places, labels = [], []
-    for place in near[rng.integers(len(near), size=teaching.near_misses)] if len(near) else ():
-        distance = math.hypot(down[place[0], 0], across[place[1]])
+    for number in near[rng.integers(len(near), size=teaching.near_misses)] if len(near) else ():
+        place = divmod(int(number), columns)
+        distance = math.hypot(down[place[0]], across[place[1]])
         if distance > _NEAREST:
             places.append(place)
             labels.append(_gaussian(distance, _NEAR_SIGMA))
     hard = non_maximum_suppression(np.where(outside, around.scores, -np.inf), hardest, _NEAR)
-    background = [*hard, *rng.choice(anywhere, count - len(hard), replace=count > len(anywhere))]
+    drawn = rng.choice(anywhere, count - len(hard), replace=count > len(anywhere))
+    background = [*hard, *(divmod(int(number), columns) for number in drawn)]
     return _rows(around.cells.rows([*places, *background]), [*labels, *[0.0] * len(background)], 1, teaching)
 
 

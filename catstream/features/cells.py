@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from catstream.arrays import Float32, Int64, UInt16
+from catstream.arrays import Float32, Int64, UInt16, writable
 from catstream.features import colours
 from catstream.features.colours import count
 from catstream.features.compiled import kernel
@@ -91,9 +91,7 @@ class Cells:
         """Score of every window without its histogram of colours."""
         rows, columns = self.shape
         scores = np.full((rows - WINDOW + 1, columns - WINDOW + 1), bias, np.float32)
-        # Weights that came over the wire cannot be written, and a kernel takes none of those.
-        weights = np.require(weights[:_PLACES], requirements="W").reshape(WINDOW, -1)
-        _add_scores(self.grid.reshape(rows, -1), weights, scores)
+        _add_scores(self.grid.reshape(rows, -1), writable(weights[:_PLACES]).reshape(WINDOW, -1), scores)
         return scores
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from catstream.arrays import Float32, UInt8, UInt16
+from catstream.arrays import Float32, UInt8, UInt16, writable
 from catstream.features import lab
 from catstream.features.compiled import kernel
 from catstream.features.layout import CHROMA, LIGHT, SHADES, SIDE, WINDOW
@@ -66,9 +66,8 @@ def add_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray, least
     scores : float32 (rows - 7, columns - 7), of the window whose first cell is there
     least : windows with a lower score are left out, and their score stays as it is
     """
-    # Weights that came over the wire cannot be written, and a kernel takes none of those.
     strips = np.empty((scores.shape[1] + _COUNTED - 1, SHADES), np.uint16)
-    _add_scores(found, np.require(weights, requirements="W"), least, strips, np.empty(SHADES, np.uint16), scores)
+    _add_scores(found, writable(weights), least, strips, np.empty(SHADES, np.uint16), scores)
 
 
 def highest_score(weights: np.ndarray) -> float:

@@ -158,6 +158,7 @@ def _count(
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
     height, width = rows * CELL, columns * CELL
     across, down, magnitude = gradients[0], gradients[1], gradients[2]
+    inner = slice(margin * CELL, (columns + 1 - margin) * CELL)
     for x in range(len(magnitude)):
         magnitude[x] = orientation[x] = 0
     for row in range(rows + 2):
@@ -165,7 +166,7 @@ def _count(
             for o in range(_SIGNED):
                 histogram[row, column, o] = 0
     for band in range(margin, rows + 1 - margin):  # of the pixels between the centres of two rows of cells
-        for block in range(columns + 1):
+        for block in range(margin, columns + 1 - margin):
             for o in range(_SIGNED):
                 for share in range(4):
                     blocks[block, o, share] = 0
@@ -178,7 +179,8 @@ def _count(
             _read(planes, min(y + 1, height - 1), below)
             _gradients(above, here, below, across[:width], down[:width], magnitude[_HALF : _HALF + width])
             _orientations(across[:width], down[:width], orientation[_HALF : _HALF + width])
-            _add(magnitude, orientation, shares[(y + _HALF) % CELL], blocks)
+            line = shares[(y + _HALF) % CELL]
+            _add(magnitude[inner], orientation[inner], line, blocks[margin : columns + 1 - margin])
         for block in range(margin, columns + 1 - margin):
             for o in range(_SIGNED):
                 histogram[band, block, o] += blocks[block, o, 0]
@@ -189,11 +191,11 @@ def _count(
 
 def _average(plane: UInt8, row: int, column: int) -> int:
     """The mean of one channel of a cell's pixels."""
-    total = CELL * CELL // 2  # half, to round
+    total = float32(CELL * CELL // 2)  # half, to round; floats are added eight at once
     for y in range(row * CELL, (row + 1) * CELL):
         for x in range(column * CELL, (column + 1) * CELL):
-            total += plane[y, x]
-    return total // (CELL * CELL)
+            total += float32(plane[y, x])
+    return int(total) // (CELL * CELL)
 
 
 def _colour(planes: UInt8, margin: int, cells: Float32) -> None:
