@@ -74,10 +74,11 @@ def _above_background(around: ScoreMap, window: Window, weights: np.ndarray) -> 
         return None
     mass = np.maximum(weights, 0)[shades]
     inner = mass[_INSIDE, _INSIDE]
-    background = (mass.sum() - inner.sum()) / (mass.size - inner.size)
+    within = inner.sum()
+    background, inside = (mass.sum() - within) / (mass.size - inner.size), within / inner.size
     above = np.maximum(mass - background, 0)
     total = above.sum()
-    if inner.mean() <= background or not total:  # rounding alone can make an even mass look uneven
+    if inside <= background or not total:  # rounding alone can make an even mass look uneven
         return None
     across, down = above.sum(axis=0) @ _PLACES / total, above.sum(axis=1) @ _PLACES / total
-    return float(1 - background / inner.mean()), float(across), float(down)
+    return float(1 - background / inside), float(across), float(down)

@@ -90,7 +90,8 @@ class Cells:
     def _places(self, weights: np.ndarray, bias: float) -> np.ndarray:
         """Score of every window without its histogram of colours."""
         rows, columns = self.shape
-        scores = np.full((rows - WINDOW + 1, columns - WINDOW + 1), bias, np.float32)
+        scores = np.empty((rows - WINDOW + 1, columns - WINDOW + 1), np.float32)
+        scores.fill(bias)
         _add_scores(self.grid.reshape(rows, -1), writable(weights[:_PLACES]).reshape(WINDOW, -1), scores)
         return scores
 

@@ -168,9 +168,12 @@ class Pyramid:
             scratch = _scratch.kept(size, lines.shape[1])
             _sample(lines, x - middle * across, y - middle * down, across, down, found, *scratch)
             return found
-        cos, sin = np.cos(turn), np.sin(turn)
-        matrix = np.array([[across * cos, -down * sin, x], [across * sin, down * cos, y]])
-        matrix[:, 2] -= matrix[:, :2] @ np.full(2, middle)
+        right, below = (
+            (across * math.cos(turn), across * math.sin(turn)),
+            (-down * math.sin(turn), down * math.cos(turn)),
+        )
+        corner = x - (right[0] + below[0]) * middle, y - (right[1] + below[1]) * middle
+        matrix = np.array([right, below, corner]).T
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return planes_of(cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
