@@ -168,10 +168,8 @@ class Pyramid:
             scratch = _scratch.kept(size, lines.shape[1])
             _sample(lines, x - middle * across, y - middle * down, across, down, found, *scratch)
             return found
-        right, below = (
-            (across * math.cos(turn), across * math.sin(turn)),
-            (-down * math.sin(turn), down * math.cos(turn)),
-        )
+        cos, sin = math.cos(turn), math.sin(turn)
+        right, below = (across * cos, across * sin), (-down * sin, down * cos)
         corner = x - (right[0] + below[0]) * middle, y - (right[1] + below[1]) * middle
         matrix = np.array([right, below, corner]).T
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
