@@ -147,6 +147,8 @@ class Learned:
         """
         if not Path(path).exists():
             raise MissingFileError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
+        if not Path(path).is_file():
+            raise ServiceError(f"{str(path)!r} is not a file: give one that `catstream save` wrote")
         try:
             data = Path(path).read_bytes()
         except OSError as error:

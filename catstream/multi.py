@@ -8,11 +8,13 @@ model, its training rows are added to its coreset trees, and a model is trained 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
+from functools import wraps
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Self
+from typing import Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -39,7 +41,39 @@ from catstream.wire.checks import check_message
 
 __all__ = ["MultiTracker"]
 
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
 _KIND = "tracker 3"  # and the version of what the file holds
+
+
+class _Lock:
+    """A lock that one thread may take several times; a copy of it, also in another process, is a new one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def __reduce__(self) -> tuple[type[_Lock], tuple[()]]:
+        return _Lock, ()
+
+
+def _one_at_a_time(
+    method: Callable[Concatenate[MultiTracker, _Arguments], _Result],
+) -> Callable[Concatenate[MultiTracker, _Arguments], _Result]:
+    """A method whose calls by several threads wait for one another."""
+
+    @wraps(method)
+    def called(self: MultiTracker, /, *arguments: _Arguments.args, **more: _Arguments.kwargs) -> _Result:
+        with self._lock:
+            return method(self, *arguments, **more)
+
+    return called
 
 
 class MultiTracker:
@@ -47,7 +81,7 @@ class MultiTracker:
 
     The same frames and settings give the same boxes, bit for bit; they are those of a `catstream.Pipeline` in lockstep.
     While a call computes, linear algebra in this process runs on one thread; what was set before holds again once it
-    returns.
+    returns. Calls of several threads wait for one another.
 
     A frame is an array as `catstream.Tracker` takes it.
 
@@ -68,6 +102,7 @@ class MultiTracker:
     """
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
+        self._lock = _Lock()
         self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
         self._tracks: dict[str, Track] | None = None
 
@@ -84,6 +119,7 @@ class MultiTracker:
             raise BoxError("nothing is tracked yet: call init with a frame and a box first")
         return dict(self._tracks)
 
+    @_one_at_a_time
     def init(self, frame: np.ndarray, boxes: Boxes, time: float = 0.0) -> None:
         """Start with the boxes of objects, and forget everything before.
 
@@ -118,6 +154,7 @@ class MultiTracker:
             self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
             self._learn(*detectors.step(pyramid, time, given))
 
+    @_one_at_a_time
     def update(
         self,
         frame: np.ndarray,
@@ -177,6 +214,7 @@ class MultiTracker:
         check_count(len(names), self.settings.run.objects_most)
         return {name: learned.compressor(self.settings, name) for name, learned in models.items()}
 
+    @_one_at_a_time
     def forget(self, name: str) -> None:
         """Follow an object no more; everything learned of it is dropped with the next frame.
 
@@ -190,6 +228,7 @@ class MultiTracker:
         _ = self.tracks
         self.detectors.forget(name)
 
+    @_one_at_a_time
     def learned(self, name: str = UNNAMED) -> Learned:
         """Everything that was learned of an object: save it as a model, and use it in another video.
 
@@ -207,6 +246,7 @@ class MultiTracker:
             raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.forest.compressors)}")
         return Learned.of(self.forest.compressors[name], self.settings)
 
+    @_one_at_a_time
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything that was learned to one file, atomically: `load` continues from there.
 
@@ -255,8 +295,8 @@ class MultiTracker:
         """
         if not Path(path).exists():
             raise MissingFileError(f"there is no saved tracker {str(path)!r}: its method `save` writes one")
-        if Path(path).is_dir():
-            raise ServiceError(f"{str(path)!r} is a folder: give a file that the method `save` of a tracker wrote")
+        if not Path(path).is_file():
+            raise ServiceError(f"{str(path)!r} is not a file: give one that the method `save` of a tracker wrote")
         try:
             arrays, metadata = storage.read(path)
         except OSError as error:

@@ -66,7 +66,7 @@ class Pipeline:
 
     Parameters
     ----------
-    source : str
+    source : str, path or int
         A video file, a folder of images, a pattern such as `images/%05d.png`, a camera (`0`), a stream
         (`rtsp://...`), or a live demo (`demo:1`).
     box : str, four numbers, or a mapping of names to such boxes
@@ -129,7 +129,7 @@ class Pipeline:
 
     def __init__(
         self,
-        source: str | None = None,
+        source: str | os.PathLike[str] | int | None = None,
         box: Boxes | None = None,
         settings: Settings | Mapping[str, object] | None = None,
         *,
@@ -151,7 +151,7 @@ class Pipeline:
         job = _with_objects(self._resumed_job or Job(started=time.time()), box, model)
         job = replace(
             job,
-            source=without_scheme(str(source)) if source is not None else job.source,
+            source=_text(source) if source is not None else job.source,
             part=job.part if part == ALL_FRAMES else part,
             settings=job.settings.but(given),
             results=results if results is not None else job.results,
@@ -467,6 +467,16 @@ def _receive_rest(incoming: Receiver[Tracks | End]) -> None:
 
 def _path(path: str | os.PathLike[str] | None) -> Path | None:
     return None if path is None else Path(path)
+
+
+def _text(source: object) -> str:
+    """The text of a source that a program has given."""
+    if isinstance(source, (str, int, os.PathLike)):
+        return without_scheme(str(source))
+    raise VideoError(
+        f"a source is a path, an address or the number of a camera, got {type(source).__name__}: "
+        "for frames in memory, call catstream.Tracker.update with each of them"
+    )
 
 
 def _with_objects(job: Job, box: Boxes | None, model: Models | None) -> Job:

@@ -6,6 +6,7 @@ By the push-through identity an r x r system is solved in place of a d x d one: 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -69,4 +70,4 @@ def _solver(gram: np.ndarray, penalty: float) -> Callable[[np.ndarray], np.ndarr
 
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
     factor = scipy.linalg.cho_factor(gram, overwrite_a=True, check_finite=False)
-    return lambda right: scipy.linalg.cho_solve(factor, right, check_finite=False)
+    return partial(scipy.linalg.cho_solve, factor, check_finite=False)  # which can be pickled

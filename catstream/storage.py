@@ -214,7 +214,7 @@ def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
             raise ValueError("its checksum does not match")
     except (SafetensorError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ProtocolError(
-            f"{name} is not an undamaged file of catstream ({error}): give a file that catstream wrote"
+            f"{name} is not an undamaged file of catstream ({error}): use an older copy, or a file that catstream wrote"
         ) from None
     return arrays, metadata
 

@@ -7,6 +7,8 @@ import os
 import stat
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,6 +68,42 @@ def test_two_processes_that_ask_whether_a_file_is_locked_do_not_see_each_other(t
             fcntl.flock(asking, fcntl.LOCK_UN)
         assert storage.lock(owner.fileno())
         assert storage.is_locked(one.fileno())
+
+
+def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
+    """Each reader sees what one of them wrote, whole."""
+    contents = [bytes([value]) * 200_000 for value in (1, 2)]
+    storage.write_atomically(tmp_path / "file", contents[0])
+
+    def write(content):
+        for _ in range(60):
+            storage.write_atomically(tmp_path / "file", content)
+
+    with ThreadPoolExecutor(2) as pool:
+        writers = [pool.submit(write, content) for content in contents]
+        while not all(writer.done() for writer in writers):
+            assert (tmp_path / "file").read_bytes() in contents
+    assert [writer.result() for writer in writers] == [None, None]
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_saved_model_that_is_stored_while_a_state_is_read_is_in_it_if_it_is_named(tmp_path, monkeypatch):
+    for name in ("trees/000001.safetensors", "desired_state.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    read_bytes = Path.read_bytes
+
+    def read(path):
+        if path.suffix == ".json":  # the detector stores a saved model, and then the state that names it
+            (tmp_path / "searched_models").mkdir(exist_ok=True)
+            (tmp_path / "searched_models" / "0a.safetensors").write_text("model")
+            path.write_text('{"model": "0a"}')
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read)
+    content = files(tmp_path)
+    assert b"0a" in content["desired_state.json"]
+    assert "searched_models/0a.safetensors" in content
 
 
 def test_the_files_of_a_state_are_restored_with_the_models_that_are_searched_for_and_the_newest_checkpoint(tmp_path):

@@ -1,6 +1,8 @@
 """The three stages in one process."""
 
+import copy
 import os
+import pickle
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -136,6 +138,16 @@ def test_trackers_in_two_threads_give_the_same_tracks_as_alone(video):
     )
 
 
+def test_calls_of_several_threads_wait_for_one_another(video):
+    frames, boxes = video
+    tracker = Tracker()
+    tracker.init(frames[0], boxes[0])
+    with ThreadPoolExecutor(3) as pool:
+        assert len(list(pool.map(tracker.update, frames[1:]))) == 19
+    assert tracker.track.seq == 20
+    assert copy.deepcopy(tracker).update(frames[-1]) == pickle.loads(pickle.dumps(tracker)).update(frames[-1])
+
+
 def results(tracker, frames):
     return [(*tracker.update(frame), tracker.track) for frame in frames]
 
@@ -196,12 +208,12 @@ def test_a_missing_file_and_one_of_something_else_are_told_apart(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"there is no saved tracker 'nothing'.*`save` writes one") as missing:
         Tracker.load("nothing")
     assert isinstance(missing.value, ServiceError)
-    with pytest.raises(ServiceError, match="is a folder"):
+    with pytest.raises(ServiceError, match="is not a file"):
         Tracker.load(tmp_path)
     (tmp_path / "text").write_text("root:x:0:0:root:/root:/bin/sh\n")
     with pytest.raises(ProtocolError, match="is not an undamaged file of catstream") as other:
         Tracker.load(tmp_path / "text")
-    assert "older copy" not in str(other.value)
+    assert "a file that catstream wrote" in str(other.value)
 
 
 def test_an_unwritable_place_is_named_as_it_was_given(video, tmp_path):

@@ -99,7 +99,7 @@ class _Verbs(click.Group):
 @click.command(cls=_Verbs, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="catstream", prog_name="catstream")
 def group() -> None:
-    """Track one object in a video stream; it is learned online from a single box, on a CPU.
+    """Track objects in a video stream; each is learned online from a single box, on a CPU.
 
     \b
       catstream demo

@@ -18,6 +18,8 @@ from catstream.sinks.sink import STDOUT
 
 __all__ = ["RunProgress"]
 
+_SHORTEST_SECONDS = 1.0  # of a run whose rate is told
+
 
 class _Line(ProgressColumn):
     """State, frames and figures on one line: in a narrow terminal those that matter least are left out."""
@@ -99,7 +101,9 @@ class RunProgress:
 
     def summary(self, results: Sequence[Path]) -> str:
         """The closing lines of the run."""
-        rate = f"{self._rate(time.perf_counter()):.0f} frames/s, first track after {self._first:.2f} s"
+        rate = f"first track after {self._first:.2f} s"
+        if (now := time.perf_counter()) - self._started - self._first >= _SHORTEST_SECONDS:
+            rate = f"{self._rate(now):.0f} frames/s, {rate}"
         if self._objects.keys() == {UNNAMED}:
             alone = self._objects[UNNAMED]
             lines = [f"{self.frames} frames, present in {alone.present}, {rate}, model version {alone.version}"]

@@ -198,7 +198,7 @@ def track(
     try:
         interrupted = _run(pipeline, files, run, console, serve, resumed=resume is not None)
     finally:
-        if run.frames:
+        if run.frames and not isinstance(sys.exception(), BrokenPipeError):
             console.print(run.summary([*([output] if output is not None else []), *files.files]), highlight=False)
             if record is not None:
                 recording = Recording(record)

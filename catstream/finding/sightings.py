@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -12,10 +11,6 @@ __all__ = ["GAP_SECONDS", "Interval", "Linker", "Sighting"]
 
 #: Longest time between two sightings of an interval.
 GAP_SECONDS = 1.0
-
-_SPEED = 3.0  # highest speed of an object, in multiples of its size a second
-_JUMP = 0.5  # distance that any two successive sightings may have, in multiples of the object's size
-_GROWTH = 1.6  # highest ratio of the sizes of two successive sightings
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +71,8 @@ class Interval:
 class Linker:
     """Links the sightings of a file into intervals, frame by frame.
 
-    A sighting continues an interval of its object if that ended at most a second ago and the object can have moved
-    there: by half its size and three times its size in a second, with its size changed by a factor of 1.6, at most.
+    A sighting continues the interval of its object if that ended at most a second ago, wherever in the frame it is: a
+    model is of one object, so its intervals never overlap.
 
     gap_seconds  longest time between two sightings of an interval
     intervals    of all objects, in the order of their first sighting
@@ -85,35 +80,17 @@ class Linker:
 
     gap_seconds: float = GAP_SECONDS
     intervals: list[Interval] = field(default_factory=list)
-    _open: list[Interval] = field(default_factory=list)
+    _newest: dict[str, Interval] = field(default_factory=dict)  # of each object
 
     def add(self, sightings: Iterable[Sighting]) -> list[Interval]:
         """Link the sightings of one frame; returns their intervals, in the same order."""
         found: list[Interval] = []
         for sighting in sightings:
-            self._open = [each for each in self._open if sighting.time - each.last.time <= self.gap_seconds]
-            able = (each for each in self._open if _is_plausible(each.last, sighting))
-            interval = min(able, key=lambda each: _distance(each.last, sighting), default=None)
-            if interval is None:
-                interval = Interval(sighting, sighting, sighting)
+            interval = self._newest.get(sighting.object)
+            if interval is None or sighting.time - interval.last.time > self.gap_seconds:
+                interval = self._newest[sighting.object] = Interval(sighting, sighting, sighting)
                 self.intervals.append(interval)
-                self._open.append(interval)
             else:
                 interval.extend(sighting)
             found.append(interval)
         return found
-
-
-def _is_plausible(before: Sighting, after: Sighting) -> bool:
-    """Whether the object of a sighting can be that of one in a later frame."""
-    if after.object != before.object or after.frame <= before.frame:
-        return False
-    growth = math.sqrt(after.box.area / before.box.area)
-    reach = _JUMP + _SPEED * (after.time - before.time)
-    return 1 / _GROWTH <= growth <= _GROWTH and _distance(before, after) <= reach
-
-
-def _distance(before: Sighting, after: Sighting) -> float:
-    """Distance of the centres, in multiples of the object's size."""
-    size = math.sqrt(math.sqrt(before.box.area * after.box.area))
-    return math.dist(before.box.centre, after.box.centre) / size

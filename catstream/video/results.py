@@ -7,7 +7,8 @@
                            x, y, w, h, score, model_version, object
 
 The toolkits of the public benchmarks read the first three. They are of one object: an object with a name has its own,
-NAME-OBJECT.txt and so on. Two lockstep runs write the same files, byte for byte, except for the measured NAME_time.txt.
+NAME-OBJECT.txt, NAME-OBJECT_confidence.value and NAME-OBJECT_time.value. Two lockstep runs write the same files, byte
+for byte, except for the measured times.
 """
 
 from __future__ import annotations
@@ -49,8 +50,10 @@ def table_file(name: str) -> str:
 
 def object_files(name: str, thing: str) -> tuple[str, ...]:
     """Return the names of the files of one object, which have a row for every frame."""
-    stem = f"{name}-{thing}" if thing else name
-    return f"{stem}.txt", f"{stem}_confidence.value", f"{stem}_time.txt"
+    if not thing:
+        return f"{name}.txt", f"{name}_confidence.value", f"{name}_time.txt"
+    # No name of another object gives one of these: `a_time` has the boxes a_time.txt, and `a` the times a_time.value.
+    return f"{name}-{thing}.txt", f"{name}-{thing}_confidence.value", f"{name}-{thing}_time.value"
 
 
 def result_files(name: str, objects: Sequence[str]) -> tuple[str, ...]:

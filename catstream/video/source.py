@@ -208,6 +208,11 @@ def open_source(
             return images(path.parent.resolve().name, image_files(path))
     except OSError as error:
         raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {_EXPECTED}") from None
+    if path.exists():
+        raise VideoError(
+            f"{str(text)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
+            "write the video to a file, or serve it as a stream"
+        )
     raise VideoError(f"there is no video or folder {str(text)!r}: {_EXPECTED}")
 
 

@@ -29,6 +29,7 @@ def test_the_help_lists_the_commands_and_shows_a_first_example(said_by_process):
     code, output, errors = said_by_process("--help")
     assert (code, errors) == (0, "")
     text = " ".join(output.split())
+    assert "Track objects in a video stream" in text
     assert all(verb in text for verb in VERBS)
     assert "catstream track walk.mp4 --box 120,80,64,48" in text
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import signal
 import time
 from functools import partial
@@ -16,6 +17,8 @@ import pytest
 
 from catstream.errors import VideoError
 from catstream.learned import Learned
+from catstream.messages import Features
+from catstream.recording.file import Recording
 from catstream.sinks.parquet import ParquetSink
 from catstream.video.source import open_source
 
@@ -76,6 +79,42 @@ def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, said, tmp_path
         assert (tmp_path / file).read_bytes() == (whole_run / file).read_bytes()
     newest = int(table(tmp_path / "out" / "demo.csv")[-1]["model_version"])
     assert Learned.load(tmp_path / "model").model.version >= newest > 2
+
+
+def test_a_reader_that_wants_no_more_ends_the_run_in_silence(video, catstream):
+    source, box = video
+    process = catstream("track", source, "--box", box, "--write", "-")
+    assert json.loads(process.stdout.readline())["frame"] == 0
+    process.stdout.close()
+    assert process.stderr.read().strip() == ""
+    process.stdout = None
+    assert process.wait(60) == 1
+
+
+def test_the_files_of_an_object_never_have_the_names_of_another_ones(video, said, tmp_path):
+    source, box = video
+    boxes = ["--box", f"a={box}", "--box", f"a_time={box}"]
+    code, _, errors = said("track", source, *boxes, "--output", tmp_path, "--end", 4)
+    assert code == 0, errors
+    assert len(np.loadtxt(tmp_path / "demo-a_time.txt", delimiter=",")) == 4
+    assert np.loadtxt(tmp_path / "demo-a_time.value").shape == (4,)
+
+
+def test_a_recording_on_a_full_disk_is_said_and_is_an_error_at_the_end(long_video, catstream, tmp_path):
+    source, box = long_video
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (5 << 20, resource.RLIM_INFINITY))"
+    (tmp_path / "sitecustomize.py").write_text(limit)
+    process = catstream(
+        "track", source, "--box", box, "--record", tmp_path / "run.mcap", env=os.environ | {"PYTHONPATH": str(tmp_path)}
+    )
+    errors = process.communicate(timeout=120)[1]
+    recording = Recording(tmp_path / "run.mcap")
+    missing = 60 - recording.counts[Features]
+    assert f"{missing} features and" in errors
+    assert "any more: File too large: the run continues without it" in errors
+    assert "run.mcap is not complete" in errors.splitlines()[-1]
+    assert process.returncode == 1
+    assert missing > 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

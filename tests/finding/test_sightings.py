@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,21 +24,21 @@ def test_an_object_that_moves_is_one_interval():
     assert interval.best.score == 1.1
 
 
-def test_a_gap_a_jump_and_a_change_of_size_each_begin_an_interval():
+def test_a_jump_and_a_change_of_size_continue_an_interval_and_a_gap_begins_one():
     linker = Linker()
     linker.add([sighting(0.0)])
     linker.add([sighting(0.2, x=300.0)])
     linker.add([sighting(0.4, size=80.0)])
     linker.add([sighting(1.2)])
     linker.add([sighting(2.5)])
-    assert [interval.count for interval in linker.intervals] == [1, 1, 1, 1, 1]
+    assert [interval.count for interval in linker.intervals] == [4, 1]
 
 
-def test_two_in_one_frame_are_two_intervals_and_each_goes_on_with_the_nearest():
+def test_two_sightings_of_one_object_in_a_frame_are_in_one_interval():
     linker = Linker()
     for step in range(5):
         linker.add([sighting(0.2 * step, x=2.0 * step), sighting(0.2 * step, x=60.0 - 2 * step)])
-    assert [interval.last.box.x for interval in linker.intervals] == [8.0, 52.0]
+    assert [interval.count for interval in linker.intervals] == [10]
 
 
 times = st.lists(st.floats(0, 30), min_size=1, max_size=40)
@@ -55,3 +57,6 @@ def test_every_sighting_is_in_one_interval_of_its_object(data, moments):
         assert interval.best.score >= made[-1].score
     assert sum(interval.count for interval in linker.intervals) == len(made)
     assert all(interval.first.time <= interval.best.time <= interval.last.time for interval in linker.intervals)
+    for name in ("anna", "ben"):
+        own = [interval for interval in linker.intervals if interval.first.object == name]
+        assert all(one.last.time + linker.gap_seconds < other.first.time for one, other in pairwise(own))

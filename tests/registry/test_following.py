@@ -220,7 +220,7 @@ def test_a_client_of_the_fleet_may_do_at_each_stream_what_its_role_says_until_it
             revoke(fleet_keys, "anna")
             synchronise(folder / "stream", allowed(fleet_keys))
             stream.update(token=7)  # the pipeline was started again: she connects again
-            with pytest.raises(ServiceError, match="does not let this key take part"):
+            with pytest.raises(ServiceError, match="does not let this key in"):
                 watched.result(60)
 
 

@@ -158,7 +158,7 @@ def test_no_file_of_an_object_of_replaced_results_is_left(tmp_path):
     run = in_folder(tmp_path, [])
     add(run, [["anna", ""], ["ben"]])
     add(run, [["carl"]])
-    rows = ("walk-carl.txt", "walk-carl_confidence.value", "walk-carl_time.txt")
+    rows = ("walk-carl.txt", "walk-carl_confidence.value", "walk-carl_time.value")
     assert {path.name for path in run.output.iterdir()} == {*rows, "walk.csv"}
 
 

@@ -71,7 +71,7 @@ def test_each_object_with_a_name_has_its_own_files_with_a_row_for_every_frame(tm
     assert not (tmp_path / "walk.txt").exists()
     for name, present in (("anna", [0, 2]), ("zoë", [2, 3])):
         assert np.flatnonzero(~np.isnan(rows(tmp_path / f"walk-{name}.txt")[:, 0])).tolist() == present
-        assert len(rows(tmp_path / f"walk-{name}_time.txt")) == len(rows(tmp_path / f"walk-{name}.txt")) == 4
+        assert len(rows(tmp_path / f"walk-{name}_time.value")) == len(rows(tmp_path / f"walk-{name}.txt")) == 4
     table = [line.split(",")[::9] for line in (tmp_path / "walk.csv").read_text().splitlines()[1:]]
     assert table == [["0", "anna"], ["2", "zoë"], ["2", "anna"], ["3", "zoë"]]
 

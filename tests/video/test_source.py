@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -387,6 +388,12 @@ def test_a_missing_source_is_an_error(tmp_path, place, message):
     (tmp_path / "empty").mkdir()
     with pytest.raises(VideoError, match=message):
         open_source(tmp_path / place)
+
+
+def test_a_pipe_is_an_error_that_names_the_alternatives(tmp_path):
+    os.mkfifo(tmp_path / "walk.mpg")
+    with pytest.raises(VideoError, match=r"is a pipe or a device, .* write the video to a file"):
+        open_source(tmp_path / "walk.mpg")
 
 
 def test_a_folder_with_two_videos_is_an_error(video, tmp_path):
