@@ -169,7 +169,7 @@ class DetectorLoop:
         for name, each in begin.desired.objects_at(begin.seq).items():
             self._seek_again(name, each, models)
         for sender, position in zip(self._outputs.senders, positions, strict=True):
-            sender.resume(begin.seq, position.seq)
+            sender.resume(begin.seq, position)
         self._sent_before = max(position.seq for position in positions)
 
     def _seek_again(self, name: str, each: DesiredObject, models: dict[str, Model]) -> None:

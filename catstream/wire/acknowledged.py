@@ -85,9 +85,9 @@ class Sender(ChannelSocket[Message]):
             return answer if isinstance(answer, Position) else None
         return None
 
-    def resume(self, seq: int, known: int) -> None:
-        """Continue after message `seq` of an earlier sender, of which the receiver has stored `known`."""
-        self._window.resume(seq, known)
+    def resume(self, seq: int, position: Position) -> None:
+        """Continue after message `seq` of an earlier sender, of which the receiver is at `position`."""
+        self._window.resume(seq, position)
 
     def send(self, message: Message) -> bool:
         """Send the message with the next seq, without waiting; False if the window is full."""

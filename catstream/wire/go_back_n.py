@@ -90,10 +90,11 @@ class SendWindow:
         self._changes: deque[tuple[int, str, int]] = deque()  # seq that led to a version of an object; 0: it is gone
         self._versions: dict[str, int] = {}  # that `samples_of` returned last
 
-    def resume(self, seq: int, known: int) -> None:
-        """Continue after message `seq` of an earlier sender, of which the receiver has stored `known`."""
-        self.sent = self.acknowledged = self.stored = self.taken = seq
-        self._sent_before = known + self._size  # a whole window of the earlier sender may still be on its way
+    def resume(self, seq: int, position: Position) -> None:
+        """Continue after message `seq` of an earlier sender, of which the receiver is at `position`."""
+        self.sent = self.acknowledged = self.taken = seq
+        self.stored = min(seq, position.seq - position.unsaved)
+        self._sent_before = position.seq + self._size  # a whole window of the earlier sender may still be on its way
 
     @property
     def full(self) -> bool:

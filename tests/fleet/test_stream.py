@@ -27,6 +27,13 @@ def spec(demo_video):
     return StreamSpec("cam-7", str(path), {"": Box(*truth[0])}, settings={"run.lockstep": True})
 
 
+@pytest.fixture
+def long_spec(demo_video):
+    """A stream that runs for seconds after the store fails."""
+    path, truth = demo_video(400)
+    return StreamSpec("cam-7", str(path), {"": Box(*truth[0])}, settings={"run.lockstep": True})
+
+
 @contextmanager
 def started(spec, store, node="n1", every=0.2):
     stream = Stream(spec, Place(node), store, every)
@@ -80,11 +87,11 @@ def test_a_source_that_cannot_be_opened_is_named(store, until, tmp_path):
     assert "none.mp4" in report.status.trouble
 
 
-def test_a_stream_goes_on_while_the_store_takes_nothing(spec, store, until, monkeypatch):
+def test_a_stream_goes_on_while_the_store_takes_nothing(long_spec, store, until, monkeypatch):
     def fails(*_):
         raise StoreError("the store cannot be reached")
 
-    with started(spec, store) as stream:
+    with started(long_spec, store) as stream:
         until(lambda: stream.report().status.frame >= 3)
         with monkeypatch.context() as patch:
             patch.setattr(Claim, "write", fails)

@@ -97,7 +97,7 @@ class Histories(RuleBasedStateMachine):
         """A reply arrives at the sender."""
         if not self.resumed:
             if isinstance(message, Position):
-                self.sender.resume(message.seq, message.seq)
+                self.sender.resume(message.seq, message)
                 self.resumed, self.known = True, message.seq
             return
         try:
@@ -395,9 +395,15 @@ def test_messages_kept_in_memory_by_a_full_disk_are_acknowledged_and_do_not_coun
         window.receive(Position(1), now=0.0)
 
 
+def test_a_new_sender_does_not_count_as_stored_what_a_full_disk_left_in_memory():
+    window = SendWindow("features", 4, now=0.0)
+    window.resume(3, Position(3, unsaved=2))
+    assert (window.acknowledged, window.stored) == (3, 1)
+
+
 def test_a_receiver_of_another_stream_is_detected_and_messages_of_an_earlier_sender_are_accepted():
     window = SendWindow("features", 4, now=0.0)
-    window.resume(3, known=5)
+    window.resume(3, Position(5))
     window.receive(Stored(9, 9), now=0.0)
     assert (window.acknowledged, window.stored, window.taken) == (3, 3, 3)
     with pytest.raises(ProtocolError, match="another stream"):

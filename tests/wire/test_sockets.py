@@ -203,7 +203,7 @@ def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
 
             until(lambda: found and found[-1] is not None, ask)
             assert found[-1].seq == 5
-            sender.resume(3, found[-1].seq)  # another receiver had less
+            sender.resume(3, found[-1])  # another receiver had less
 
             def on():
                 if sender.sent < 9:
@@ -227,7 +227,7 @@ def test_a_restarted_sender_accepts_a_position_that_advanced_after_its_request(e
                 lambda: found and found[-1] is not None,
                 lambda: (found.append(sender.ask_position()), take(receiver, taken, store=False)),
             )
-            sender.resume(0, found[-1].seq)
+            sender.resume(0, found[-1])
             receiver.acknowledge(Position(5))
 
             def on():
