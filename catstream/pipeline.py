@@ -178,6 +178,7 @@ class Pipeline:
         self._supervisor: Supervisor | None = None
         self._checked = 0.0
         self._end: End | None = None
+        self._rows = 0  # tracks that were received
         self._health: dict[str, Health] = {}
 
     @property
@@ -339,6 +340,7 @@ class Pipeline:
                 for name, each in message.tracks.items()
             }
             self._incoming.acknowledge(Position(message.seq, message.frame, self._found))
+            self._rows += len(message.tracks)
         elif isinstance(message, End):
             self._incoming.acknowledge(Position(message.seq))
             self._end = message
@@ -369,10 +371,19 @@ class Pipeline:
     def totals(self) -> dict[str, int]:
         """At the end: the number of features messages that were `sent`, and `stored` in the coreset trees.
 
-        If frames of a file were left out, how many were `damaged`; of a live source, how many frames were `skipped`,
-        and how often it was `reopened`.
+        And of the tracks that were received here (`rows`), and how often a process was restarted (`restarts`). If
+        frames of a file were left out, how many were `damaged`; of a live source, how many frames were `skipped`, and
+        how often it was `reopened`.
         """
-        return {name: int(value) for name, value in self._end.totals.items()} if self._end else {}
+        if self._end is None:
+            return {}
+        own = {"rows": self._rows, "restarts": self.restarts}
+        return {name: int(value) for name, value in self._end.totals.items()} | own
+
+    @property
+    def reason(self) -> str:
+        """At the end: why the stream ended; empty before."""
+        return self._end.reason if self._end is not None else ""
 
     @property
     def health(self) -> dict[str, dict[str, float]]:

@@ -42,8 +42,9 @@ def test_every_frame_gets_one_track_and_every_feature_is_stored(run):
     tracks, pipeline, _ = run
     assert [track.frame for track in tracks] == list(range(pipeline.frames))
     assert [track.seq for track in tracks] == list(range(1, pipeline.frames + 1))
-    assert pipeline.totals == {"sent": pipeline.frames, "stored": pipeline.frames}
-    assert pipeline.restarts == 0
+    n = pipeline.frames
+    assert pipeline.totals == {"sent": n, "stored": n, "rows": n, "restarts": 0}
+    assert pipeline.reason == "the source has ended"
 
 
 def test_the_object_is_followed_with_ever_newer_models(run, video):
@@ -102,7 +103,7 @@ def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):
                 psutil.Process(killed[-1]).kill()
         pids = pipeline.pids
     assert [track.frame for track in tracks] == list(range(pipeline.frames))
-    assert pipeline.totals == {"sent": pipeline.frames, "stored": pipeline.frames}
+    assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (pipeline.frames, pipeline.frames)
     assert len(killed) == pipeline.restarts == len(NAMES)
     assert not any(map(alive, [*killed, *pids.values()]))
 
