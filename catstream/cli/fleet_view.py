@@ -35,9 +35,10 @@ def view(fleet: str, keys: str, listen: Address, token: str | None) -> None:
     that of catstream view. If the fleet does not answer, the page keeps its
     last state and waits. Ctrl-C ends the server; the fleet continues.
 
-    If the host is not a loopback address, a token is required; the printed
-    addresses end with it. The connection is not encrypted: use an ssh tunnel,
-    or a proxy with TLS.
+    The printed addresses end with a token: open one of them, and the browser
+    keeps it. Without a token the page is closed, also to other users of this
+    machine. The connection is not encrypted: use an ssh tunnel, or a proxy with
+    TLS.
 
     \b
     Serves

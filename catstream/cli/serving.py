@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import secrets
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +18,7 @@ __all__ = ["PORT", "Address", "AddressType", "with_token"]
 PORT = 8000
 
 _LARGEST_PORT = 65535
+_TOKEN_BYTES = 16  # of a token that is made here
 
 
 class Address(NamedTuple):
@@ -43,7 +45,10 @@ class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since c
 
 
 def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add the options --PREFIXtoken and --PREFIXtoken-file; the command gets one argument `token`, a text or None."""
+    """Add --PREFIXtoken, --PREFIXtoken-file and --no-PREFIXtoken; the command gets `token`, a text or None.
+
+    If none of them is given, a new token is made.
+    """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @click.option(
@@ -52,7 +57,8 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
             envvar="VIEW_TOKEN",
             show_envvar=True,
             metavar="TOKEN",
-            help="Token for access to the page; at least 16 characters.",
+            help="Token for access to the page, at least 16 characters; by default a new one, at the end of the "
+            "printed address.",
         )
         @click.option(
             f"--{prefix}token-file",
@@ -63,9 +69,20 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
             metavar="FILE",
             help="File with this token.",
         )
+        @click.option(
+            f"--no-{prefix}token",
+            "no_token",
+            is_flag=True,
+            help="Without a token: every user and program of this machine may watch the page and give commands.",
+        )
         @functools.wraps(command)
-        def with_one(*args: object, token: str | None, token_file: Path | None, **others: object) -> None:
-            command(*args, token=token or (_read(token_file) if token_file else None), **others)
+        def with_one(
+            *args: object, token: str | None, token_file: Path | None, no_token: bool, **others: object
+        ) -> None:
+            given = token or (_read(token_file) if token_file else None)
+            if no_token and given:
+                raise click.UsageError(f"a token and --no-{prefix}token were given: give one of them")
+            command(*args, token=None if no_token else given or secrets.token_urlsafe(_TOKEN_BYTES), **others)
 
         return with_one
 

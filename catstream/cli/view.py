@@ -32,9 +32,10 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
     the page waits for the next one. Ctrl-C ends the server; the pipeline
     continues.
 
-    If the host is not a loopback address, a token is required; the printed
-    addresses end with it. The connection is not encrypted: use an ssh tunnel,
-    or a proxy with TLS.
+    The printed addresses end with a token: open one of them, and the browser
+    keeps it. Without a token the page is closed, also to other users of this
+    machine. The connection is not encrypted: use an ssh tunnel, or a proxy with
+    TLS.
 
     \b
     Serves

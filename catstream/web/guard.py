@@ -11,7 +11,7 @@ from pathlib import Path
 from time import monotonic
 from urllib.parse import parse_qs, urlsplit
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -20,7 +20,7 @@ from catstream.errors import ServiceError
 
 __all__ = ["Guard", "TokenBucket", "body_of", "is_loopback", "too_many"]
 
-_COOKIE = "catstream"
+_COOKIE = "catstream"  # and the port: a browser sends cookies to all ports of a host
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
 _PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline runs
 
@@ -121,7 +121,7 @@ class Guard:
 
     def _reject_without_token(self, request: Request) -> Response | None:
         """Return an error if a request has no token or a wrong one."""
-        shown = _credential(request.headers)
+        shown = _credential(request)
         if shown is not None:
             return self._reject_wrong_token(shown, request)
         if request.scope["path"].endswith("/"):  # a page
@@ -137,7 +137,8 @@ class Guard:
             return wrong
         answer = RedirectResponse("/", 303)
         secure = request.headers.get("origin", "").startswith("https:")
-        answer.set_cookie(_COOKIE, self._token_digest or "", httponly=True, samesite="lax", secure=secure)
+        name, value = _cookie_of(request.scope), self._token_digest or ""
+        answer.set_cookie(name, value, httponly=True, samesite="lax", secure=secure)
         return answer
 
     def _reject_wrong_token(self, shown: str, request: Request) -> Response | None:
@@ -191,12 +192,17 @@ def _digest(token: str) -> str:
     return hashlib.sha256(b"catstream view\0" + token.encode()).hexdigest()
 
 
-def _credential(headers: Headers) -> str | None:
-    kind, _, token = headers.get("authorization", "").partition(" ")
+def _cookie_of(scope: Scope) -> str:
+    """Return the name of the cookie of this server."""
+    return f"{_COOKIE}-{scope['server'][1]}"
+
+
+def _credential(request: Request) -> str | None:
+    kind, _, token = request.headers.get("authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return _digest(token.strip())
     try:
-        cookie = SimpleCookie(headers.get("cookie", "")).get(_COOKIE)
+        cookie = SimpleCookie(request.headers.get("cookie", "")).get(_cookie_of(request.scope))
     except CookieError:
         return None
     return cookie.value if cookie else None

@@ -43,7 +43,8 @@ class Server:
     ----------
     site : what is served
     host, port : address to listen on; port 0 for a free port
-    token : token that clients must have; required unless the host is a loopback address
+    token : token that clients must have; None, which is possible on a loopback address only, lets every user of this
+        machine watch and give commands
 
     Attributes
     ----------

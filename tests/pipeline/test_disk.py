@@ -67,5 +67,6 @@ def test_a_run_continues_and_reports_a_disk_that_cannot_be_written(long_video, d
                 mend(disk)
     assert reason in said
     assert tracks == list(range(len(boxes)))
-    assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(boxes), len(boxes)), "checkpoints went on once there was room"
+    totals = pipeline.totals
+    assert totals["sent"] == totals["stored"] == len(boxes), "checkpoints went on once there was room"
     assert CheckpointStore(state / TREES).load(SETTINGS).seq == len(boxes)

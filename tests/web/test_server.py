@@ -375,6 +375,9 @@ def test_the_login_form_accepts_the_token_and_the_browser_does_not_store_it(lock
     assert TOKEN not in kept
     assert "HttpOnly" in kept
     assert "SameSite=lax" in kept
+    assert kept.startswith(f"catstream-{locked.base_url.port}="), (
+        "a cookie of this port: pages on other ports have their own"
+    )
     assert locked.get("/").status_code == 200
 
 
