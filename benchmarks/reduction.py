@@ -19,7 +19,7 @@ from table import Cell, Table, publish
 
 from catstream.box import Box
 from catstream.compression.forest import Forest
-from catstream.compression.tree import TREES
+from catstream.compression.tree import REDUCTIONS
 from catstream.detection.objects import Detectors
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.runs import EvaluationRun
@@ -33,7 +33,7 @@ COSTS = ("coreset.reduction", "frames", "rows", "MB", "most MB", "energy kept", 
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    variants = {name: Settings(coreset={"reduction": name}) for name in TREES}
+    variants = {name: Settings(coreset={"reduction": name}) for name in REDUCTIONS}
     yield costs(named(options, options.sequence), variants)
     found = [video for video in videos(options) if options.quick or video.name in TUNED]
     runs = compared(options, found, variants)

@@ -68,6 +68,7 @@ class Job:
     state     folder of the checkpoints and of the desired state; None if nothing is kept
     resume    whether the processes continue from that state
     record    file that the compressor records all messages to
+    run       id of this start of the run, which its messages carry; empty if the processes were started by hand
     owned     whether the process that started the run receives every track on the channel `results`
     since     value of `time.monotonic` from which the times of a live source count; None for its first frame
     """
@@ -84,6 +85,7 @@ class Job:
     state: Path | None = None
     resume: bool = False
     record: Path | None = None
+    run: str = ""
     owned: bool = False
     since: float | None = None
 

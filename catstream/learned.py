@@ -23,7 +23,7 @@ from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
 from catstream.detection.likeness import Likeness
 from catstream.errors import MissingFileError, ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
-from catstream.heads import HEADS
+from catstream.heads import TREES
 from catstream.messages import Features, Model
 from catstream.names import check_name, listed
 from catstream.packing import pack, unpack
@@ -74,7 +74,7 @@ class Learned:
         state = compressor.detector
         if compressor.box is None or state is None or state.first_window is None or not compressor.version:
             raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
-        trees = {head: tree.copy() for head, tree in compressor.trees.items()}
+        trees = {each: tree.copy() for each, tree in compressor.trees.items()}
         centres, name = compressor.centres, compressor.name
         model = _trained(trees, centres, compressor.version, name, settings)
         return cls(name, trees, centres, compressor.origins, compressor.box, model, settings)
@@ -177,11 +177,11 @@ class Learned:
     @classmethod
     def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
         trees = unpack_trees(arrays, metadata["trees"])
-        if missing := [name for name in HEADS if name not in trees]:
+        if missing := [name for name in TREES if name not in trees]:
             raise ValueError(f"it has no tree {missing[0]!r}: learn the object anew with this catstream")
         return cls(
             check_name(metadata["object"]),
-            {name: trees[name] for name in HEADS},
+            {name: trees[name] for name in TREES},
             arrays["centres"],
             tuple(map(str, metadata["origins"])),
             Box(*map(float, metadata["box"])),
@@ -196,8 +196,8 @@ class Learned:
         x, y, w, h = self.box
         if not (np.isfinite((x, y)).all() and 0 < w < np.inf and 0 < h < np.inf):
             raise ValueError(f"its box is {self.box}")
-        for name, head in HEADS.items():
-            tree, width = self.trees[name], len(self.model.weights) + head.more_columns
+        for name, kind in TREES.items():
+            tree, width = self.trees[name], len(self.model.weights) + kind.more_columns
             if tree.size != self.settings.coreset.size or tree.width not in (0, width):
                 raise ValueError(f"its tree {name!r} has {tree.size} rows of length {tree.width}")
 
@@ -240,7 +240,7 @@ def merge(parts: Sequence[Learned]) -> Learned:
     for part in parts[1:]:
         _check_merge(named if part.object else first, part, origins)
         origins.update(part.origins)
-    trees = {head: reduce(CoresetTree.merged, [part.trees[head] for part in parts]) for head in HEADS}
+    trees = {name: reduce(CoresetTree.merged, [part.trees[name] for part in parts]) for name in TREES}
     name = next((part.object for part in parts if part.object), "")
     centres = next((part.centres for part in parts if len(part.centres)), first.centres)
     version = max(part.model.version for part in parts)

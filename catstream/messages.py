@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 
 from catstream.box import Box, Window
-from catstream.heads import GROUPS, HEADS
+from catstream.heads import GROUPS, HEADS, TREES
 from catstream.schema import Array, ByObject, Bytes, Name, Named, OnlyWith, Whole
 
 __all__ = [
@@ -76,9 +76,9 @@ NodeState = Literal["alive", "draining", "dead"]
 #: The name of an object.
 ObjectName = Annotated[str, Name()]
 
-_COLUMNS = {name: head.more_columns for name, head in HEADS.items()}
-_REQUIRED = frozenset(name for name, head in HEADS.items() if head.adds_to_score)
-_NOT_IN_THE_SCORE = {name: 0 for name in HEADS if name not in _REQUIRED}
+_COLUMNS = {name: tree.more_columns for name, tree in TREES.items()}
+_REQUIRED = frozenset(name for name, tree in TREES.items() if tree.required)
+_NOT_IN_THE_SCORE = {name: 0 for name, head in HEADS.items() if not head.adds_to_score}
 _WITH_BIAS = {name: 0 for name, head in HEADS.items() if head.has_bias}
 
 
@@ -98,7 +98,7 @@ class Motion:
 class DetectorState:
     """All that a detector knows after a frame, besides the model: with both, another one continues bit for bit.
 
-    first_frame       the object's first; a model of frames before it is of another object
+    first_frame       the object's first: with its name, it says which object this is; see `began` of a track
     level             of the belief that the object was found, see `catstream.detection.belief`
     window            window of the object; the next search is centred on it
     confident_window  the same in the last frame whose level was confident or redetected; while the object of a saved
@@ -130,14 +130,16 @@ class TrainingRows:
 
     rows     features of the windows
     labels   group "appearance": 1 for the object, 0 for background, between them for a near miss; group "extent": 1 for
-             a window of the right size and aspect, towards 0 for windows far from it; groups "size" and "aspect": 0.5
-             for the right one, and 1/16 more for each step by which a window is too large or too wide
+             a window of the right size and aspect, towards 0 for windows far from it
     weights  number of ordinary rows that each stands for
+    offsets  group "extent": 0.5 for a window of the right size, and 1/16 more for each step by which it is too large;
+             then the same for the aspect; None if all are right
     """
 
     rows: Annotated[np.ndarray, Array("float32", ("k", "d"))]
     labels: Annotated[np.ndarray, Array("float32", ("k",), low=0, high=1)]
     weights: Annotated[np.ndarray, Array("float32", ("k",), above=0)]
+    offsets: Annotated[np.ndarray, Array("float32", ("k", 2), low=0, high=1)] | None = None
 
     @classmethod
     def labelled(cls, rows: Sequence[np.ndarray], label: float | Sequence[float], weight: float = 1.0) -> Self:
@@ -149,6 +151,7 @@ class TrainingRows:
         return len(self.rows)
 
     def __add__(self, other: TrainingRows) -> TrainingRows:
+        """The rows of both, of a group without offsets."""
         return TrainingRows(
             np.concatenate([self.rows, other.rows]),
             np.concatenate([self.labels, other.labels]),
@@ -263,9 +266,10 @@ class Sample:
 
     version  1, 2, 3 ... in the order in which the samples of all objects are made
     frame    number of the newest frame that it summarises
-    trees    the summary of each tree of `catstream.heads`; a tree without a leaf is left out
+    trees    the summary of each tree of `catstream.heads.TREES`; a tree without a leaf is left out
     centres  centre of the object in each frame of the last complete block of frames, pixels; NaN while absent
     object   name of the object
+    began    number of the object's first frame
     """
 
     version: int
@@ -273,6 +277,7 @@ class Sample:
     trees: Annotated[dict[str, Summary], Named(_COLUMNS, _REQUIRED)]
     centres: Annotated[np.ndarray, Array("float64", ("m", 2), may_be_nan=True)]
     object: ObjectName = ""
+    began: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,6 +294,7 @@ class Model:
              "size" and "aspect"
     biases   bias of each of these heads that has one
     object   name of the object
+    began    number of the object's first frame: the detector uses no model of an object that had the name before
     """
 
     version: int
@@ -301,6 +307,7 @@ class Model:
     )
     biases: Annotated[dict[str, float], Named(_WITH_BIAS)] = field(default_factory=dict)
     object: ObjectName = ""
+    began: int = 0
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -329,6 +336,9 @@ class Track:
         Time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file.
     object : str
         Name of the object; "" if it has none.
+    began : int
+        Number of the object's first frame. If it differs from that of the track before, another object was given this
+        name, by a box or a saved model.
 
     Examples
     --------
@@ -345,6 +355,7 @@ class Track:
     model_version: int
     pts: float | None = None
     object: ObjectName = ""
+    began: int = 0
 
     def __repr__(self) -> str:
         name = f"object={self.object!r}, " if self.object else ""
@@ -374,6 +385,7 @@ class Track:
             "model_version": int(self.model_version),
             "pts": None if self.pts is None else float(self.pts),
             "object": self.object,
+            "began": int(self.began),
         }
 
 

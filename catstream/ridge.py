@@ -40,25 +40,26 @@ def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.n
 
 
 class Regression:
-    """The weights and the bias that minimise ||A [w; b; -1]||^2 / r + penalty ||w||^2.
+    """The weights and biases that minimise ||A [w; b] - y||^2 / r + penalty ||w||^2, for labels y and penalties.
 
-    The system depends on the features only: it is factored once, and solved for any labels in O(r d).
+    The products of the rows are computed once, and factored once for each penalty; then a label costs O(r d).
 
     Parameters
     ----------
-    rows : float32 (r, d + 2), A: rows [x, 1, y], or any left rotation of them
-    penalty : lambda
+    rows : float32 (r, d + 1), A: rows [x, 1], or any left rotation of them and the labels
     """
 
-    def __init__(self, rows: np.ndarray, penalty: float) -> None:
+    def __init__(self, rows: np.ndarray) -> None:
         self.rows = rows
-        x = rows[:, :-2]
-        self._solve = _solver(x @ x.T, penalty * len(rows))
+        self._gram = rows[:, :-1] @ rows[:, :-1].T
+        self._solvers: dict[float, Callable[[np.ndarray], np.ndarray]] = {}
 
-    def fit(self, labels: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-        """w, float32 (d,), and b; for other labels (r,) than those of the rows, if given."""
-        x, ones = self.rows[:, :-2], self.rows[:, -2]
-        solved = self._solve(np.stack([self.rows[:, -1] if labels is None else labels, ones], axis=1))
+    def fit(self, labels: np.ndarray, penalty: float) -> tuple[np.ndarray, float]:
+        """w, float32 (d,), and b, for labels float32 (r,)."""
+        if penalty not in self._solvers:
+            self._solvers[penalty] = _solver(self._gram.copy(), penalty * len(self.rows))
+        x, ones = self.rows[:, :-1], self.rows[:, -1]
+        solved = self._solvers[penalty](np.stack([labels, ones], axis=1))
         bias = (ones @ solved[:, 0]) / (ones @ solved[:, 1])
         weights: np.ndarray = x.T @ (solved[:, 0] - bias * solved[:, 1])
         return weights, float(bias)

@@ -150,7 +150,7 @@ class CoresetSettings(_Group):
             "by an eighth sooner.",
             ge=1,
         ),
-    ] = 5
+    ] = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +265,7 @@ class TeachingSettings(_Group):
     ] = 0.9
     near_misses: Annotated[
         int, _about("Windows beside the object in each frame, with a label between 0 and 1.", ge=0)
-    ] = 12
+    ] = 6
     hard_negatives: Annotated[
         int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
     ] = 10

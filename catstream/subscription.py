@@ -15,7 +15,6 @@ goes on if the stream moves to another node.
 
 from __future__ import annotations
 
-import math
 import select
 from time import monotonic
 from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
@@ -177,7 +176,7 @@ class Subscription(Generic[Message]):
         self.end: End | None = None
         self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
         self._close_time = float("inf")  # when to wait no more
-        self._version = math.inf  # of the model of the object's last track
+        self._began: int | None = None  # first frame of the object
         self._frames: dict[str, int] = {}  # the newest of each object, of a stream of a fleet
         self._rejected = 0  # by the connections before this one
         self._connection: _Connection | None = None
@@ -215,6 +214,11 @@ class Subscription(Generic[Message]):
     def place(self) -> Endpoint | None:
         """Endpoint of the connected pipeline; None if the stream of a fleet has not run yet."""
         return self._connection.endpoint if self._connection is not None else None
+
+    @property
+    def run(self) -> str:
+        """Id of the run that the last message is from: of one start of one pipeline; empty if it is not known."""
+        return self._connection.messages.run if self._connection is not None else ""
 
     @property
     def rejected(self) -> int:
@@ -335,10 +339,9 @@ class Subscription(Generic[Message]):
     def _count(self, message: Track | Features) -> None:
         """Count the frames missing before a message, unless its object was not there."""
         if self._about is not None and isinstance(message, Track):
-            # The version of an object's model never falls: if it does, another object begins under the same name.
-            if message.model_version < self._version:
+            if message.began != self._began:  # another object of this name
                 self._gaps.begin(message.seq)
-            self._version = message.model_version
+            self._began = message.began
         self._gaps.take(message.seq)
 
     def _ended(self) -> bool:

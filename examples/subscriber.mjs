@@ -48,8 +48,8 @@ function attach(endpoint, channel, options) {
 // The kind and the fields of each message.
 async function* messages(socket) {
   for await (const [data] of socket) {
-    const [version, kind, , fields] = decode(data);
-    if (version !== 3) throw new Error("this catstream speaks another protocol");
+    const [version, kind, , , fields] = decode(data);
+    if (version !== 4) throw new Error("this catstream speaks another protocol");
     yield { kind, fields };
   }
 }

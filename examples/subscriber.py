@@ -45,8 +45,8 @@ def attach(endpoint: str, channel: str, keys: str) -> zmq.Socket:
 
 def receive(socket: zmq.Socket) -> tuple[str, dict]:
     """Receive the next message: its kind and its fields."""
-    version, kind, _, fields = msgpack.unpackb(socket.recv())
-    if version != 3:
+    version, kind, _, _, fields = msgpack.unpackb(socket.recv())
+    if version != 4:
         sys.exit("this catstream speaks another protocol")
     return kind, fields
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from secrets import token_hex
 from typing import NamedTuple
 
 from catstream.errors import CatstreamError, StreamRewoundError
@@ -62,7 +63,9 @@ class Process:
 
     def __init__(self, name: str, job: Job, watchdog: int | None = None) -> None:
         self.name, self.job, self.settings = name, job, job.settings
-        self.endpoint = Endpoint.parse(job.endpoint or job.settings.run.endpoint, job.settings.run.keys)
+        place = Endpoint.parse(job.endpoint or job.settings.run.endpoint, job.settings.run.keys)
+        # Of processes that were started by hand, only the detector knows that a run begins.
+        self.endpoint = replace(place, run=job.run or (token_hex(8) if name == "detector" else ""))
         self.trouble = self.source = ""
         self.source_failed = False
         # One turn of the compressor or the trainer takes a time that grows with the coreset size.

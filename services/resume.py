@@ -46,7 +46,7 @@ def start(
     positions: Sequence[Position],
     models: Mapping[str, Model],
     desired: DesiredState,
-    state_at: Callable[[Box, Box], DetectorState],
+    state_at: Callable[[Box, Box, int], DetectorState],
 ) -> Start:
     """Return the start of the detectors: after the last message that every receiver has stored.
 
@@ -60,7 +60,7 @@ def start(
     positions : answers of the receivers, that of the compressor first
     models : the newest models, for which `agree` is true
     desired : the objects, and the first message of each
-    state_at : returns the state of a detector from only its last and its first box
+    state_at : returns the state of a detector from only its last box, its first box, and the number of its first frame
     """
     last, versions = _last(positions), positions[0].versions
     for name, each in _continuing(last, desired).items():
@@ -91,9 +91,9 @@ def _continuing(last: Position, desired: DesiredState) -> dict[str, DesiredObjec
 
 
 def _state(
-    found: ObjectPosition, desired: DesiredObject, state_at: Callable[[Box, Box], DetectorState]
+    found: ObjectPosition, desired: DesiredObject, state_at: Callable[[Box, Box, int], DetectorState]
 ) -> DetectorState | None:
     """The state of a detector in a position; None if it is not known where the object was."""
     if found.detector is None and found.box is not None:
-        return state_at(found.box, desired.box)
+        return state_at(found.box, desired.box, desired.begins - 1)
     return found.detector

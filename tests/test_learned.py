@@ -14,7 +14,7 @@ from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import energy
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
-from catstream.heads import APPEARANCE, EXTENT, HEADS
+from catstream.heads import APPEARANCE, EXTENT, TREES
 from catstream.learned import Learned, merge
 from catstream.messages import DetectorState, ObjectFeatures, TrainingRows
 from catstream.settings import Settings
@@ -144,11 +144,11 @@ def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
         Learned.load(tmp_path / "one")
 
 
-@pytest.mark.parametrize("head", HEADS)
-def test_a_file_without_the_tree_of_a_head_is_an_error(learned, head):
+@pytest.mark.parametrize("tree", TREES)
+def test_a_file_without_one_of_the_trees_is_an_error(learned, tree):
     arrays, metadata = storage.decode(learned.to_bytes(), "one")
-    trees = {name: tree for name, tree in metadata["trees"].items() if name != head}
-    with pytest.raises(ProtocolError, match=f"it has no tree '{head}': learn the object anew"):
+    trees = {name: each for name, each in metadata["trees"].items() if name != tree}
+    with pytest.raises(ProtocolError, match=f"it has no tree '{tree}': learn the object anew"):
         Learned.from_bytes(storage.encode(arrays, {**metadata, "trees": trees}), "one")
 
 

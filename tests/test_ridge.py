@@ -17,20 +17,23 @@ def test_fit_minimises_the_squared_error(rng):
     centred = x - x.mean(axis=0)
     system = centred.T @ centred / 40 + 0.3 * np.eye(9)
     expected = np.linalg.solve(system, centred.T @ (y - y.mean()) / 40)
-    np.testing.assert_allclose(ridge.Regression(wide, 0.3).fit()[0], expected, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(ridge.Regression(wide[:, :-1]).fit(wide[:, -1], 0.3)[0], expected, rtol=1e-3, atol=1e-5)
 
 
 def test_fit_is_the_same_for_every_left_rotation(rng):
     rows = rng.normal(size=(25, 8)).astype(np.float32)
     rotation = np.linalg.qr(rng.normal(size=(25, 25)))[0].astype(np.float32)
-    turned = ridge.Regression(rotation @ rows, 0.2).fit()[0]
-    np.testing.assert_allclose(turned, ridge.Regression(rows, 0.2).fit()[0], rtol=1e-2, atol=1e-4)
+    (turned, _), (expected, _) = (
+        ridge.Regression(each[:, :-1]).fit(each[:, -1], 0.2) for each in (rotation @ rows, rows)
+    )
+    np.testing.assert_allclose(turned, expected, rtol=1e-2, atol=1e-4)
 
 
-def test_a_regression_fits_other_labels_as_one_of_rows_that_have_them(rng):
-    rows, labels = rng.normal(size=(25, 8)).astype(np.float32), rng.normal(size=25).astype(np.float32)
-    weights, bias = ridge.Regression(np.column_stack([rows[:, :-1], labels]), 0.2).fit()
-    regression = ridge.Regression(rows, 0.2)
-    regression.fit()
-    np.testing.assert_allclose(regression.fit(labels)[0], weights, rtol=1e-3, atol=1e-5)
-    np.testing.assert_allclose(regression.fit(labels)[1], bias, rtol=1e-3, atol=1e-5)
+def test_a_regression_fits_several_labels_with_several_penalties(rng):
+    rows, labels = rng.normal(size=(25, 8)).astype(np.float32), rng.normal(size=(2, 25)).astype(np.float32)
+    regression = ridge.Regression(rows)
+    for label in labels:
+        for penalty in (0.2, 0.03, 0.2):
+            expected = ridge.Regression(rows).fit(label, penalty)
+            np.testing.assert_array_equal(regression.fit(label, penalty)[0], expected[0])
+            assert regression.fit(label, penalty)[1] == expected[1]

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
-from catstream.heads import APPEARANCE, GROUPS, HEADS
+from catstream.heads import APPEARANCE, GROUPS, TREES
 from catstream.messages import Features, Health, Model, Preview, Sample, Track
 from catstream.subscription import AnyMessage, Subscription
 
@@ -64,7 +64,7 @@ def _model(message: Model) -> dict[str, str]:
 
 
 def _sample(message: Sample) -> dict[str, str]:
-    trees = {name: message.trees.get(name) for name in HEADS}
+    trees = {name: message.trees.get(name) for name in TREES}
     return _object(message) | {
         "version": f"{message.version}",
         "frame": f"{message.frame}",

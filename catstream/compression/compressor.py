@@ -1,6 +1,6 @@
 """The compressor of one object: takes its features of every frame, and returns a training sample now and then.
 
-It is the only owner of the object's coreset trees: one for each head of `catstream.heads`.
+It is the only owner of the object's coreset trees, those of `catstream.heads.TREES`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 
 from catstream.arrays import Bool, Float32
 from catstream.box import Box
-from catstream.compression.tree import TREES, CoresetTree, pack_trees, unpack_trees
+from catstream.compression.tree import REDUCTIONS, CoresetTree, pack_trees, unpack_trees
 from catstream.errors import SettingsError
-from catstream.heads import APPEARANCE, HEADS, Head
+from catstream.heads import APPEARANCE, TREES, Tree
 from catstream.messages import DetectorState, ObjectFeatures, ObjectPosition, Sample, TrainingRows
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
@@ -23,6 +23,7 @@ from catstream.storage import Arrays, Metadata
 
 __all__ = ["Compressor", "sample_of"]
 
+_RIGHT = 0.5  # label of a window that is neither too large nor too small, too wide or too high
 _GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between
 
 
@@ -39,6 +40,7 @@ class Compressor:
 
     Attributes
     ----------
+    began : number of the object's first frame in this stream
     frame : number of the newest frame
     box : box in which the object was last found
     detector : the detector state after the newest frame: a restarted detector continues from it
@@ -52,9 +54,9 @@ class Compressor:
                 "call Settings.for_length first, or set coreset.size"
             )
         self.settings, self.name = settings, name
-        self._tree = tree or TREES[settings.coreset.reduction]
-        self.trees = {head: self._tree(settings.coreset.size) for head in HEADS}
-        self.frame = -1
+        self._tree = tree or REDUCTIONS[settings.coreset.reduction]
+        self.trees = {name: self._tree(settings.coreset.size) for name in TREES}
+        self.began, self.frame = 0, -1
         self.box: Box | None = None
         self.detector: DetectorState | None = None
         self.last_sample: Sample | None = None
@@ -76,27 +78,28 @@ class Compressor:
     ) -> Compressor:
         """A compressor that inserts another stream into copies of the trees of an earlier one; see `begin` too."""
         self = cls(settings, name)
-        self.trees = {head: tree.copy() for head, tree in trees.items()}
+        self.trees = {each: tree.copy() for each, tree in trees.items()}
         self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name), centres
         self._sampled_leaves, self._earlier = self.leaves, origins
         return self
 
     def begin(self, frame: int, version: int) -> Sample | None:
-        """Number the sample that the trees of an earlier stream begin this one with; None if there is none.
+        """Begin the object's stream; returns the sample that the trees of an earlier stream begin it with, or None.
 
         Parameters
         ----------
         frame : number of the first frame in this stream
         version : the smallest that is free in this stream; a higher one of the sample is kept
         """
+        self.began = frame
         if self.last_sample is not None:
-            self.last_sample = replace(self.last_sample, version=max(self.version, version), frame=frame)
+            self.last_sample = replace(self.last_sample, version=max(self.version, version), frame=frame, began=frame)
         return self.last_sample
 
     @property
     def width(self) -> int:
         """Length d of a feature row, 0 before the first."""
-        widths = {self.trees[name].width - head.more_columns for name, head in HEADS.items() if self.trees[name].width}
+        widths = {self.trees[name].width - tree.more_columns for name, tree in TREES.items() if self.trees[name].width}
         return max(widths, default=0)
 
     def take(self, frame: int, features: ObjectFeatures, version: int) -> Sample | None:
@@ -108,9 +111,9 @@ class Compressor:
         """
         if not self._origin and APPEARANCE in features.training:
             self._origin = blake2b(features.training[APPEARANCE].rows.tobytes(), digest_size=8).hexdigest()
-        for name, head in HEADS.items():
-            if (training := features.training.get(head.group)) is not None:
-                self.trees[name].insert(_rows_of(head, training))
+        for name, tree in TREES.items():
+            if (training := features.training.get(tree.group)) is not None:
+                self.trees[name].insert(_rows_of(tree, training))
         self.frame, self.detector = frame, features.detector
         if features.box is not None:
             self.box = features.box
@@ -154,6 +157,7 @@ class Compressor:
         arrays, trees = pack_trees(self.trees)
         arrays |= {"centres": self.centres, "path": np.array(self._path).reshape(-1, 2)}
         metadata: Metadata = {
+            "began": self.began,
             "frame": self.frame,
             "box": list(self.box) if self.box else None,
             "sampled_leaves": self._sampled_leaves,
@@ -173,7 +177,7 @@ class Compressor:
     def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings, name: str = "") -> Compressor:
         """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
         self = cls(settings, name)
-        self.frame = int(metadata["frame"])
+        self.began, self.frame = int(metadata["began"]), int(metadata["frame"])
         self.box = Box(*metadata["box"]) if metadata["box"] else None
         if "detector" in metadata:
             self.detector = unpack(DetectorState, arrays, metadata["detector"], "detector")
@@ -198,7 +202,7 @@ class Compressor:
 
     def _due(self) -> bool:
         """Whether there is a new leaf, and the trees have grown by an eighth or the interval is over."""
-        if not all(self.trees[name].nodes for name, head in HEADS.items() if head.adds_to_score):
+        if not all(self.trees[name].nodes for name, tree in TREES.items() if tree.required):
             return False
         leaves, last = self.leaves, self.last_sample
         waited = last is not None and self.frame - last.frame >= self.settings.coreset.sample_interval
@@ -206,24 +210,29 @@ class Compressor:
 
     def _sample(self, version: int) -> Sample:
         self._sampled_leaves = self.leaves
-        self.last_sample = sample_of(self.trees, version, self.frame, self.centres, self.name)
+        self.last_sample = sample_of(self.trees, version, self.frame, self.centres, self.name, self.began)
         return self.last_sample
 
 
-def sample_of(trees: Mapping[str, CoresetTree], version: int, frame: int, centres: np.ndarray, name: str) -> Sample:
+def sample_of(
+    trees: Mapping[str, CoresetTree], version: int, frame: int, centres: np.ndarray, name: str, began: int = 0
+) -> Sample:
     """The sample of all trees of an object that have a leaf."""
-    summaries = {head: tree.sample() for head, tree in trees.items() if tree.nodes}
-    return Sample(version, frame, summaries, centres, name)
+    summaries = {each: tree.sample() for each, tree in trees.items() if tree.nodes}
+    return Sample(version, frame, summaries, centres, name, began)
 
 
-def _rows_of(head: Head, training: TrainingRows) -> Float32:
-    """The rows that the tree of a head takes."""
+def _rows_of(tree: Tree, training: TrainingRows) -> Float32:
+    """The rows that a tree takes."""
     rows: Float32 = training.rows
-    if head.label is not None:
-        of_label: Bool = training.labels == head.label
+    if tree.label is not None:
+        of_label: Bool = training.labels == tree.label
         return rows[of_label]
-    roots: Float32 = np.sqrt(training.weights, dtype=np.float32)
-    wide = np.empty((len(rows), rows.shape[1] + 2), np.float32)
-    np.multiply(rows, roots[:, None], out=wide[:, :-2])
-    wide[:, -2], wide[:, -1] = roots, training.labels * roots
+    d, roots = rows.shape[1], np.sqrt(training.weights, dtype=np.float32)[:, None]
+    wide = np.empty((len(rows), d + tree.more_columns), np.float32)
+    np.multiply(rows, roots, out=wide[:, :d])
+    wide[:, d], wide[:, d + 1], wide[:, d + 2 :] = 1, training.labels, _RIGHT
+    if training.offsets is not None:
+        wide[:, d + 2 :] = training.offsets
+    wide[:, d:] *= roots
     return wide

@@ -15,7 +15,7 @@ from catstream.storage import Arrays, Metadata, with_prefix
 
 __all__ = ["Forest"]
 
-_KIND = "forest 1"  # and the version of what a checkpoint holds
+_KIND = "forest 2"  # and the version of what a checkpoint holds
 
 
 class Forest:

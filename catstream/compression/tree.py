@@ -23,7 +23,7 @@ from catstream.storage import Arrays, Metadata
 if TYPE_CHECKING:
     import os
 
-__all__ = ["TREES", "CoresetTree", "FrequentDirections", "pack_trees", "unpack_trees"]
+__all__ = ["REDUCTIONS", "CoresetTree", "FrequentDirections", "pack_trees", "unpack_trees"]
 
 _LEVELS = 64  # no stream has 2**64 leaves
 
@@ -212,7 +212,7 @@ class CoresetTree:
     def from_state(arrays: Arrays, metadata: Metadata) -> CoresetTree:
         """The tree that `state` described, of its own class; ProtocolError if it is something else."""
         try:
-            tree = TREES[metadata["reduction"]](int(metadata["size"]))
+            tree = REDUCTIONS[metadata["reduction"]](int(metadata["size"]))
             for i, node in enumerate(metadata["nodes"]):
                 rows, total, whole = arrays[f"rows.{i}"], arrays[f"sum.{i}"], float.fromhex(node["energy"])
                 tree.nodes.append(Node(int(node["level"]), rows, int(node["count"]), total, whole))
@@ -298,7 +298,7 @@ class FrequentDirections(CoresetTree):
 
 
 #: The class of a tree, by the value of the setting `coreset.reduction`.
-TREES: dict[str, type[CoresetTree]] = {kind.reduction: kind for kind in (CoresetTree, FrequentDirections)}
+REDUCTIONS: dict[str, type[CoresetTree]] = {kind.reduction: kind for kind in (CoresetTree, FrequentDirections)}
 
 
 def pack_trees(trees: Mapping[str, CoresetTree]) -> tuple[Arrays, Metadata]:

@@ -108,7 +108,7 @@ class Detector:
             )
         window = Window.around(box, self.settings.search.context)
         self.state = DetectorState(frame, "lost", window, window, None)
-        self.model, self.likeness, self._scm = model, likeness, None
+        self.model, self.likeness, self._scm = replace(model, began=frame), likeness, None
         self.newest_version = max(self.newest_version, model.version)
 
     def look(self, frame: Pyramid, seq: int) -> Detection:
@@ -161,7 +161,8 @@ class Detector:
         """Let a frame pass without a search: the object counts as absent."""
         if self.state is not None:
             self.state = replace(self.state, level="lost")
-        track = Track(seq, seq - 1, time, "absent", None, 0.0, self.model.version, object=self.name)
+        began = self.state.first_frame if self.state is not None else seq - 1
+        track = Track(seq, seq - 1, time, "absent", None, 0.0, self.model.version, object=self.name, began=began)
         return track, ObjectFeatures(None, {}, self.state)
 
     def adopt(self, model: Model) -> None:
@@ -169,7 +170,7 @@ class Detector:
         if model.version <= self.newest_version:
             return
         self.newest_version = model.version
-        if self.state is not None and model.frame >= self.state.first_frame:
+        if self.state is not None and model.began == self.state.first_frame:
             self.model, self._scm = model, None
             if model.motion is not None:
                 self.state = replace(self.state, motion=model.motion)
@@ -187,11 +188,11 @@ class Detector:
         self.model, self.newest_version = model, model.version
         self.state = state if model.motion is None else replace(state, motion=model.motion)
 
-    def state_at(self, box: Box, first: Box) -> DetectorState:
-        """The state if nothing is known but the boxes of the object in the last frame and in its first one."""
+    def state_at(self, box: Box, first: Box, began: int) -> DetectorState:
+        """The state if nothing is known but the boxes of the object in the last frame and in its first one, `began`."""
         context = self.settings.search.context
         window = Window.around(box, context)
-        return DetectorState(0, "confident", window, window, Window.around(first, context))
+        return DetectorState(began, "confident", window, window, Window.around(first, context))
 
     def scm_state(self) -> tuple[Arrays, Metadata | None]:
         """Arrays and metadata of the paper's first tracker, for `resume_scm`; none if it is not in use."""

@@ -8,16 +8,17 @@ The size head and the aspect head learn from the same windows by how many steps 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from catstream.box import Window
-from catstream.heads import ASPECT, SIZE
 from catstream.settings import ExtentSettings
 
 __all__ = [
     "ASPECT_CHANGE",
     "SIZE_CHANGE",
+    "Trial",
     "cost",
     "followed",
     "offset_cost",
@@ -33,10 +34,18 @@ SIZE_CHANGE, ASPECT_CHANGE = math.log(1 + _SIZE_STEP), math.log(1 + _ASPECT_STEP
 
 _SIZE_RATE, _ASPECT_RATE = 0.7, 0.2  # share of a change that is applied in one frame, of its logarithm
 _PENALTY = 0.3  # weight of |log f|, for a change by the factor f
-_LABEL_STEPS = 16  # steps between the labels 0 and 1 of groups "size" and "aspect"
+_LABEL_STEPS = 16  # steps between the labels 0 and 1 of the size and the aspect head
 _OFFSET_WEIGHT = 0.02  # weight of the squared steps that a window is off
 _LARGE_OFFSET = 1.0  # steps from which this cost grows linearly
 _GROWTH = 1.18  # factor of size that no object grows by in a frame
+
+
+class Trial(NamedTuple):
+    """A window, and the steps by which it is too large and too wide."""
+
+    window: Window
+    larger: int = 0
+    wider: int = 0
 
 
 def followed(before: Window, window: Window, resize: bool) -> Window:
@@ -54,18 +63,16 @@ def followed(before: Window, window: Window, resize: bool) -> Window:
     return before.scaled(grown * stretched, grown / stretched).centred(*window.centre)
 
 
-def trials(window: Window, settings: ExtentSettings) -> dict[str, list[tuple[int, Window]]]:
-    """Windows of wrong sizes and of wrong aspect ratios, by group, with the steps that each is off.
+def trials(window: Window, settings: ExtentSettings) -> list[list[Trial]]:
+    """Windows of wrong sizes, then windows of wrong aspect ratios.
 
-    A group that is not searched is left out, and both are if `weight` is 0.
+    Those that are not searched are left out, and both are if `weight` is 0.
     """
     if not settings.weight:
-        return {}
-    found = {
-        SIZE: [(k, window.scaled(size(k))) for k in _steps(settings.size_count)],
-        ASPECT: [(k, window.scaled(*stretch(k))) for k in _steps(settings.aspect_count)],
-    }
-    return {group: windows for group, windows in found.items() if windows}
+        return []
+    sizes = [Trial(window.scaled(size(k)), larger=k) for k in _steps(settings.size_count)]
+    aspects = [Trial(window.scaled(*stretch(k)), wider=k) for k in _steps(settings.aspect_count)]
+    return [each for each in (sizes, aspects) if each]
 
 
 def offset_label(steps: int) -> float:

@@ -99,7 +99,9 @@ def track_of(
     reported = _policy(state, settings).report
     box = state.window.box(settings.search.context) if reported else None
     present: State = "present" if model.version else "bootstrapping"
-    return Track(seq, seq - 1, time, present if reported else "absent", box, float(score), model.version, object=name)
+    shown: State = present if reported else "absent"
+    began = state.first_frame
+    return Track(seq, seq - 1, time, shown, box, float(score), model.version, object=name, began=began)
 
 
 def _policy(state: DetectorState, settings: Settings) -> belief.Policy:

@@ -9,7 +9,8 @@ The initial model is learned from the rows of the first frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -116,7 +117,7 @@ def training_at(
     ----------
     around : scores of the windows around it, if a search left them: near misses and background are taken from these,
         if they reach far enough
-    extents : whether to cut rows of groups "extent", "size" and "aspect", too
+    extents : whether to cut rows of group "extent", too
     """
     rng = np.random.default_rng((settings.run.seed, seq))  # of this frame alone: no frame depends on those before
     rows = _appearance(frame, window, around, model, rng, settings.teaching)
@@ -320,57 +321,49 @@ def _surroundings(
 
 
 def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Settings) -> Training:
-    """Rows of groups "extent", "size" and "aspect": the first of `rows`, which fits, and windows of wrong extents."""
-    own, teaching = (0, rows.rows[0]), settings.teaching
-    cuts = {
-        group: [(steps, Cells.within(frame.around(trial, WINDOW)).row(0, 0)) for steps, trial in trials]
-        for group, trials in extent.trials(window, settings.extent).items()
-    }
-    if not cuts:
+    """Rows of group "extent": the first of `rows`, which fits, and windows of wrong extents."""
+    trials = [trial for each in extent.trials(window, settings.extent) for trial in each]
+    if not trials:
         return {}
-    fits = _fits([own, *(cut for each in cuts.values() for cut in each)], 1, teaching)
-    return {EXTENT: fits, **{group: _offsets([own, *each], teaching) for group, each in cuts.items()}}
+    cuts = [Cells.within(frame.around(trial.window, WINDOW)).row(0, 0) for trial in trials]
+    return {EXTENT: _fits([extent.Trial(window), *trials], [rows.rows[0], *cuts], 1, settings.teaching)}
 
 
 def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, settings: Settings) -> Training:
-    """Rows of the same groups from the first frame, as many as fill a leaf of each tree: only there the box is certain.
+    """Rows of the same group from the first frame, more than fill a leaf: only there the box is certain.
 
     The windows are cut from shifted and rotated copies of the object, most of which are on another background.
     """
-    cuts = {
-        group: _first_cuts(frame, window, [(0, window), *trials], rng, settings)
-        for group, trials in extent.trials(window, settings.extent).items()
-    }
-    if not cuts:
-        return {}
-    fits = _fits([cut for each in cuts.values() for cut in each], 1 / len(cuts), settings.teaching)
-    return {EXTENT: fits, **{group: _offsets(each, settings.teaching) for group, each in cuts.items()}}
+    trials, rows = [], []
+    kinds = extent.trials(window, settings.extent)
+    for kind in kinds:
+        for trial, row in _first_cuts(frame, window, [extent.Trial(window), *kind], rng, settings):
+            trials.append(trial)
+            rows.append(row)
+    return {EXTENT: _fits(trials, rows, 1 / len(kinds), settings.teaching)} if kinds else {}
 
 
 def _first_cuts(
-    frame: Pyramid, window: Window, trials: list[tuple[int, Window]], rng: np.random.Generator, settings: Settings
-) -> list[tuple[int, np.ndarray]]:
-    """Feature rows of windows at copies of the object in the first frame, with the steps that each is off."""
-    cuts = []
+    frame: Pyramid, window: Window, trials: list[extent.Trial], rng: np.random.Generator, settings: Settings
+) -> Iterator[tuple[extent.Trial, np.ndarray]]:
+    """Trials at copies of the object in the first frame, each with its feature row."""
     for number in range(math.ceil(settings.coreset.size / len(trials))):
         right, down, turn = rng.normal(size=3) if number else np.zeros(3)
         copy = _shifted(window, right, down)
         offset = _elsewhere(window, rng) if _is_moved(number, settings.teaching.other_backgrounds) else None
-        for steps, trial in trials:
-            tried = trial.centred(*copy.centre)
+        for trial in trials:
+            tried = trial.window.centred(*copy.centre)
             patch = _patch(frame, tried, _TURN * turn, copy.box(settings.search.context), offset)
-            cuts.append((steps, Cells.within(patch).row(0, 0)))
-    return cuts
+            yield trial, Cells.within(patch).row(0, 0)
 
 
-def _fits(cuts: list[tuple[int, np.ndarray]], weight: float, teaching: TeachingSettings) -> TrainingRows:
-    """Rows of group "extent" from feature rows and the steps that each is off."""
-    return _rows([row for _, row in cuts], [_gaussian(steps, _EXTENT_SIGMA) for steps, _ in cuts], weight, teaching)
-
-
-def _offsets(cuts: list[tuple[int, np.ndarray]], teaching: TeachingSettings) -> TrainingRows:
-    """Rows of group "size" or "aspect" from feature rows and the steps that each is off."""
-    return _rows([row for _, row in cuts], [extent.offset_label(steps) for steps, _ in cuts], 1, teaching)
+def _fits(
+    trials: Sequence[extent.Trial], cuts: Sequence[np.ndarray], weight: float, teaching: TeachingSettings
+) -> TrainingRows:
+    """Rows of group "extent" from trials and the feature row of each."""
+    labels = [_gaussian(trial.larger + trial.wider, _EXTENT_SIGMA) for trial in trials]  # one of the two is 0
+    offsets = [(extent.offset_label(trial.larger), extent.offset_label(trial.wider)) for trial in trials]
+    return replace(_rows(cuts, labels, weight, teaching), offsets=np.array(offsets, np.float32))
 
 
 def _gaussian(offset: float, sigma: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from catstream.arrays import Bool, Float32
 from catstream.box import Box
 from catstream.compression.reduce import energy, reduce
-from catstream.compression.tree import TREES, CoresetTree
+from catstream.compression.tree import REDUCTIONS, CoresetTree
 from catstream.errors import SettingsError
 from catstream.heads import APPEARANCE
 from catstream.messages import Features
@@ -83,7 +83,7 @@ def taught_frames(
     for message in features:
         for name, part in message.objects.items():
             if part.begins or name not in novelties:
-                frames[name], novelties[name] = [], Novelty(TREES[settings.reduction](settings.size))
+                frames[name], novelties[name] = [], Novelty(REDUCTIONS[settings.reduction](settings.size))
             if (training := part.training.get(APPEARANCE)) is not None:
                 of_object: Bool = training.labels == 1
                 new = novelties[name].of(training.rows[of_object])

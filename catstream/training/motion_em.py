@@ -19,7 +19,7 @@ PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 
 OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels
 
 
-def learn_motion(centres: np.ndarray, iterations: int = 10) -> Motion | None:
+def learn_motion(centres: np.ndarray, iterations: int = 5) -> Motion | None:
     """Estimate the covariances of the constant-velocity model from centres, by maximum likelihood.
 
     No iteration lowers the likelihood. The covariances are symmetric, and their eigenvalues are at least

@@ -17,7 +17,7 @@ import numpy as np
 
 from catstream import ridge
 from catstream.errors import ProtocolError
-from catstream.heads import BETWEEN_RIDGE, HEADS
+from catstream.heads import BETWEEN_RIDGE, TREES, Head, Tree
 from catstream.messages import Model, Motion, Sample
 from catstream.paper.one_class import one_class
 from catstream.settings import Settings
@@ -31,7 +31,7 @@ class Trainer:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._regressions: dict[str, dict[str, ridge.Regression]] = {}  # of the last samples, by object and head
+        self._regressions: dict[str, dict[str, ridge.Regression]] = {}  # of the last samples, by object and tree
         ridge.prepare()  # before the first sample, because the detector waits for its model
 
     def train(self, sample: Sample) -> Model:
@@ -60,7 +60,7 @@ class Trainer:
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
         bias = -float(weights @ background_mean)
         heads, biases = self._head_vectors(sample, weights)
-        return Model(sample.version, sample.frame, weights, bias, motion, heads, biases, sample.object)
+        return Model(sample.version, sample.frame, weights, bias, motion, heads, biases, sample.object, sample.began)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
@@ -71,9 +71,10 @@ class Trainer:
         return [
             _between(sample),
             *(
-                self._regression(sample, name, head.ridge).fit()[0]
-                for name, head in HEADS.items()
-                if head.adds_to_score and head.ridge is not None
+                self._fitted(sample, tree, head)[0]
+                for tree in TREES.values()
+                for head in tree.heads
+                if head.adds_to_score
             ),
         ]
 
@@ -84,22 +85,32 @@ class Trainer:
         chooses size and aspect.
         """
         vectors, biases = {}, {}
-        for name, head in HEADS.items():
-            if head.ridge is None or head.adds_to_score or name not in sample.trees:
-                continue
-            regression, rows = self._regression(sample, name, head.ridge), sample.trees[name].rows
-            if head.has_bias:
-                vectors[name], biases[name] = regression.fit()
-            else:
-                vectors[name], _ = regression.fit(rows[:, -1] - rows[:, :-2] @ weights)
+        for tree in TREES.values():
+            for head in tree.heads:
+                if head.adds_to_score or tree.name not in sample.trees:
+                    continue
+                vectors[head.name], bias = self._fitted(sample, tree, head, None if head.has_bias else weights)
+                if head.has_bias:
+                    biases[head.name] = bias
         return vectors, biases
 
-    def _regression(self, sample: Sample, name: str, penalty: float) -> ridge.Regression:
-        """The regression of a head, as it was factored for the last sample if that had the same rows."""
-        rows, known = sample.trees[name].rows, self._regressions[sample.object]
-        if name not in known or not np.array_equal(known[name].rows, rows):
-            known[name] = ridge.Regression(rows, penalty)
-        return known[name]
+    def _fitted(
+        self, sample: Sample, tree: Tree, head: Head, beside: np.ndarray | None = None
+    ) -> tuple[np.ndarray, float]:
+        """Weights and bias of a head; with `beside`, of what its label has beyond the product with these weights."""
+        rows = sample.trees[tree.name].rows
+        d = rows.shape[1] - tree.more_columns
+        labels = rows[:, d + 1 + tree.heads.index(head)]
+        if beside is not None:
+            labels = labels - rows[:, :d] @ beside
+        return self._regression(sample, tree.name, rows[:, : d + 1]).fit(labels, head.penalty)
+
+    def _regression(self, sample: Sample, tree: str, rows: np.ndarray) -> ridge.Regression:
+        """The regression on the rows of a tree, as it was made for the last sample if that had the same."""
+        known = self._regressions[sample.object]
+        if tree not in known or not np.array_equal(known[tree].rows, rows):
+            known[tree] = ridge.Regression(rows)
+        return known[tree]
 
 
 def _between(sample: Sample) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, OrderedDict, deque
 from typing import Literal
 
-from catstream.heads import HEADS
+from catstream.heads import TREES
 from catstream.messages import End, Features, Health, Model, Preview, Track
 from catstream.web.objects import Objects
 from catstream.web.surprising import SurprisingFrames
@@ -22,8 +22,6 @@ _POINT_SECONDS = 0.25
 _POINTS = 480  # two minutes
 _RATE_SECONDS = 2.0  # interval over which frames per second are counted
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
-_MONOTONIC_COUNTERS = ("sent", "rows")  # counters that never decrease within a run, if no object is dropped
-_LATE_HEALTH_SECONDS = 3.0  # health reports of the same run may arrive this long after its end
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
 _PICTURES = 8  # number of pictures that a page may still request
 
@@ -47,6 +45,8 @@ class Dashboard:
 
     def __init__(self) -> None:
         self.endpoint = self._attached = ""
+        self._run = ""  # id of the run that is shown
+        self._runs_before: set[str] = set()  # ids of those before it, whose last messages may still arrive
         self._revisions: Counter[str] = Counter(pipeline=1, trees=1)  # `pipeline` is the first update: it clears a page
         self._reset()
 
@@ -61,7 +61,7 @@ class Dashboard:
         self.pictures: OrderedDict[int, Preview] = OrderedDict()
         self._last: dict[str, Health] = {}  # like `health`, but kept while the pipeline is silent
         self._points: deque[_Point] = deque(maxlen=_POINTS)
-        self._last_point = self._ended = float("-inf")  # times of the last chart point and of the end
+        self._last_point = float("-inf")  # time of the last chart point
         self._moments: deque[float] = deque()
         self._arrivals: OrderedDict[int, float] = OrderedDict()
         self._tracks: OrderedDict[int, dict[str, Track]] = OrderedDict()  # of the newest frames, by frame and object
@@ -74,11 +74,21 @@ class Dashboard:
             self.endpoint = endpoint
             self._mark_changed("status")
 
-    def take(self, message: object, now: float) -> None:
-        """Process a message that arrived at the time `now`, in seconds of a monotonic clock."""
-        if self._is_from_another_pipeline(message, now):
-            self._reset()
-            self._mark_changed("pipeline", "status", "tracks", "picture", "trees", "surprising")
+    def take(self, message: object, now: float, run: str = "") -> None:
+        """Process a message that arrived at the time `now`, in seconds of a monotonic clock.
+
+        Parameters
+        ----------
+        run : id of the run that it is from; empty if its sender knows none: then it is of the run that is shown
+        """
+        if run in self._runs_before:
+            return
+        if run and run != self._run:
+            if self._run:
+                self._runs_before.add(self._run)
+                self._reset()
+                self._mark_changed("pipeline", "status", "tracks", "picture", "trees", "surprising")
+            self._run, self.endpoint = run, self._attached
         match message:
             case Track():
                 self._add_track(message, now)
@@ -92,7 +102,7 @@ class Dashboard:
                 if self.surprising.add_features(message):
                     self._mark_changed("surprising")
             case End() if self.phase != "ended":
-                self.phase, self.reason, self._ended = "ended", message.reason, now
+                self.phase, self.reason = "ended", message.reason
                 self._mark_changed("status")
 
     def mark_silent(self, reason: str) -> None:
@@ -148,22 +158,6 @@ class Dashboard:
                 parts[name] = getattr(self, f"_{name}_part")(revision - seen.get(name, 0))
                 seen[name] = revision
         return parts
-
-    def _is_from_another_pipeline(self, message: object, now: float) -> bool:
-        """Return whether a message shows that another pipeline runs than the one shown."""
-        if not isinstance(message, Track | Health):
-            return False
-        if self._attached != self.endpoint:
-            self.endpoint = self._attached
-            return True
-        if isinstance(message, Track):  # a restarted detector continues with the model of the object
-            before = self.objects.shown.get(message.object)
-            over = before is not None and message.seq < before.seq and message.model_version == 0 < before.version
-            return over or self.phase == "ended"
-        counters = self._last.get(message.process, message).counters
-        over = any(message.counters.get(name, 0.0) < counters.get(name, 0.0) for name in _MONOTONIC_COUNTERS)
-        late = self.phase == "ended" and now - self._ended > _LATE_HEALTH_SECONDS
-        return late or (over and self.phase in ("ended", "silent"))
 
     def _add_health(self, health: Health, now: float) -> None:
         self.health[health.process] = health
@@ -282,14 +276,14 @@ class Dashboard:
         counted = self._last["compressor"].objects if "compressor" in self._last else {}
         objects = {
             name: {
-                "leaves": [counters.get(f"{head}_leaves", 0.0) for head in HEADS],
+                "leaves": [counters.get(f"{tree}_leaves", 0.0) for tree in TREES],
                 "bytes": counters.get("bytes", 0.0),
                 "rows": counters.get("rows", 0.0),
             }
             for name, counters in counted.items()
         }
         return {
-            "heads": [{"title": head.title, "meaning": head.meaning} for head in HEADS.values()],
+            "kinds": [{"title": tree.title, "meaning": tree.meaning} for tree in TREES.values()],
             "objects": objects,
         }
 

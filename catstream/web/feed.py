@@ -102,8 +102,8 @@ class Feed:
     async def _forward(self, place: Endpoint, channel: str) -> End | None:
         """Feed the messages of a channel until the pipeline ends; channels for viewers only while there are viewers.
 
-        The other channels do not identify their pipeline. They are read only after a track or health report arrived:
-        before, they could give the last message of the previous pipeline at the same endpoint.
+        The other channels are read only once the pipeline runs: before, they could give the last message of the
+        previous pipeline at the same endpoint.
         """
         timeout = SILENCE_SECONDS if channel == "health" else None
         while True:
@@ -113,7 +113,7 @@ class Feed:
                 await self.viewers.wait()
             with Subscription[AnyMessage](place, channel, timeout=timeout) as messages:
                 async for message in messages:
-                    self.dashboard.take(message, monotonic())
+                    self.dashboard.take(message, monotonic(), messages.run)
                     if self.dashboard.phase == "running":
                         self._is_running.set()
                     if channel in _FOR_VIEWERS and not self.viewers.count:

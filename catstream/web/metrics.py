@@ -8,7 +8,7 @@ from time import monotonic, time
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from catstream.heads import HEADS
+from catstream.heads import TREES
 from catstream.web.feed import Feed
 from catstream.wire.channels import CHANNELS
 
@@ -93,7 +93,7 @@ class _Collector:
         leaves = GaugeMetricFamily(
             "catstream_tree_leaves", "Leaves ever inserted into a coreset tree.", labels=["object", "tree"]
         )
-        for tree in HEADS:
+        for tree in TREES:
             for name, value in dashboard.object_counters("compressor", f"{tree}_leaves").items():
                 leaves.add_metric([name, tree], value)
         yield leaves

@@ -17,6 +17,7 @@ class ShownObject:
     colour         colour of its box, #rrggbb
     state, score   those of its newest track
     version        version of the model that scored it
+    began          number of its first frame, None before its first track
     seq            number of its newest track, 0 before the first
     model          its newest model, None before the first
     model_latency  seconds from the track of a frame to the model that was trained on it, None before the first model
@@ -26,6 +27,7 @@ class ShownObject:
     state: State = "absent"
     score: float = 0.0
     version: int = 0
+    began: int | None = None
     seq: int = 0
     model: Model | None = None
     model_latency: float | None = None
@@ -44,21 +46,17 @@ class Objects:
         self.shown: dict[str, ShownObject] = {}
         self.colours = Colours()
         self._models: dict[str, Model] = {}  # newest models, also of objects without a track yet
-        self._since: dict[str, int] = {}  # first frame of an object that took the name of another one
 
     def add_track(self, track: Track) -> bool:
         """Add a track; return whether another object of this name begins with it."""
         name, before = track.object, self.shown.get(track.object)
-        begins = before is not None and track.model_version < before.version
-        if begins:
-            self._since[name] = track.frame
-            if (model := self._models.get(name)) is not None and model.frame < track.frame:
-                del self._models[name]
+        begins = before is not None and before.began not in (None, track.began)
         if before is None or begins:
             self.shown[name] = ShownObject(self.colours.of(name))
         each = self.shown[name]
         each.state, each.score, each.version, each.seq = track.state, track.score, track.model_version, track.seq
-        each.model = self._models.get(name)
+        each.began, model = track.began, self._models.get(name)
+        each.model = model if model is not None and model.began == track.began else None
         return begins
 
     def add_model(self, model: Model, latency: float | None) -> bool:
@@ -69,10 +67,11 @@ class Objects:
         False if the model is of another object that had the name before: it is ignored
         """
         name = model.object
-        if model.frame < self._since.get(name, 0):
+        each, before = self.shown.get(name), self._models.get(name)
+        if each is not None and each.began is not None and model.began < each.began:
             return False
-        before, self._models[name] = self._models.get(name), model
-        if (each := self.shown.get(name)) is not None:
+        self._models[name] = model
+        if each is not None and each.began == model.began:
             each.model = model
             if latency is not None and (before is None or before.version != model.version):
                 each.model_latency = latency
@@ -97,6 +96,5 @@ class Objects:
         for name in dropped:
             del self.shown[name]
             self._models.pop(name, None)
-            self._since.pop(name, None)
         self.colours.keep(self.shown)
         return dropped

@@ -16,7 +16,6 @@ import zmq
 
 from catstream.messages import End, Position, Stored
 from catstream.wire.channels import Channel
-from catstream.wire.codec import encode
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow
 from catstream.wire.socket import LINGER_MILLISECONDS, ChannelSocket
@@ -94,7 +93,7 @@ class Sender(ChannelSocket[Message]):
         self.poll(0)
         if self._window.full:
             return False
-        self._window.push(message.seq, encode(message))
+        self._window.push(message.seq, self._encode(message))
         self._transmit()
         return True
 
@@ -221,6 +220,6 @@ class Receiver(ChannelSocket[Message]):
             match action:
                 case Reply(peer, answer):
                     with contextlib.suppress(zmq.Again):  # a sender that does not read asks again
-                        self._socket.send_multipart([peer, encode(answer)], zmq.NOBLOCK)
+                        self._socket.send_multipart([peer, self._encode(answer)], zmq.NOBLOCK)
                 case Reject(reason, text):
                     self._reject(reason, text)

@@ -1,10 +1,12 @@
 """Messages to bytes and back. Everything that arrives is checked before it is used.
 
-A message is one frame of msgpack, `[version, kind, object, fields]`:
+A message is one frame of msgpack, `[version, kind, object, run, fields]`:
 
-    version   3; another one is rejected
+    version   4; another one is rejected
     kind      name of the message in small letters: "features", "track" ...
     object    name of the object that the message is about, "" if it is about none or about all
+    run       id of the run that it is from: of one start of one pipeline, kept by processes that are restarted; "" if
+              the sender knows none
     fields    map from each field's name to its value, see `catstream.messages`
     a box     [x, y, w, h]
     an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
@@ -47,12 +49,22 @@ from catstream.messages import (
 from catstream.schema import LONGEST_LIST, LONGEST_TEXT
 from catstream.wire.checks import check_message
 
-__all__ = ["KINDS", "VERSION", "decode", "decode_json", "encode", "encode_json", "opening", "topic_of"]
+__all__ = [
+    "KINDS",
+    "VERSION",
+    "decode",
+    "decode_json",
+    "decode_with_run",
+    "encode",
+    "encode_json",
+    "opening",
+    "topic_of",
+]
 
 Message = TypeVar("Message")
 
 #: Version of the envelope and of the meaning of the fields.
-VERSION = 3
+VERSION = 4
 
 _LONGEST_TOPIC = 512  # bytes
 
@@ -80,8 +92,8 @@ KINDS: dict[str, type] = {
 }
 
 
-def encode(message: object) -> bytes:
-    """A message as bytes.
+def encode(message: object, run: str = "") -> bytes:
+    """A message of a run as bytes.
 
     Raises
     ------
@@ -89,7 +101,7 @@ def encode(message: object) -> bytes:
         If it breaks its schema: it would be rejected on arrival.
     """
     check_message(message)
-    return _ENCODER.encode((VERSION, type(message).__name__.lower(), getattr(message, "object", ""), message))
+    return _ENCODER.encode((VERSION, type(message).__name__.lower(), getattr(message, "object", ""), run, message))
 
 
 def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
@@ -100,6 +112,11 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
     ProtocolError
         If it is anything else; the error has the expected and the received kind.
     """
+    return decode_with_run(data, *kinds)[0]
+
+
+def decode_with_run(data: bytes | memoryview, *kinds: type[Message]) -> tuple[Message, str]:
+    """The same, and the run that the message is from."""
     expected = " or ".join(sorted(kind.__name__.lower() for kind in kinds))
     try:
         envelope = msgpack.unpackb(
@@ -119,11 +136,11 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
         raise ProtocolError(
             f"expected version {VERSION} of the protocol, got {_brief(version)}: run the same catstream", "version"
         )
-    if not isinstance(envelope, list) or len(envelope) != 4:
+    if not isinstance(envelope, list) or len(envelope) != 5:
         raise ProtocolError(
-            f"expected {expected} as [version, kind, object, fields], got something else in msgpack", "envelope"
+            f"expected {expected} as [version, kind, object, run, fields], got something else in msgpack", "envelope"
         )
-    _, name, about, fields = envelope
+    _, name, about, run, fields = envelope
     kind = KINDS.get(name) if isinstance(name, str) else None
     if kind not in kinds:
         raise ProtocolError(f"expected {expected}, got {_brief(name)}", "kind")
@@ -136,14 +153,16 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
             f"{name}: expected one object, got {_brief(about)} in the envelope and another one in the fields",
             "envelope",
         )
+    if not isinstance(run, str):
+        raise ProtocolError(f"{name}: expected the id of a run, got {_brief(run)}", "envelope")
     check_message(message)
-    return message
+    return message, run
 
 
 def opening(kind: type, about: str | None = None) -> bytes:
     """The bytes that every message of a kind begins with; of those about one object, if a name is given."""
     names = (kind.__name__.lower(),) if about is None else (kind.__name__.lower(), about)
-    return _ENCODER.encode((VERSION, *names, *[None] * (3 - len(names))))[: -(3 - len(names))]  # nil is one byte
+    return _ENCODER.encode((VERSION, *names, *[None] * (4 - len(names))))[: -(4 - len(names))]  # nil is one byte
 
 
 def topic_of(data: bytes | memoryview) -> bytes:

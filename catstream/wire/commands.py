@@ -16,7 +16,6 @@ from typing import Generic, Protocol, TypeVar, cast
 import zmq
 
 from catstream.wire.channels import Channel
-from catstream.wire.codec import encode
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.socket import ChannelSocket
 
@@ -57,7 +56,7 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
 
     def ask(self, question: Question, seconds: float) -> Answer | None:
         """Send a question until it is answered; None if no answer arrived in time."""
-        data, now = encode(question), monotonic()
+        data, now = self._encode(question), monotonic()
         deadline, repeat_at = now + seconds, now
         while now < deadline:
             if now >= repeat_at or not self._in_transit:
@@ -70,7 +69,7 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
 
     def send(self, question: Question) -> None:
         """Send a question once, without waiting for a connection or for the answer: `receive` returns it."""
-        self._send(encode(question))
+        self._send(self._encode(question))
 
     def receive(self, question: str, seconds: float) -> Answer | None:
         """The answer to the question with this id if it arrives in time; late answers to others are dropped."""
@@ -132,7 +131,7 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
 
     def answer(self, answer: Answer) -> None:
         """Answer a question, now and whenever it is repeated."""
-        self._answers[answer.id] = data = encode(answer)
+        self._answers[answer.id] = data = self._encode(answer)
         if len(self._answers) > _MAX_QUESTIONS:
             del self._answers[next(iter(self._answers))]
         if (peer := self._waiting.pop(answer.id, None)) is not None:

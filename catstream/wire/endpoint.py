@@ -44,6 +44,7 @@ class Endpoint:
     hosts   of single processes, by name
     keys    to connect with; None if the pipeline has no keys
     source  of the pipeline's frames, without a password; empty if it is not known here, or for a fleet
+    run     id of the run whose process this is; empty for a client
 
     >>> Endpoint.parse("tcp://localhost:5700").address(CHANNELS["models"])
     'tcp://127.0.0.1:5702'
@@ -57,6 +58,7 @@ class Endpoint:
     hosts: dict[str, str] = field(default_factory=dict)
     keys: Keys | None = None
     source: str = field(default="", compare=False)
+    run: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         """As the setting `run.endpoint` says it."""

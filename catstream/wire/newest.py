@@ -25,7 +25,7 @@ import zmq
 
 from catstream.messages import End, Health
 from catstream.wire.channels import Channel
-from catstream.wire.codec import encode, opening, topic_of
+from catstream.wire.codec import opening, topic_of
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.socket import ChannelSocket
 
@@ -67,7 +67,7 @@ class Publisher(ChannelSocket[Message]):
         self._expected: set[bytes] = set()  # topics of announced subscribers that are not connected yet
         self._last: dict[bytes, bytes] = {}  # the messages for late joiners by topic, oldest first
         if first_message is not None:
-            self._last[b""] = encode(first_message)
+            self._last[b""] = self._encode(first_message)
         self._due: list[bytes] = []  # topics whose last message is sent again, in this order
         self._next_part = 0.0  # when some of them are sent
         self._repeat_at, self._pause = math.inf, _REPEAT_SECONDS  # when all are due again; seconds from time to time
@@ -92,9 +92,9 @@ class Publisher(ChannelSocket[Message]):
         if not self._newest:
             self.serve_late_joiners()
             if self._subscribed:
-                self._socket.send(encode(message), copy=False)
+                self._socket.send(self._encode(message), copy=False)
             return
-        data = encode(message)
+        data = self._encode(message)
         if isinstance(message, End):  # nothing before it counts
             self._last.clear()
         self._last.pop(topic := topic_of(data), None)

@@ -16,7 +16,7 @@ import zmq
 
 from catstream.errors import ProtocolError, ServiceError
 from catstream.wire.channels import Channel
-from catstream.wire.codec import decode
+from catstream.wire.codec import decode_with_run, encode
 from catstream.wire.context import context
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.monitor import Event, Monitor
@@ -69,11 +69,13 @@ class ChannelSocket(Generic[Message]):
     ----------
     channel : row of the table
     rejected : messages that were dropped because they were not what the channel carries
+    run : id of the run that the last message is from, see `catstream.wire.codec`; empty if it is not known
     """
 
     def __init__(self, kind: int, channel: Channel[Message], endpoint: Endpoint, high_water_mark: int) -> None:
         self.channel = channel
         self.rejected = 0
+        self.run = ""
         self._endpoint = endpoint
         self._listens = False
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
@@ -159,13 +161,17 @@ class ChannelSocket(Generic[Message]):
     ) -> Kind | None:
         """The message in `data`, None if it is rejected."""
         try:
-            message = decode(data, *kinds)
+            message, self.run = decode_with_run(data, *kinds)
             if check is not None:
                 check(message)
         except ProtocolError as error:
             self._reject(error.reason, f"a message was dropped: {error}")
             return None
         return message
+
+    def _encode(self, message: object) -> bytes:
+        """A message of this process as bytes."""
+        return encode(message, self._endpoint.run)
 
     def _receive_from_peer(self) -> tuple[bytes, memoryview | None]:
         """Peer and data of a ROUTER's next message; the data is None if the message has not exactly one part."""

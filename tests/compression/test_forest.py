@@ -14,16 +14,19 @@ from catstream.box import Box, Window
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
-from catstream.compression.tree import TREES, CoresetTree
+from catstream.compression.tree import REDUCTIONS, CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.heads import APPEARANCE, ASPECT, EXTENT, HEADS, SIZE
+from catstream.heads import APPEARANCE, EXTENT, TREES
 from catstream.messages import DetectorState, Features, Motion, ObjectFeatures, Sample, TrainingRows
 from catstream.settings import Settings
 
 WIDTH = 20
 
+#: Labels of size and aspect of the first rows of a frame.
+OFFSETS = np.array([[0.5, 0.5], [0.25, 0.5], [0.5, 0.75]], np.float32)
 
-@pytest.fixture(params=TREES)
+
+@pytest.fixture(params=REDUCTIONS)
 def settings(request: pytest.FixtureRequest) -> Settings:
     coreset = {"size": 8, "sample_interval": 4, "reduction": request.param}
     return Settings(coreset=coreset, search={"motion_frames": 10})
@@ -41,9 +44,7 @@ def messages(rng) -> Iterator[Features]:
             box = Box(frame, 10, 20, 30) if frame % 5 else None
             training = {
                 APPEARANCE: TrainingRows(rows, labels, weights),
-                EXTENT: TrainingRows.labelled(rows[:3], labels[:3]),
-                SIZE: TrainingRows.labelled(rows[:2], [0.5, 0.25]),
-                ASPECT: TrainingRows.labelled(rows[:2], [0.5, 0.75]),
+                EXTENT: TrainingRows(rows[:3], labels[:3], weights[:3], OFFSETS),
             }
             yield one_object(frame, ObjectFeatures(box, training))
 
@@ -80,8 +81,8 @@ def test_each_row_is_inserted_into_the_tree_of_its_label(settings, messages):
     sample = take(forest, messages, 60)[-1]
     frames = sample.frame + 1
     rows = {(APPEARANCE, 1.0): 2, (APPEARANCE, 0.0): 3, (APPEARANCE, None): 6}
-    rows |= {(EXTENT, None): 3, (SIZE, None): 2, (ASPECT, None): 2}
-    counts = {name: frames * rows[head.group, head.label] for name, head in HEADS.items()}
+    rows |= {(EXTENT, None): 3}
+    counts = {name: frames * rows[tree.group, tree.label] for name, tree in TREES.items()}
     assert {name: tree.count for name, tree in sample.trees.items()} == counts
 
 
@@ -101,13 +102,30 @@ def test_rows_of_the_loss_tree_give_the_loss_of_any_model(settings, messages, rn
         assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
 
 
+def test_rows_of_the_extent_tree_give_the_loss_of_each_of_its_heads(settings, messages, rng):
+    forest, seen = Forest(settings), [next(messages) for _ in range(60)]
+    for message in seen:
+        forest.take(message)
+    trained = [message.objects[""].training[EXTENT] for message in seen]
+    tree = forest.compressors[""].trees[EXTENT]
+    kept = np.vstack([*(node.rows for node in tree.nodes), tree.pending]).astype(np.float64)
+    for column in range(3):
+        model = np.zeros(WIDTH + 4)
+        model[: WIDTH + 1], model[WIDTH + 1 + column] = rng.normal(size=WIDTH + 1), -1
+        labels = [np.column_stack([m.labels, m.offsets])[:, column] for m in trained]
+        errors = [m.rows @ model[:WIDTH] + model[WIDTH] - y for m, y in zip(trained, labels, strict=True)]
+        loss = sum(float(m.weights @ error**2) for m, error in zip(trained, errors, strict=True))
+        approximate = float(np.sum((kept @ model) ** 2))
+        assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
+
+
 def test_an_object_that_begins_again_has_new_trees(settings, messages):
     forest = Forest(settings)
     take(forest, messages, 20)
     before = forest.version
     assert before
     forest.take(changed(next(messages), begins=True))
-    assert forest.counters()["rows"] == 2 + 3 + 6 + 3 + 2 + 2, "those of one frame"
+    assert forest.counters()["rows"] == 2 + 3 + 6 + 3, "those of one frame"
     assert all(sample.version > before for sample in take(forest, messages, 40)), "no version is used twice"
 
 
@@ -250,7 +268,7 @@ def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path)
 
 def test_a_tree_is_no_forest(settings, tmp_path):
     Compressor(settings).trees["object"].save(tmp_path / "tree")
-    with pytest.raises(ServiceError, match="is of kind None, this catstream reads 'forest 1'"):
+    with pytest.raises(ServiceError, match="is of kind None, this catstream reads 'forest 2'"):
         Forest.load(tmp_path / "tree", settings)
 
 
@@ -259,7 +277,7 @@ def test_a_checkpoint_of_another_version_is_rejected_with_one_line(settings, mes
     take(forest, messages, 37)
     arrays, metadata = forest.state()
     storage.write(path, arrays, metadata | {"kind": "compressor 1"})
-    with pytest.raises(ServiceError, match="is of kind 'compressor 1', this catstream reads 'forest 1'") as error:
+    with pytest.raises(ServiceError, match="is of kind 'compressor 1', this catstream reads 'forest 2'") as error:
         CheckpointStore(tmp_path).load(settings)
     assert "\n" not in str(error.value)
 
@@ -276,7 +294,7 @@ def test_a_state_of_another_reduction_is_rejected(settings, messages, tmp_path):
     forest = Forest(settings)
     take(forest, messages, 37)
     forest.save(tmp_path / "state")
-    (other,) = TREES.keys() - {settings.coreset.reduction}
+    (other,) = REDUCTIONS.keys() - {settings.coreset.reduction}
     with pytest.raises(SettingsError, match=r"holds trees of coreset.reduction=.*same settings"):
         Forest.load(tmp_path / "state", settings.but({"coreset.reduction": other}))
 
@@ -315,7 +333,7 @@ def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, m
     assert forest.compressors == {"ben": kept}
     assert forest.position.objects.keys() == forest.object_counters().keys() == {"ben"}
     forest.take(merged(3, ben=next(messages), anna=next(messages)))
-    assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3 + 2 + 2, "those of one frame"
+    assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3, "those of one frame"
 
 
 def test_rows_of_another_length_of_one_object_leave_the_others_unchanged(settings, messages):

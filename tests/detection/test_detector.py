@@ -155,7 +155,7 @@ def test_another_detector_continues_from_the_state_of_a_stopped_one(scene):
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
     track, _ = detector.step(scene((64, 52)))
-    other.go_on(track.seq, other.state_at(track.box, START), model)
+    other.go_on(track.seq, other.state_at(track.box, START, 0), model)
     track, _ = other.step(scene((68, 54)))
     assert (track.seq, track.state) == (3, "present")
     assert track.box.overlap(Box(68, 54, 48, 40)) > 0.8
@@ -209,9 +209,9 @@ def test_a_detector_that_is_resumed_adopts_no_model_of_the_object_before_either(
     detector.step(scene((62, 50)))
     _, features = detector.start(scene((90, 60)), Box(90, 60, 48, 40))
     other.go_on(detector.seq, features.detector, detector.model)
-    other.adopt(dataclasses.replace(detector.model, version=1, frame=1))
+    other.adopt(dataclasses.replace(detector.model, version=1))
     assert (other.model.version, other.newest_version) == (0, 1)
-    other.adopt(dataclasses.replace(detector.model, version=2, frame=2))
+    other.adopt(dataclasses.replace(detector.model, version=2, began=2))
     assert other.model.version == 2
 
 
@@ -219,7 +219,7 @@ def test_the_training_rows_of_a_frame_do_not_depend_on_earlier_frames(scene):
     detector, other = started(scene), Follower()
     model = dataclasses.replace(detector.model, version=1)
     detector.adopt(model)
-    other.go_on(1, other.state_at(START, START), model)
+    other.go_on(1, other.state_at(START, START, 0), model)
     one, two = (stage.step(scene((60, 50)))[1] for stage in (detector, other))
     np.testing.assert_allclose(one.training["appearance"].rows, two.training["appearance"].rows, atol=1e-5)
 
@@ -276,9 +276,9 @@ def test_another_object_begins_with_a_model_of_its_own_and_older_ones_are_not_ad
     track, features = detector.start(scene((64, 50)), Box(64, 50, 48, 40))
     assert (track.seq, track.state, track.model_version, features.begins) == (4, "bootstrapping", 0, True)
     initial = detector.model
-    detector.adopt(dataclasses.replace(initial, version=2, frame=2))
+    detector.adopt(dataclasses.replace(initial, version=2))
     assert (detector.model, detector.newest_version) == (initial, 2), "it is of the object before"
-    detector.adopt(dataclasses.replace(initial, version=3, frame=3))
+    detector.adopt(dataclasses.replace(initial, version=3, began=3))
     assert detector.model.version == 3
 
 

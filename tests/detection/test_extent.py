@@ -10,7 +10,7 @@ from catstream.detection import extent, teacher
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW as WINDOW_CELLS
 from catstream.features.pyramid import Pyramid
-from catstream.heads import ASPECT, GROUPS, HEADS, SIZE
+from catstream.heads import ASPECT, EXTENT, GROUPS, HEADS, SIZE
 from catstream.settings import ExtentSettings, Settings
 from catstream.tracker import Tracker
 
@@ -65,29 +65,29 @@ def test_the_heads_predict_by_how_many_steps_a_window_is_too_large_or_too_wide(d
     image, box = draw(60, 60)
     frame, window = Pyramid.of(image), Window.around(box, Settings().search.context)
     _, training = teacher.first_training(frame, window, np.random.default_rng(0), Settings())
-    for group, wrong in ((SIZE, window.scaled(extent.size(steps))), (ASPECT, window.scaled(*extent.stretch(steps)))):
-        rows = training[group]
-        table = np.column_stack([rows.rows, np.ones(len(rows)), rows.labels]).astype(np.float32)
-        weights, bias = ridge.Regression(table, HEADS[group].ridge).fit()
+    rows = training[EXTENT]
+    regression = ridge.Regression(np.column_stack([rows.rows, np.ones(len(rows), np.float32)]))
+    for head, wrong in ((SIZE, window.scaled(extent.size(steps))), (ASPECT, window.scaled(*extent.stretch(steps)))):
+        weights, bias = regression.fit(rows.offsets[:, int(head == ASPECT)], HEADS[head].penalty)
         row = Cells.within(frame.around(wrong, WINDOW_CELLS)).row(0, 0)
         assert (row @ weights + bias - 0.5) * 16 == pytest.approx(steps, abs=0.7)
 
 
 def test_trials_are_windows_of_wrong_sizes_and_of_wrong_aspect_ratios():
     trials = extent.trials(WINDOW, ExtentSettings(size_count=5, aspect_count=3))
-    sizes, aspects = trials[SIZE], trials[ASPECT]
-    assert [steps for steps, _ in sizes] == [-2, -1, 1, 2]
-    assert [steps for steps, _ in aspects] == [-1, 1]
-    for steps, window in sizes:
+    sizes, aspects = trials
+    assert [(each.larger, each.wider) for each in sizes] == [(-2, 0), (-1, 0), (1, 0), (2, 0)]
+    assert [(each.larger, each.wider) for each in aspects] == [(0, -1), (0, 1)]
+    for window, steps, _ in sizes:
         assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h)
         assert window.w / WINDOW.w == pytest.approx(1.04**steps)
-    for steps, window in aspects:
+    for window, _, steps in aspects:
         assert window.area == pytest.approx(WINDOW.area)
         assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h * 1.08**steps)
 
 
 def test_without_a_weight_of_the_extent_head_there_are_no_trials():
-    assert extent.trials(WINDOW, ExtentSettings(weight=0)) == {}
+    assert extent.trials(WINDOW, ExtentSettings(weight=0)) == []
 
 
 def test_the_cost_of_an_offset_is_quadratic_up_to_a_step_and_then_linear(rng):

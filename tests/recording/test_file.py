@@ -213,7 +213,7 @@ def test_another_program_tells_the_objects_apart_by_a_field_of_each_message(writ
     tracks = [json.loads(message.data) for _, channel, message in said if channel.topic == "tracks"]
     models = [msgpack.unpackb(message.data) for _, channel, message in said if channel.topic == "models"]
     assert [track["object"] for track in tracks] == ["anna", "ben"]
-    assert [(about, fields["object"]) for _, _, about, fields in models] == [("anna", "anna"), ("", "")]
+    assert [(about, fields["object"]) for _, _, about, _, fields in models] == [("anna", "anna"), ("", "")]
 
 
 @pytest.mark.parametrize("kind", [Features, Model])
@@ -223,7 +223,7 @@ def test_a_recording_of_an_earlier_protocol_is_an_error_of_one_line(written, kin
         file.truncate(Recording(path).size)
         file.seek(0, os.SEEK_END)
         file.write(pack(list(TOPICS).index(kind) + 1, 1, 0, msgpack.packb([2, kind.__name__.lower(), {}])))
-    with pytest.raises(RecordingError, match=r"cannot read: expected version 3 of the protocol, got 2") as raised:
+    with pytest.raises(RecordingError, match=r"cannot read: expected version 4 of the protocol, got 2") as raised:
         Recording(path)
     assert "\n" not in str(raised.value)
 

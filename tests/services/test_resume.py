@@ -28,7 +28,7 @@ histories = st.tuples(st.lists(positions, min_size=1, max_size=2), models, state
 
 def begin(history):
     received, model, desired = history
-    return start(received, model, desired, lambda _box, _first: STATE)
+    return start(received, model, desired, lambda _box, _first, _began: STATE)
 
 
 @given(histories)
@@ -93,7 +93,7 @@ def test_a_state_that_is_not_stored_is_made_of_the_last_and_the_first_box():
 
     position = Position(5, 4, {"anna": ObjectPosition(last, 1)})
     found = start([position], {"anna": model}, DesiredState({"anna": DesiredObject(first, begins=1)}), state_at)
-    assert (found.seq, found.objects, made) == (5, {"anna": (STATE, model)}, [(last, first)])
+    assert (found.seq, found.objects, made) == (5, {"anna": (STATE, model)}, [(last, first, 0)])
 
 
 def test_an_object_that_had_learned_nothing_beside_another_begins_anew_where_it_was_last():
@@ -101,7 +101,7 @@ def test_an_object_that_had_learned_nothing_beside_another_begins_anew_where_it_
     last = Box(5.0, 6.0, 30.0, 40.0)
     position = Position(5, 4, {"anna": ObjectPosition(BOX, 1, STATE), "ben": ObjectPosition(last)})
     desired = DesiredState({name: DesiredObject(BOX, begins=2) for name in ("anna", "ben")})
-    found = start([position], {"anna": model}, desired, lambda _box, _first: STATE)
+    found = start([position], {"anna": model}, desired, lambda _box, _first, _began: STATE)
     assert found.objects == {"anna": (STATE, model)}
     assert found.desired.objects["ben"] == DesiredObject(last, begins=6)
 
@@ -110,7 +110,7 @@ def test_an_object_that_was_forgotten_later_continues_until_then_in_the_order_of
     model = Model(1, 5, np.empty(0, np.float32), 0.0)
     parts = {"anna": ObjectPosition(BOX, 1, STATE), "ben": ObjectPosition(BOX, 1, STATE)}
     desired = DesiredState().begun("anna", BOX, 1).begun("ben", BOX, 2).without("anna", 8).begun("anna", BOX, 9)
-    found = start([Position(5, 4, parts)], dict.fromkeys(parts, model), desired, lambda _box, _first: STATE)
+    found = start([Position(5, 4, parts)], dict.fromkeys(parts, model), desired, lambda _box, _first, _began: STATE)
     assert list(found.objects) == ["anna", "ben"]
     assert found.desired == desired
     assert list(desired.objects_at(8)) == ["anna", "ben"]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from catstream.compression.tree import TREES
+from catstream.compression.tree import REDUCTIONS
 from catstream.errors import SettingsError
 from catstream.heads import APPEARANCE
 from catstream.messages import Features, ObjectFeatures, TrainingRows
@@ -34,7 +34,7 @@ def run(rng):
     return [message(rng, frame, second if CHANGE <= frame < CHANGE + 10 else first) for frame in range(60)]
 
 
-@pytest.mark.parametrize("reduction", TREES)
+@pytest.mark.parametrize("reduction", REDUCTIONS)
 def test_a_frame_is_new_if_the_object_has_not_looked_so_before(run, reduction):
     frames = taught_frames(run, CoresetSettings(size=8, reduction=reduction))[""]
     novelties = [frame.novelty for frame in frames]
@@ -43,9 +43,9 @@ def test_a_frame_is_new_if_the_object_has_not_looked_so_before(run, reduction):
     assert max(novelties[1:CHANGE] + novelties[CHANGE + 1 :]) < 0.1
 
 
-@pytest.mark.parametrize("reduction", TREES)
+@pytest.mark.parametrize("reduction", REDUCTIONS)
 def test_novelty_is_the_energy_outside_the_span_of_the_tree(rng, reduction):
-    tree, rows = TREES[reduction](8), rng.normal(size=(50, WIDTH)).astype(np.float32)
+    tree, rows = REDUCTIONS[reduction](8), rng.normal(size=(50, WIDTH)).astype(np.float32)
     novelty = Novelty(tree)
     for row in rows[:, None]:
         outside = row

@@ -38,9 +38,9 @@ def test_the_same_sample_gives_the_same_bits(sample):
 
 
 def test_a_model_does_not_depend_on_the_samples_before_it(sample, rng):
-    rows = rng.normal(size=sample.trees["size"].rows.shape).astype(np.float32)
+    rows = rng.normal(size=sample.trees["extent"].rows.shape).astype(np.float32)
     other = dataclasses.replace(
-        sample, trees=sample.trees | {"size": dataclasses.replace(sample.trees["size"], rows=rows)}
+        sample, trees=sample.trees | {"extent": dataclasses.replace(sample.trees["extent"], rows=rows)}
     )
     trainer = Trainer(Settings())
     for each in (sample, other, dataclasses.replace(other, object="anna"), other, sample):
@@ -59,7 +59,7 @@ def test_centres_give_a_motion(sample):
 
 def test_the_sum_of_score_and_extent_predicts_how_well_a_cut_fits(sample, rng):
     x, fits = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=40)
-    rows = np.column_stack([x, np.ones(40), fits]).astype(np.float32)
+    rows = np.column_stack([x, np.ones(40), fits, np.full((40, 2), 0.5)]).astype(np.float32)
     cuts = Summary(rows, rows.mean(axis=0), 40, (0,))
     model = Trainer(Settings()).train(dataclasses.replace(sample, trees=sample.trees | {"extent": cuts}))
     together = x @ (model.weights + model.heads["extent"])
@@ -68,12 +68,13 @@ def test_the_sum_of_score_and_extent_predicts_how_well_a_cut_fits(sample, rng):
 
 @pytest.mark.parametrize("name", ["size", "aspect"])
 def test_the_heads_of_size_and_aspect_predict_their_label(sample, rng, name):
-    x, labels = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=40)
+    x, labels = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=(40, 3))
     rows = np.column_stack([x, np.ones(40), labels]).astype(np.float32)
     model = Trainer(Settings()).train(
-        dataclasses.replace(sample, trees=sample.trees | {name: Summary(rows, rows.mean(axis=0), 40, (0,))})
+        dataclasses.replace(sample, trees=sample.trees | {"extent": Summary(rows, rows.mean(axis=0), 40, (0,))})
     )
-    np.testing.assert_allclose(x @ model.heads[name] + model.biases[name], labels, atol=1e-2)
+    label = labels[:, ["extent", "size", "aspect"].index(name)]
+    np.testing.assert_allclose(x @ model.heads[name] + model.biases[name], label, atol=1e-2)
 
 
 def test_an_object_like_the_background_is_rejected(sample):

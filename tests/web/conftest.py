@@ -41,13 +41,13 @@ class Facts:
     """Messages about frame after frame, of one object or of several."""
 
     @staticmethod
-    def track(frame, version=1, state="present", score=0.75, name=""):
+    def track(frame, version=1, state="present", score=0.75, name="", began=0):
         box = None if state == "absent" else Box(4.0, 3.0, 20.0, 10.0)
-        return Track(frame + 1, frame, frame / 10, state, box, score, version, None, name)
+        return Track(frame + 1, frame, frame / 10, state, box, score, version, None, name, began)
 
     @staticmethod
-    def model(version, frame, name=""):
-        return Model(version, frame, np.ones(2, np.float32), 0.0, object=name)
+    def model(version, frame, name="", began=0):
+        return Model(version, frame, np.ones(2, np.float32), 0.0, object=name, began=began)
 
     @staticmethod
     def features(frame, wrong, *names):

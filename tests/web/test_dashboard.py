@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from catstream.colours import PALETTE
-from catstream.heads import HEADS
+from catstream.heads import TREES
 from catstream.messages import End, Health
 from catstream.web.dashboard import Dashboard
 
@@ -88,14 +88,17 @@ def test_a_silent_process_is_not_listed(dashboard):
     assert dashboard.updates(told)["status"]["processes"] == []
 
 
-def test_the_last_health_report_of_a_pipeline_does_not_belong_to_the_next_one(dashboard):
-    dashboard.take(Health("detector", 1.0, {"sent": 7.0}), 9.0)
-    dashboard.take(End(2, "the source has ended"), 10.0)
-    dashboard.take(Health("detector", 1.0, {"sent": 8.0}), 10.5)
-    dashboard.take(Health("compressor", 1.0, {}), 10.6)
+def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, facts):
+    dashboard.take(Health("detector", 1.0, {"sent": 7.0}), 9.0, "one")
+    dashboard.take(End(2, "the source has ended"), 10.0, "one")
+    dashboard.take(Health("detector", 1.0, {"sent": 8.0}), 10.5, "one")
+    dashboard.take(Health("compressor", 1.0, {}), 30.0, "one")
     assert dashboard.phase == "ended"
-    dashboard.take(Health("compressor", 2.0, {}), 20.0)
+    dashboard.take(Health("compressor", 2.0, {}), 30.1, "two")
     assert dashboard.phase == "running"
+    dashboard.take(facts.track(90, name="anna"), 30.2, "one")
+    dashboard.take(End(2, "the source has ended"), 30.3, "one")
+    assert (dashboard.phase, names(dashboard)) == ("running", [])
 
 
 def test_the_trees_of_the_last_health_report_are_shown_after_the_end(dashboard):
@@ -103,7 +106,7 @@ def test_the_trees_of_the_last_health_report_are_shown_after_the_end(dashboard):
     dashboard.take(learning({"object_leaves": 3.0, "rows": 200.0}), 10.1)
     dashboard.mark_silent("no pipeline is running")
     trees = dashboard.updates({})["trees"]["objects"][""]
-    assert (trees["leaves"], trees["rows"]) == ([3.0, *[0.0] * (len(HEADS) - 1)], 200.0)
+    assert (trees["leaves"], trees["rows"]) == ([3.0, *[0.0] * (len(TREES) - 1)], 200.0)
 
 
 def learning(counters):
@@ -111,17 +114,17 @@ def learning(counters):
     return Health("compressor", 1.0, counters, objects={"": counters})
 
 
-def followed(dashboard, facts, endpoint):
+def followed(dashboard, facts, endpoint, run="one"):
     """Show a page all of a pipeline; what the page was told."""
     told = {}
     dashboard.attach(endpoint)
-    dashboard.take(Health("detector", 1.0, {"sent": 9.0}, source="first.mp4"), 0.0)
-    dashboard.take(learning({"object_leaves": 3.0, "rows": 90.0}), 0.0)
+    dashboard.take(Health("detector", 1.0, {"sent": 9.0}, source="first.mp4"), 0.0, run)
+    dashboard.take(learning({"object_leaves": 3.0, "rows": 90.0}), 0.0, run)
     for frame in (50, 51):
-        dashboard.take(facts.track(frame, version=5), frame / 10)
-        dashboard.take(facts.model(5, frame=50), frame / 10)
-        dashboard.take(facts.features(frame, wrong=1.0), frame / 10)
-        dashboard.take(facts.preview(frame), frame / 10)
+        dashboard.take(facts.track(frame, version=5), frame / 10, run)
+        dashboard.take(facts.model(5, frame=50), frame / 10, run)
+        dashboard.take(facts.features(frame, wrong=1.0), frame / 10, run)
+        dashboard.take(facts.preview(frame), frame / 10, run)
     assert dashboard.updates(told)["surprising"]["frames"]
     return told
 
@@ -134,9 +137,9 @@ FIRST_SIGNS = {
     ),
     "its track at another endpoint": ("b", False, lambda facts: facts.track(70, version=9)),
     "its track at the same endpoint after the end": ("a", True, lambda facts: facts.track(70, version=9)),
-    "its health at the same endpoint after the end": ("a", True, lambda _: Health("detector", 2.0, {"sent": 0.0})),
-    "its trees at the same endpoint after the end": ("a", True, lambda _: Health("compressor", 2.0, {"rows": 0.0})),
-    "its first track at the same endpoint": ("a", False, lambda facts: facts.track(0, version=0)),
+    "its health at the same endpoint after the end": ("a", True, lambda _: Health("detector", 2.0, {"sent": 90.0})),
+    "its trees at the same endpoint after the end": ("a", True, lambda _: Health("compressor", 2.0, {"rows": 900.0})),
+    "a later track at the same endpoint": ("a", False, lambda facts: facts.track(70, version=9)),
 }
 
 
@@ -144,11 +147,11 @@ FIRST_SIGNS = {
 def test_all_state_is_dropped_when_another_pipeline_appears(dashboard, facts, endpoint, ended, sign):
     told = followed(dashboard, facts, "a")
     if ended:
-        dashboard.take(End(52, "the source has ended"), 6.0)
+        dashboard.take(End(52, "the source has ended"), 6.0, "one")
     dashboard.attach(endpoint)
     assert dashboard.endpoint == "a"
     assert not set(dashboard.updates(told)) - {"status"}, "nothing goes before the other one is seen"
-    dashboard.take(sign(facts), 6.1)
+    dashboard.take(sign(facts), 6.1, "two")
     parts = dashboard.updates(told)
     assert next(iter(parts)) == "pipeline", "a page clears what it shows before it takes the rest"
     assert (parts["status"]["phase"], parts["status"]["endpoint"]) == ("running", endpoint)
@@ -163,32 +166,32 @@ def test_all_state_is_dropped_when_another_pipeline_appears(dashboard, facts, en
 def test_frames_of_another_pipeline_are_not_measured_by_the_model_of_the_one_before(dashboard, facts):
     followed(dashboard, facts, "a")
     dashboard.attach("b")
-    dashboard.take(facts.track(0, version=0, state="bootstrapping"), 6.0)
-    dashboard.take(facts.features(0, wrong=1.0), 6.0)
-    dashboard.take(facts.preview(0), 6.0)
+    dashboard.take(facts.track(0, version=0, state="bootstrapping"), 6.0, "two")
+    dashboard.take(facts.features(0, wrong=1.0), 6.0, "two")
+    dashboard.take(facts.preview(0), 6.0, "two")
     assert dashboard.surprising.measured == 0
 
 
 def test_frames_of_another_object_are_not_measured_by_the_model_of_the_one_before(dashboard, facts):
     followed(dashboard, facts, "a")
-    dashboard.take(facts.track(60, version=0, state="bootstrapping"), 6.0)
+    dashboard.take(facts.track(60, version=0, state="bootstrapping", began=60), 6.0)
     dashboard.take(facts.model(6, frame=55), 6.0)
     dashboard.take(facts.features(60, wrong=1.0), 6.0)
     dashboard.take(facts.preview(60), 6.0)
     assert dashboard.surprising.measured == 0
-    dashboard.take(facts.model(7, frame=61), 6.0)
+    dashboard.take(facts.model(7, frame=61, began=60), 6.0)
     dashboard.take(facts.features(61, wrong=1.0), 6.0)
     dashboard.take(facts.preview(61), 6.0)
     assert dashboard.surprising.measured == 1
 
 
 def test_another_run_begins_with_no_surprising_frames(dashboard, facts):
-    dashboard.take(facts.track(0, version=5), 0.0)
-    dashboard.take(facts.model(5, frame=0), 0.0)
-    dashboard.take(facts.features(0, wrong=1.0), 0.0)
-    dashboard.take(facts.preview(0), 0.0)
+    dashboard.take(facts.track(0, version=5), 0.0, "one")
+    dashboard.take(facts.model(5, frame=0), 0.0, "one")
+    dashboard.take(facts.features(0, wrong=1.0), 0.0, "one")
+    dashboard.take(facts.preview(0), 0.0, "one")
     assert [one["frame"] for one in dashboard.updates({})["surprising"]["frames"]] == [0]
-    dashboard.take(facts.track(0, version=0, state="bootstrapping"), 5.0)
+    dashboard.take(facts.track(0, version=0, state="bootstrapping"), 5.0, "two")
     assert dashboard.updates({})["surprising"]["frames"] == []
 
 
@@ -283,10 +286,10 @@ def test_another_object_of_the_same_name_does_not_clear_the_others(dashboard, fa
         dashboard.take(facts.track(5, name=name, version=3), 0.0)
     dashboard.take(facts.features(5, 1.0, "anna", "ben"), 0.0)
     dashboard.take(facts.preview(5, "anna", "ben"), 0.0)
-    dashboard.take(facts.track(6, name="anna", version=0, state="bootstrapping"), 0.1)
+    dashboard.take(facts.track(6, name="anna", version=7, began=6), 0.1)
     assert [one["object"] for one in dashboard.updates({})["surprising"]["frames"]] == ["ben"]
     dashboard.take(facts.model(4, 5, "anna"), 0.2)
-    assert dashboard.objects.shown["anna"].model is None, "a model of frames before it is of the object before it"
+    assert dashboard.objects.shown["anna"].model is None, "it is of the object before"
 
 
 @given(

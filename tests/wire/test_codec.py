@@ -61,14 +61,12 @@ def summary(columns: int) -> Summary:
 MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
 WINDOWS = Window(4.0, 2.0, 25.0, 12.5), Window(4.5, 2.0, 25.0, 12.5), Window(9.0, 2.0, 25.0, 12.5)
 DETECTOR = DetectorState(3, "weak", *WINDOWS, False, 2, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
-TRAINING = TrainingRows(array(3, 5), array(3), array(3))
+TRAINING = TrainingRows(array(3, 5), array(3), array(3), array(3, 2))
 TREES = {
     "object": summary(5),
     "background": summary(5),
     "loss": summary(7),
-    "extent": summary(7),
-    "size": summary(7),
-    "aspect": summary(7),
+    "extent": summary(9),
 }
 BOX = Box(4.5, 3.0, 20.0, 10.0)
 TRACK = Track(3, 2, 0.08, "present", BOX, 0.75, 4, 1234.5, "anna")
@@ -139,7 +137,7 @@ FUZZ = settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
 def packed(kind: str, **changes: object) -> bytes:
     """An example as bytes, with some of its fields replaced on the wire."""
     about = getattr(EXAMPLES[kind], "object", "")
-    return msgpack.packb([VERSION, kind, about, fields_of(kind) | changes])
+    return msgpack.packb([VERSION, kind, about, "a run", fields_of(kind) | changes])
 
 
 def fields_of(kind: str) -> dict[str, Any]:
@@ -304,14 +302,14 @@ REJECTED = {
     "training rows of no group": of_anna(training={"unknown": {}}),
     "a name that is no name": packed("features", objects={"an na": {}}),
     "a track of a name that is no name": msgpack.packb(
-        [VERSION, "track", "../x", fields_of("track") | {"object": "../x"}]
+        [VERSION, "track", "../x", "", fields_of("track") | {"object": "../x"}]
     ),
-    "another object in the envelope": msgpack.packb([VERSION, "track", "ann", fields_of("track")]),
+    "another object in the envelope": msgpack.packb([VERSION, "track", "ann", "", fields_of("track")]),
     "an object in the envelope, and none in the fields": msgpack.packb(
-        [VERSION, "stored", "anna", fields_of("stored")]
+        [VERSION, "stored", "anna", "", fields_of("stored")]
     ),
-    "lists in lists, as object": b"\x94\x03\xa3end" + b"\x91" * 1015 + b"\x90\x80",
-    "a number as object": msgpack.packb([VERSION, "track", 1, fields_of("track") | {"object": 1}]),
+    "lists in lists, as object": b"\x95\x04\xa3end" + b"\x91" * 1015 + b"\x90\xa0\x80",
+    "a number as object": msgpack.packb([VERSION, "track", 1, "", fields_of("track") | {"object": 1}]),
     "more objects than a map may have": packed("stored", versions={f"o{i}": 1 for i in range(257)}),
     "rows of another width in another group": retrained(rows=plain("<f4", [3, 4], bytes(48))),
     "a picture that is no JPEG": packed("preview", jpeg=b"<svg onload=...>"),
@@ -323,26 +321,27 @@ REJECTED = {
     "a negative seq": packed("track", seq=-1),
     "a seq above 2**53": packed("track", seq=2**53 + 1),
     "a text for a number": packed("track", score="0.5"),
-    "a missing field": msgpack.packb([VERSION, "track", "", {"seq": 1}]),
-    "another version": msgpack.packb([VERSION + 1, "track", "", {}]),
-    "a kind that does not exist": msgpack.packb([VERSION, "orders", "", {}]),
+    "a missing field": msgpack.packb([VERSION, "track", "", "", {"seq": 1}]),
+    "another version": msgpack.packb([VERSION + 1, "track", "", "", {}]),
+    "a kind that does not exist": msgpack.packb([VERSION, "orders", "", "", {}]),
+    "a number as run": msgpack.packb([VERSION, "end", "", 7, fields_of("end")]),
     "no envelope": msgpack.packb({"seq": 1}),
     "nothing": b"",
     "half a message": encode(EXAMPLES["features"])[:-20],
     "more than a message": encode(EXAMPLES["track"]) + b"\x00",
-    "a name twice in a map": b"\x94\x03\xa3end\xa0\x82\xa3seq\x01\xa3seq\x02",
-    "a map of bytes": b"\x94\x03\xa3end\xa0\x82\xc4\x03seq\x01\xa6reason\xa1x",
-    "a list of four thousand million": b"\x94\x03\xa3end\xa0\xdd\xff\xff\xff\xff",
-    "a map of four thousand million": b"\x94\x03\xa3end\xa0\xdf\xff\xff\xff\xff",
-    "bytes of four gigabytes": b"\x94\x03\xa3end\xa0\xc6\xff\xff\xff\xff",
-    "a text of four gigabytes": b"\x94\x03\xdb\xff\xff\xff\xff",
-    "a list longer than any message's": msgpack.packb([VERSION, "end", "", [None] * 257]),
+    "a name twice in a map": b"\x95\x04\xa3end\xa0\xa0\x82\xa3seq\x01\xa3seq\x02",
+    "a map of bytes": b"\x95\x04\xa3end\xa0\xa0\x82\xc4\x03seq\x01\xa6reason\xa1x",
+    "a list of four thousand million": b"\x95\x04\xa3end\xa0\xa0\xdd\xff\xff\xff\xff",
+    "a map of four thousand million": b"\x95\x04\xa3end\xa0\xa0\xdf\xff\xff\xff\xff",
+    "bytes of four gigabytes": b"\x95\x04\xa3end\xa0\xa0\xc6\xff\xff\xff\xff",
+    "a text of four gigabytes": b"\x95\x04\xdb\xff\xff\xff\xff",
+    "a list longer than any message's": msgpack.packb([VERSION, "end", "", "", [None] * 257]),
     "a reason longer than a page": packed("end", reason="x" * 4097),
-    "an extension type": b"\x94\x03\xa3end\xa0\xd4\x05\x00",
-    "a timestamp": b"\x94\x03\xa3end\xa0\xd6\xff\x00\x00\x00\x00",
-    "lists in lists, as version": b"\x94" + b"\x91" * 1015 + b"\x90\xa3end\xa0\x80",
-    "lists in lists, as kind": b"\x94\x03" + b"\x91" * 1015 + b"\x90\xa0\x80",
-    "lists in lists, as fields": b"\x94\x03\xa3end\xa0" + b"\x91" * 1015 + b"\x90",
+    "an extension type": b"\x95\x04\xa3end\xa0\xa0\xd4\x05\x00",
+    "a timestamp": b"\x95\x04\xa3end\xa0\xa0\xd6\xff\x00\x00\x00\x00",
+    "lists in lists, as version": b"\x95" + b"\x91" * 1015 + b"\x90\xa3end\xa0\xa0\x80",
+    "lists in lists, as kind": b"\x95\x04" + b"\x91" * 1015 + b"\x90\xa0\xa0\x80",
+    "lists in lists, as fields": b"\x95\x04\xa3end\xa0\xa0" + b"\x91" * 1015 + b"\x90",
     "lists in lists without end": b"\x91" * 100_000,
 }
 
@@ -402,14 +401,15 @@ def decoded_or_refused(data: bytes) -> None:
 @FUZZ
 @given(st.sampled_from(ALL), st.data())
 def test_any_value_in_any_field_arrives_whole_or_is_rejected(kind, data):
-    version, name, about, sent = msgpack.unpackb(encode(data.draw(messages(kind))))
+    version, name, about, run, sent = msgpack.unpackb(encode(data.draw(messages(kind))))
     place = sent
     while isinstance(inner := place[key := data.draw(st.sampled_from(sorted(place)))], dict) and inner:
         if data.draw(st.booleans()):
             break
         place = inner
     place[key] = data.draw(VALUES)
-    decoded_or_refused(msgpack.packb([version, name, data.draw(st.just(about) | VALUES), sent]))
+    about, run = data.draw(st.just(about) | VALUES), data.draw(st.just(run) | VALUES)
+    decoded_or_refused(msgpack.packb([version, name, about, run, sent]))
 
 
 @FUZZ

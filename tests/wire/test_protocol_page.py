@@ -17,7 +17,7 @@ import msgpack
 import pytest
 
 from catstream.box import Box, Window
-from catstream.heads import HEADS
+from catstream.heads import TREES
 from catstream.messages import (
     DetectorState,
     End,
@@ -107,13 +107,17 @@ def names_of(named):
     return ", ".join(f"`{name}`" + (" (always)" if name in named.required else "") for name in named.columns)
 
 
+def used(tree):
+    return ", ".join(f"`heads.{head.name}`" for head in tree.heads if not head.adds_to_score) or "score"
+
+
 def heads_table():
     rows = [
-        f"| `{name}` | `{head.group}` | {'all' if head.label is None else f'label {head.label:g}'} | "
-        f"{'d + 2' if head.more_columns else 'd'} | {'score' if head.adds_to_score else f'`heads.{name}`'} |\n"
-        for name, head in HEADS.items()
+        f"| `{name}` | `{tree.group}` | {'all' if tree.label is None else f'label {tree.label:g}'} | "
+        f"{f'd + {tree.more_columns}' if tree.more_columns else 'd'} | {used(tree)} |\n"
+        for name, tree in TREES.items()
     ]
-    head = "| head | group of training rows | rows | columns of its tree | adds to |\n| --- | --- | --- | --- | --- |\n"
+    head = "| tree | group of training rows | rows | columns | used for |\n| --- | --- | --- | --- | --- |\n"
     return head + "".join(rows)
 
 
@@ -142,7 +146,7 @@ def test_the_table_of_a_message_agrees_with_its_schema(kind):
 
 
 def test_the_table_of_heads_is_that_of_the_library():
-    assert heads_table() in PAGE, "docs/protocol.md is not the table of heads: run `make protocol`"
+    assert heads_table() in PAGE, "docs/protocol.md is not the table of trees: run `make protocol`"
 
 
 def test_the_limits_are_those_of_the_codec():
@@ -197,4 +201,4 @@ def heard(stream):
 if __name__ == "__main__":
     for kind in MESSAGES:
         PAGE = section(kind).sub(lambda found, kind=kind: found[1] + table(kind), PAGE)
-    PATH.write_text(re.sub(r"^\| head \|.*\n(\|.*\n)+", lambda _: heads_table(), PAGE, flags=re.MULTILINE))
+    PATH.write_text(re.sub(r"^\| tree \|.*\n(\|.*\n)+", lambda _: heads_table(), PAGE, flags=re.MULTILINE))

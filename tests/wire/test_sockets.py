@@ -294,7 +294,7 @@ JUNK = [
     [b"not msgpack"],
     [b"", b"two parts"],
     [encode(Health("trainer", 0.0))],
-    [b"\x94\x03" + b"\x91" * 1015 + b"\x90\xa0\x80"],
+    [b"\x95\x04" + b"\x91" * 1015 + b"\x90\xa0\xa0\x80"],
 ]
 
 

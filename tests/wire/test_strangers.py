@@ -46,8 +46,8 @@ def features(seq, width=5, rows=3):
 
 def changed(message, **fields):
     """A message as bytes, with some of its fields replaced on the wire."""
-    version, kind, about, plain = msgpack.unpackb(encode(message))
-    return msgpack.packb([version, kind, about, plain | fields])
+    *envelope, plain = msgpack.unpackb(encode(message))
+    return msgpack.packb([*envelope, plain | fields])
 
 
 def retrained(**arrays):
@@ -67,7 +67,7 @@ def rows(dtype, shape, number=1.0):
 WRONG = {
     "msgpack": [b"GET / HTTP/1.1"],
     "envelope": [msgpack.packb({"seq": 1})],
-    "version": [msgpack.packb([VERSION - 1, "features", {}])],
+    "version": [msgpack.packb([VERSION - 1, "features", "", "", {}])],
     "kind": [encode(Health("trainer", 0.0))],
     "type": [changed(features(1), seq="1")],
     "dtype": [retrained(rows=rows("<f8", [3, 5]))],

@@ -12,7 +12,7 @@ export class Trees {
     this.element = element;
     this.kept = kept;
     this.trees = [];
-    this.part = { heads: [], objects: {} };
+    this.part = { kinds: [], objects: {} };
     this.name = null;
   }
 
@@ -23,12 +23,12 @@ export class Trees {
     this.show(this.part);
   }
 
-  /** Show the trees of the chosen object, by the table of heads: a figure for each, made when it is first received. */
+  /** Show the trees of the chosen object, by the table of trees: a figure for each, made when it is first received. */
   show(part) {
     this.part = part;
     const { leaves = [], rows = 0, bytes = 0 } = part.objects[this.name] ?? {};
     this.kept.textContent = rows ? `${rows.toLocaleString("en")} rows in ${(bytes / 1e6).toFixed(1)} MB.` : "";
-    for (const [place, { title, meaning }] of part.heads.entries()) {
+    for (const [place, { title, meaning }] of part.kinds.entries()) {
       const tree = this.trees[place] ??= this.add(title, meaning, TONES[place % TONES.length]);
       const count = leaves[place] ?? 0;
       if (count !== tree.leaves) this.draw(tree, count);
