@@ -159,4 +159,5 @@ def prints_well_and_is_ready_for_json(track):
         "model_version": 0,
         "pts": None,
         "object": "",
+        "began": 0,
     }
