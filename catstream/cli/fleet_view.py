@@ -35,10 +35,10 @@ def view(fleet: str, keys: str, listen: Address, token: str | None) -> None:
     that of catstream view. If the fleet does not answer, the page keeps its
     last state and waits. Ctrl-C ends the server; the fleet continues.
 
-    The printed addresses end with a token: open one of them, and the browser
-    keeps it. Without a token the page is closed, also to other users of this
-    machine. The connection is not encrypted: use an ssh tunnel, or a proxy with
-    TLS.
+    Only who has the token may watch and steer: open the printed link, which
+    ends with it. Each start makes a new token; give one of your own to keep
+    it, for example for Prometheus. The connection is not encrypted: from
+    other machines, use an ssh tunnel, or a proxy with TLS.
 
     \b
     Serves
@@ -52,7 +52,8 @@ def view(fleet: str, keys: str, listen: Address, token: str | None) -> None:
     EXAMPLES
       catstream fleet view
       catstream fleet view --fleet head.example.org:5690 --keys my-keys
-      VIEW_TOKEN=$(openssl rand -hex 16) catstream fleet view --listen 0.0.0.0:8000
+      catstream fleet view --listen 0.0.0.0:8000
+      VIEW_TOKEN_FILE=my-token catstream fleet view
     """
     from catstream.web.fleet_app import fleet_site
     from catstream.web.server import Server

@@ -18,7 +18,6 @@ __all__ = ["PORT", "Address", "AddressType", "with_token"]
 PORT = 8000
 
 _LARGEST_PORT = 65535
-_TOKEN_BYTES = 16  # of a token that is made here
 
 
 class Address(NamedTuple):
@@ -45,9 +44,9 @@ class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since c
 
 
 def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add --PREFIXtoken, --PREFIXtoken-file and --no-PREFIXtoken; the command gets `token`, a text or None.
+    """Add --PREFIXtoken, --PREFIXtoken-file and --no-PREFIXtoken; the command gets one argument `token`.
 
-    If none of them is given, a new token is made.
+    It is the given token, a new random one if none is given, or None with --no-PREFIXtoken.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -57,8 +56,7 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
             envvar="VIEW_TOKEN",
             show_envvar=True,
             metavar="TOKEN",
-            help="Token for access to the page, at least 16 characters; by default a new one, at the end of the "
-            "printed address.",
+            help="Token for access to the page, at least 16 characters; by default a random one.",
         )
         @click.option(
             f"--{prefix}token-file",
@@ -73,7 +71,7 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
             f"--no-{prefix}token",
             "no_token",
             is_flag=True,
-            help="Without a token: every user and program of this machine may watch the page and give commands.",
+            help="Serve the page without a token: every user of this machine can watch the pictures and steer.",
         )
         @functools.wraps(command)
         def with_one(
@@ -81,8 +79,11 @@ def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[...
         ) -> None:
             given = token or (_read(token_file) if token_file else None)
             if no_token and given:
-                raise click.UsageError(f"a token and --no-{prefix}token were given: give one of them")
-            command(*args, token=None if no_token else given or secrets.token_urlsafe(_TOKEN_BYTES), **others)
+                raise click.UsageError(
+                    f"--no-{prefix}token contradicts the token of --{prefix}token, --{prefix}token-file, VIEW_TOKEN or "
+                    "VIEW_TOKEN_FILE: leave out one of them"
+                )
+            command(*args, token=None if no_token else given or secrets.token_hex(16), **others)
 
         return with_one
 

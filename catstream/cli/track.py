@@ -142,7 +142,7 @@ def track(
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
       catstream track 0 --view
-      VIEW_TOKEN=$(openssl rand -hex 16) catstream track 0 --view 0.0.0.0:8000
+      catstream track 0 --view 0.0.0.0:8000
       catstream track walk.mp4 --box 120,80,64,48 --output out --state checkpoints
       catstream track --resume checkpoints
     """
@@ -246,7 +246,7 @@ def _serve(pipeline: Pipeline, view: Address, token: str | None, console: Consol
     server = Server(site, host=view.host, port=view.port, token=token)
     stack.enter_context(server.in_background())
     for url in server.urls:
-        console.print(f"page: {url}", highlight=False)
+        console.print(f"page: {url}", highlight=False, soft_wrap=True)
 
 
 def _write_tracks(

@@ -32,10 +32,10 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
     the page waits for the next one. Ctrl-C ends the server; the pipeline
     continues.
 
-    The printed addresses end with a token: open one of them, and the browser
-    keeps it. Without a token the page is closed, also to other users of this
-    machine. The connection is not encrypted: use an ssh tunnel, or a proxy with
-    TLS.
+    Only who has the token may watch and steer: open the printed link, which
+    ends with it. Each start makes a new token; give one of your own to keep
+    it, for example for Prometheus. The connection is not encrypted: from
+    other machines, use an ssh tunnel, or a proxy with TLS.
 
     \b
     Serves
@@ -49,7 +49,8 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
     EXAMPLES
       catstream view
       catstream view --endpoint run --port 8080
-      VIEW_TOKEN=$(openssl rand -hex 16) catstream view --host 0.0.0.0
+      catstream view --host 0.0.0.0
+      VIEW_TOKEN_FILE=my-token catstream view
     """
     from catstream.web.app import pipeline_site
     from catstream.web.server import Server

@@ -6,10 +6,9 @@ import hashlib
 import hmac
 from collections import OrderedDict
 from collections.abc import Callable
-from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from time import monotonic
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, urlencode, urlsplit
 
 from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
@@ -20,9 +19,11 @@ from catstream.errors import ServiceError
 
 __all__ = ["Guard", "TokenBucket", "body_of", "is_loopback", "too_many"]
 
-_COOKIE = "catstream"  # and the port: a browser sends cookies to all ports of a host
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
 _PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline runs
+
+_NEEDED = "a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN\n"
+_WRONG = "this is not the token that this page was started with\n"
 
 _MIN_TOKEN_LENGTH = 16
 _MAX_BODY = 4096  # bytes
@@ -65,10 +66,10 @@ class TokenBucket:
 class Guard:
     """ASGI middleware that checks each request before an application receives it.
 
-    Without a token, only requests to a loopback host name are answered; this prevents DNS rebinding. With a token, a
-    request must have it as `Authorization: Bearer TOKEN` or as the cookie that `POST /login` sets. Requests that change
-    something must come from a page of the same origin, or from a program, which sends no Origin header; this prevents
-    CSRF.
+    With a token, a request must have it as `?token=TOKEN`, as `Authorization: Bearer TOKEN`, or as the cookie that a
+    page sets if it is opened with `?token=TOKEN`. Without a token, only requests to a loopback host name are answered;
+    this prevents DNS rebinding. Requests that change something must come from a page of the same origin, or from a
+    program, which sends no Origin header; this prevents CSRF.
 
     Parameters
     ----------
@@ -104,59 +105,47 @@ class Guard:
         answer: ASGIApp = self._reject_foreign(request) or self._app
         path = scope["path"]  # as in the routes; `request.url` depends on the client's Host header
         if answer is self._app and self._token_digest is not None and not path.startswith(_PUBLIC_PATHS):
-            if (request.method, path) == ("POST", "/login"):
-                answer = await self._log_in(request)
-            else:
-                answer = self._reject_without_token(request) or self._app
+            answer = self._check_token(request) or self._app
         await answer(scope, receive, send_with_headers)
 
     def _reject_foreign(self, request: Request) -> Response | None:
         """Return an error if the host name or the origin of a request is not that of this server."""
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
-        if self._token_digest is None and not is_loopback(_host_name(host)):
+        if self._token_digest is None and not is_loopback(_split(request).hostname or ""):
             return PlainTextResponse(f"this page is at http://127.0.0.1, not at {host!r}\n", 421)
         if request.method not in ("GET", "HEAD") and origin is not None and origin.partition("://")[2] != host:
             return PlainTextResponse(f"rejected: the request comes from a page of another origin, {origin!r}\n", 403)
         return None
 
-    def _reject_without_token(self, request: Request) -> Response | None:
-        """Return an error if a request has no token or a wrong one."""
-        shown = _credential(request)
-        if shown is not None:
-            return self._reject_wrong_token(shown, request)
-        if request.scope["path"].endswith("/"):  # a page
-            return FileResponse(_LOGIN_PAGE, 401)
-        return PlainTextResponse("a token is needed: Authorization: Bearer TOKEN\n", 401)
-
-    async def _log_in(self, request: Request) -> Response:
-        """Set the cookie and redirect to the page if the posted token is correct."""
-        body = await body_of(request)
-        token = parse_qs(body.decode(errors="replace")).get("token", [""])[0] if body else ""
-        wrong = self._reject_wrong_token(_digest(token.strip()), request)
-        if wrong is not None:
-            return wrong
-        answer = RedirectResponse("/", 303)
-        secure = request.headers.get("origin", "").startswith("https:")
-        name, value = _cookie_of(request.scope), self._token_digest or ""
-        answer.set_cookie(name, value, httponly=True, samesite="lax", secure=secure)
-        return answer
-
-    def _reject_wrong_token(self, shown: str, request: Request) -> Response | None:
-        """Return an error for a wrong token, None for the correct one.
+    def _check_token(self, request: Request) -> Response | None:
+        """Return the answer to a request without the token, or to a page that is opened with it in its URL.
 
         The correct token is never rate-limited: behind a proxy all clients have the same address, and wrong tokens of
         one client must not lock out the others. The token is protected by its length; the limit only saves work.
         """
-        if hmac.compare_digest(shown.encode(), (self._token_digest or "").encode()):
-            return None
+        page, name = request.scope["path"].endswith("/"), _cookie_name(request)
+        in_url, cookie = request.query_params.get("token"), request.cookies.get(name)
+        kind, _, in_header = request.headers.get("authorization", "").partition(" ")
+        given = in_url or (in_header if kind.lower() == "bearer" else None)
+        shown = cookie if given is None else _digest(given.strip())
+        if shown is not None and hmac.compare_digest(shown.encode(), (self._token_digest or "").encode()):
+            return _enter(request, name, shown) if in_url and page and request.method == "GET" else None
+        if shown is not None and (wait := self._count_guess(request)):
+            return too_many(wait)
+        if page and given is None:  # with a cookie: that of a server that ran here before
+            return FileResponse(_LOGIN_PAGE, 401)
+        return PlainTextResponse(_NEEDED if given is None else _WRONG, 401)
+
+    def _count_guess(self, request: Request) -> float:
+        """Count a wrong token; return the seconds to wait, if there were too many from this address."""
         address, now = request.client.host if request.client else "", self._clock()
         guesses = self._guesses.setdefault(address, TokenBucket(_MAX_GUESSES, _GUESSES_PER_SECOND))
         if len(self._guesses) > _ADDRESSES:
             self._guesses.popitem(last=False)
-        if wait := guesses.wait(now):
-            return too_many(wait)
-        guesses.take()
-        return PlainTextResponse("this is not the token that this page was started with\n", 401)
+        wait = guesses.wait(now)
+        if not wait:
+            guesses.take()
+        return wait
 
 
 async def body_of(request: Request) -> bytes | None:
@@ -179,30 +168,30 @@ def is_loopback(host: str) -> bool:
     return host in ("127.0.0.1", "::1", "localhost")
 
 
-def _host_name(host: str) -> str:
-    """Return the host of a Host header without the port."""
+def _split(request: Request) -> SplitResult:
+    """Return the Host header, with the attributes `hostname` and `port`."""
     try:
-        return urlsplit(f"//{host}").hostname or ""
+        split = urlsplit(f"//{request.headers.get('host', '')}")
+        split.port  # noqa: B018  # ValueError if it is not a number
     except ValueError:
-        return ""
+        return urlsplit("//")
+    return split
+
+
+def _cookie_name(request: Request) -> str:
+    """Return the name of the cookie; browsers send a cookie to all ports of a host, so the name contains the port."""
+    return f"catstream-{_split(request).port or 80}"
+
+
+def _enter(request: Request, cookie: str, digest: str) -> Response:
+    """Set the cookie, and redirect to the same page without the token in its URL."""
+    query = urlencode([pair for pair in request.query_params.multi_items() if pair[0] != "token"])
+    answer = RedirectResponse("./" + (f"?{query}" if query else ""), 303)
+    secure = request.headers.get("x-forwarded-proto") == "https"
+    answer.set_cookie(cookie, digest, httponly=True, samesite="lax", secure=secure)
+    return answer
 
 
 def _digest(token: str) -> str:
     """Return the digest of a token, which is the value of the cookie and is compared in place of the token."""
     return hashlib.sha256(b"catstream view\0" + token.encode()).hexdigest()
-
-
-def _cookie_of(scope: Scope) -> str:
-    """Return the name of the cookie of this server."""
-    return f"{_COOKIE}-{scope['server'][1]}"
-
-
-def _credential(request: Request) -> str | None:
-    kind, _, token = request.headers.get("authorization", "").partition(" ")
-    if kind.lower() == "bearer":
-        return _digest(token.strip())
-    try:
-        cookie = SimpleCookie(request.headers.get("cookie", "")).get(_cookie_of(request.scope))
-    except CookieError:
-        return None
-    return cookie.value if cookie else None

@@ -9,6 +9,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from urllib.parse import quote
 
 import uvicorn
 from starlette.types import ASGIApp
@@ -48,7 +49,7 @@ class Server:
 
     Attributes
     ----------
-    url : URL of the page for a browser on this machine
+    url : URL of the page for a browser on this machine, with the token
     urls : `url`, and if the server listens on all interfaces, the URLs for other machines
 
     Raises
@@ -60,13 +61,13 @@ class Server:
     def __init__(self, site: Site, *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None) -> None:
         if token is None and not is_loopback(host):
             raise ServiceError(
-                f"{host} can be reached from other machines, and anyone who sees the page may steer: give a token "
-                "(VIEW_TOKEN=$(openssl rand -hex 16)), or listen on 127.0.0.1"
+                f"{host} can be reached from other machines, and anyone who opens the page may steer: serve it with a "
+                "token (without --no-token), or listen on 127.0.0.1"
             )
         guard = Guard(site.app, token)
         self._socket = _listen(host, port)
         bound = self._socket.getsockname()[1]
-        end = f":{bound}/" + (f"#{token}" if token else "")
+        end = f":{bound}/" + (f"?token={quote(token, safe='')}" if token else "")
         hosts = (
             ["127.0.0.1", *_addresses_of_this_machine()]
             if host in _ALL_ADDRESSES

@@ -81,7 +81,7 @@ def serve(folder):
         def start(**options):
             server = Server(pipeline_site(str(folder)), port=0, **options)
             stack.enter_context(server.in_background())
-            return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
+            return stack.enter_context(httpx.Client(base_url=server.url.partition("?")[0], timeout=60, verify=False))
 
         yield start
 
@@ -137,7 +137,7 @@ def serve_fleet(fleet, manager):  # noqa: ARG001  # it answers
         def start(**options):
             server = Server(fleet_site(fleet.address, fleet.keys_of_client), port=0, **options)
             stack.enter_context(server.in_background())
-            return stack.enter_context(httpx.Client(base_url=server.url.partition("#")[0], timeout=60, verify=False))
+            return stack.enter_context(httpx.Client(base_url=server.url.partition("?")[0], timeout=60, verify=False))
 
         yield start
 

@@ -15,6 +15,7 @@ from catstream.web import fleet_feed
 pytestmark = pytest.mark.system
 
 HERE = Path(__file__).parent
+TOKEN = "correct-horse-battery"
 
 
 def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_silent(
@@ -30,7 +31,8 @@ def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_s
     fleet.stream("cam-10", "moving", node="south", restarts=1)
     fleet.stream("cam-9", "unplaced", trouble="cam-9 needs a node with site=west, there is none")
     fleet.stream("dock", "waiting", node="north")
-    words = [node, HERE / "fleet.mjs", str(serve_fleet().base_url), chromium, tmp_path / "profile"]
+    link = str(serve_fleet(token=TOKEN).base_url.copy_set_param("token", TOKEN))
+    words = [node, HERE / "fleet.mjs", link, chromium, tmp_path / "profile"]
     said = {}
     over = threading.Event()
     turning = threading.Thread(target=lambda: [camera() for _ in iter(lambda: over.wait(0.02), True)])

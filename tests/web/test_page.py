@@ -71,7 +71,7 @@ def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_
             boxes.append(box)
     # The pipeline continues only if its tracks are received.
     settings = Settings(run={"endpoint": str(folder), "unstored_frames": 4})
-    server = Server(pipeline_site(str(folder)), port=0)
+    server = Server(pipeline_site(str(folder)), port=0, token="correct-horse-battery")
     with server.in_background():
         with Pipeline(str(path), None, settings) as pipeline:
             browser, lines = browse(server.url, boxes[0])

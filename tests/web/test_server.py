@@ -333,8 +333,24 @@ def test_commands_above_the_rate_limit_are_rejected(page):
 
 @pytest.mark.parametrize("path", PATHS)
 def test_without_the_token_nothing_of_the_pipeline_is_shown(locked, path):
-    assert locked.get(path).status_code == 401
+    answer = locked.get(path)
+    assert answer.status_code == 401
+    assert ("<form" in answer.text) == (path == "/"), "the page asks for the token"
     assert locked.post("/control", json={"verb": "pause"}).status_code == 401
+
+
+@pytest.mark.parametrize("opened", ["by the link", "by a header", "by no token"])
+def test_with_the_token_or_without_the_need_of_one_everything_is_shown(serve, facts, monkeypatch, opened):
+    monkeypatch.setattr(Dashboard, "picture", lambda *_: facts.preview(1))
+    page = serve(token=None if opened == "by no token" else TOKEN)
+    if opened == "by the link":
+        assert page.get(f"/?token={TOKEN}", follow_redirects=True).status_code == 200
+    elif opened == "by a header":
+        page.headers["Authorization"] = f"Bearer {TOKEN}"
+    for path in PATHS:
+        with page.stream("GET", path) as answer:
+            assert answer.status_code == 200, path
+    assert page.post("/control", json={"verb": "format"}).status_code == 400, "it is no verb, but it was read"
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/control"])
@@ -368,25 +384,50 @@ def test_the_token_is_accepted_as_a_header(locked):
     assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}x"}).status_code == 401
 
 
-def test_the_login_form_accepts_the_token_and_the_browser_does_not_store_it(locked):
-    answer = locked.post("/login", data={"token": TOKEN})
-    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+@pytest.mark.parametrize(("asked", "opened"), [("/", "/"), ("/?search=a%3Db&", "/?search=a%3Db")])
+def test_the_link_sets_a_cookie_and_the_browser_does_not_show_the_token(locked, asked, opened):
+    answer = locked.get(f"{asked}{'' if '?' in asked else '?'}token={TOKEN}")
+    assert (answer.status_code, str(answer.next_request.url)) == (303, str(locked.base_url.join(opened)))
     kept = answer.headers["set-cookie"]
     assert TOKEN not in kept
     assert "HttpOnly" in kept
     assert "SameSite=lax" in kept
-    assert kept.startswith(f"catstream-{locked.base_url.port}="), (
-        "a cookie of this port: pages on other ports have their own"
-    )
+    assert "Secure" not in kept
     assert locked.get("/").status_code == 200
 
 
+def test_behind_a_proxy_with_tls_the_cookie_is_sent_over_tls_only(locked):
+    answer = locked.get(f"/?token={TOKEN}", headers={"X-Forwarded-Proto": "https"})
+    assert "Secure" in answer.headers["set-cookie"]
+
+
+def test_the_link_never_leads_to_another_host(locked):
+    answer = locked.get(f"{locked.base_url}/evil.example/?token={TOKEN}")
+    assert answer.status_code == 303
+    assert answer.next_request.url.host == locked.base_url.host
+
+
+def test_a_browser_may_open_two_pages_at_two_ports(serve):
+    """Browsers send a cookie to all ports of a host."""
+    one, other = serve(token=TOKEN), serve(token=TOKEN[::-1])
+    for page, token in ((one, TOKEN), (other, TOKEN[::-1])):
+        one.cookies.extract_cookies(page.get(f"/?token={token}"))
+    other.cookies = one.cookies
+    assert [page.get("/metrics").status_code for page in (one, other)] == [200, 200]
+
+
+def test_a_page_whose_cookie_is_that_of_an_earlier_server_asks_for_the_token(locked):
+    port = locked.base_url.port
+    answer = locked.get("/", headers={"Cookie": f"catstream-{port}=0123; {{another program: yes}}"})
+    assert (answer.status_code, "<form" in answer.text) == (401, True)
+
+
 def test_wrong_tokens_are_rate_limited_and_the_correct_one_is_still_accepted(locked):
-    wrong = [locked.post("/login", data={"token": f"guess {guess}"}) for guess in range(12)]
+    wrong = [locked.get("/", params={"token": f"guess {guess}"}) for guess in range(12)]
     assert [answer.status_code for answer in wrong] == [401] * 8 + [429] * 4
     assert int(wrong[-1].headers["retry-after"]) >= 0
     assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
-    assert locked.post("/login", data={"token": TOKEN}).status_code == 303
+    assert locked.get("/", params={"token": TOKEN}).status_code == 303
     assert locked.get("/").status_code == 200, "the cookie opens"
     assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}x"}).status_code == 429
 
@@ -402,7 +443,7 @@ def test_a_token_bucket_allows_its_burst_and_its_rate():
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::"])
 def test_a_public_address_requires_a_token(host):
-    with pytest.raises(ServiceError, match="VIEW_TOKEN"):
+    with pytest.raises(ServiceError, match="without --no-token"):
         Server(pipeline_site(), host=host, port=0)
 
 
@@ -411,7 +452,7 @@ def test_a_server_on_all_interfaces_lists_the_addresses_for_other_machines(host)
     server = Server(pipeline_site(), host=host, port=0, token=TOKEN)
     with server.in_background():
         urls = [urlsplit(url) for url in server.urls]
-    assert {url.fragment for url in urls} == {TOKEN}
+    assert {url.query for url in urls} == {f"token={TOKEN}"}
     assert [url.hostname for url in urls[:2]] == ["127.0.0.1", socket.gethostname().lower()]
     assert not {"0.0.0.0", "::"} & {url.hostname for url in urls}
     for url in urls[2:]:

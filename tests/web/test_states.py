@@ -27,7 +27,7 @@ def seen(tmp_path):
     if node is None or chromium is None or not (HERE / "node_modules" / "axe-core").exists():
         pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
     cv2.imwrite(str(tmp_path / "picture.jpg"), np.full((240, 320, 3), (200, 160, 90), np.uint8))
-    server = Server(pipeline_site(str(tmp_path / "nowhere")), port=0)
+    server = Server(pipeline_site(str(tmp_path / "nowhere")), port=0, token="correct-horse-battery")
     with server.in_background():
         words = [node, HERE / "states.mjs", server.url, chromium, tmp_path / "profile", tmp_path / "picture.jpg"]
         run = subprocess.run(words, capture_output=True, text=True, check=False)

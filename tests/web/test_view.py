@@ -1,0 +1,72 @@
+"""`catstream view` and `catstream fleet view`, as a user starts them: who may open the page."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics", "/streams/roof/", "/streams/roof/picture.jpg"]
+OTHER_USER = 65534
+
+
+@pytest.fixture
+def started(folder):
+    """Starts a command, which prints the link of its page: the process, and the link."""
+    running = []
+
+    def start(*words):
+        process = subprocess.Popen(
+            [sys.executable, "-c", "from catstream.cli import main; main()", *words],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "TMPDIR": str(folder.parent), "PYTHONUNBUFFERED": "1"},
+        )
+        running.append(process)
+        return process, process.stdout.readline().strip()
+
+    yield start
+    for process in running:
+        process.terminate()
+        process.communicate(timeout=60)
+
+
+@contextmanager
+def another_user():
+    """Be another user of the machine, if this one may; without the token, a server cannot tell them apart."""
+    may = os.geteuid() == 0
+    if may:
+        os.seteuid(OTHER_USER)
+    try:
+        yield
+    finally:
+        if may:
+            os.seteuid(0)
+
+
+@pytest.mark.parametrize("words", [("view", "--port", "0"), ("fleet", "view", "--listen", "127.0.0.1:0")])
+def test_another_user_of_the_machine_can_neither_watch_nor_steer(started, words):
+    process, link = started(*words)
+    url, _, token = link.partition("?token=")
+    assert len(token) == 32
+    with another_user(), httpx.Client(base_url=url, verify=False) as stranger:
+        assert {path: stranger.get(path).status_code for path in PATHS} == dict.fromkeys(PATHS, 401)
+        for place in ("/control", "/streams/roof/control"):
+            assert stranger.post(place, json={"verb": "pause"}).status_code == 401
+        assert stranger.get("/healthz").status_code == 200
+        assert token not in Path(f"/proc/{process.pid}/cmdline").read_text(), "every user can read it"
+    with httpx.Client(verify=False, follow_redirects=True) as owner:
+        page = owner.get(link)
+        assert (page.status_code, str(page.url), "<main>" in page.text) == (200, url, True)
+        assert owner.get(f"{url}metrics").status_code == 200
+
+
+def test_with_no_token_the_page_is_open_to_every_user_of_the_machine(started):
+    _, link = started("view", "--port", "0", "--no-token")
+    with another_user(), httpx.Client(base_url=link, verify=False) as stranger:
+        assert [stranger.get(path).status_code for path in ("/", "/metrics")] == [200, 200]
