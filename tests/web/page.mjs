@@ -44,7 +44,6 @@ try {
   await page.waitForFunction(() => document.querySelector("#message").textContent === "Paused for your box.", null, patience);
   console.log("paused"); // until the box is set
   await draw(20, 150, 60, 60);
-  await page.selectOption("#role", "new");
   await page.fill("#name", "no name");
   await click("#follow:not([disabled])");
   await page.waitForSelector("#message.wrong", patience);
@@ -57,6 +56,7 @@ try {
   await click("#forget-dialog .danger");
   await page.waitForSelector("#objects", { state: "hidden", ...patience });
   console.log("forgotten", (await page.locator("#message").innerText()).replace(/\d+$/, "N"));
+  await page.waitForSelector("#message.faded", { state: "attached", ...patience });
 
   await is("absent");
   console.log("state", await state.innerText());

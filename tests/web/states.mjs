@@ -96,12 +96,19 @@ const doing = {
   "the end, and of the server": (page) => page.evaluate(() => events.onerror()),
 };
 
-const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args: options, hasTouch: true });
+const colours = (lines) => [...new Set(lines.map((line) => getComputedStyle(line).stroke))];
+
+const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args: options });
 const seen = [];
 try {
   for (const [scheme, viewport] of PAGES) {
     const page = await browser.newPage();
     await page.setViewportSize(viewport);
+    if (viewport === PHONE) { // has no pointer that hovers
+      const phone = await page.context().newCDPSession(page);
+      await phone.send("Emulation.setDeviceMetricsOverride", { ...viewport, deviceScaleFactor: 1, mobile: true });
+      await phone.send("Emulation.setTouchEmulationEnabled", { enabled: true });
+    }
     await page.emulateMedia({ colorScheme: scheme, reducedMotion: "reduce" });
     await page.addInitScript(() => {
       window.EventSource = class { constructor() { window.events = this; } close() {} };
@@ -122,6 +129,9 @@ try {
         source: await page.locator("#source").textContent(), frame: await page.locator("#frame").textContent(),
         objects: await page.locator(".objects b").allTextContents(), chosen: await page.locator('.choose[aria-pressed="true"] b').allTextContents(),
         charts: await page.locator("#charts-title").innerText(), name: await page.locator("#name").inputValue(), sent: sent.at(-1) ?? null,
+        loud: await page.locator("#watching .main").allInnerTexts(), role: await page.locator("#role").inputValue(),
+        header: await page.locator("header").innerText(), keys: await page.locator(".keys").isVisible(),
+        folded: !(await page.locator(".trees").isVisible()), lines: await page.locator("polyline").evaluateAll(colours),
         frames: await page.locator(".surprising li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
         wide: await page.evaluate(() => document.documentElement.scrollWidth - innerWidth),
         violations: violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html, any }) => `${html} ${any[0]?.message ?? ""}`).join("; ")}`) });

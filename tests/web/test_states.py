@@ -39,9 +39,16 @@ def test_each_state_of_the_page_is_accessible_and_correct(seen):
     assert len(seen) == 38
     assert {key: state["violations"] for key, state in seen.items() if state["violations"]} == {}, "found by axe"
     assert {key for key, state in seen.items() if state["wide"] > 0} == set(), "wider than its window"
+    wide, phone = seen["light", "present"], seen["dark", "present"]
+    assert [(state["keys"], state["folded"]) for state in (wide, phone)] == [(True, False), (False, True)]
     for scheme in ("light", "dark"):
         assert seen[scheme, "present"]["source"] == "walk.mp4"
         assert seen[scheme, "lost"]["source"] == "walk.mp4, 40 frames skipped"
+        assert seen[scheme, "present"]["loud"] == [], "all is well"
+        assert {tuple(seen[scheme, name]["loud"]) for name in ("waiting for a box", "absent")} == {("Draw a box",)}
+        assert seen[scheme, "three objects"]["header"].startswith("2 of 3 present"), "the state is first"
+        assert len(seen[scheme, "three objects"]["lines"]) == 1, "colours are those of objects"
+        assert [seen[scheme, name]["role"] for name in ("drawing one more", "drawing")] == ["new", "new"]
         check_several(*(seen[scheme, name] for name in SEVERAL))
         check_another_pipeline(seen[scheme, "another pipeline"])
         check_end(seen[scheme, "the end"], seen[scheme, "the end, and of the server"])

@@ -14,7 +14,7 @@ export class BoxForm {
     const first = !this.objects.list.length;
     this.name.value = first ? "" : this.objects.suggestion;
     this.name.placeholder = first ? "optional" : "";
-    this.offer(this.objects.single ? "another" : "new");
+    this.offer("new");
   }
 
   /** Offer the roles that there are for the chosen object. The first object is a new one. */

@@ -6,10 +6,10 @@ const [FEWEST, SECONDS] = [15, 120]; // minimum and maximum time span of a chart
 const [LEFT, TOP, BOTTOM] = [34, 8, 18];
 
 const CHARTS = [
-  { title: "score", tone: "accent", column: 1, least: 1, show: (value) => value.toFixed(2), unit: "" },
-  { title: "frames a second", tone: "blue", column: 2, least: 10, show: (value) => value.toFixed(0), unit: "" },
-  { title: "frame to model", tone: "violet", column: 3, least: 0.5, show: (value) => value.toFixed(2), unit: "s" },
-  { title: "model version", tone: "green", column: 4, least: 4, show: (value) => value.toFixed(0), unit: "" },
+  { title: "score", column: 1, least: 1, show: (value) => value.toFixed(2), unit: "" },
+  { title: "frames a second", column: 2, least: 10, show: (value) => value.toFixed(0), unit: "" },
+  { title: "frame to model", column: 3, least: 0.5, show: (value) => value.toFixed(2), unit: "s" },
+  { title: "model version", column: 4, least: 4, show: (value) => value.toFixed(0), unit: "" },
 ];
 
 export class Charts {
@@ -18,7 +18,7 @@ export class Charts {
     this.name = null;
     this.charts = CHARTS.map((chart) => {
       const drawing = make("svg", { role: "img" });
-      const parts = figure("chart", chart.title, chart.tone, drawing);
+      const parts = figure("chart", chart.title, drawing);
       element.append(parts.element);
       return { ...chart, drawing, ...parts };
     });

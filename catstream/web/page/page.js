@@ -7,6 +7,7 @@ import { Stage } from "./stage.js";
 import { SurprisingFrames } from "./surprising.js";
 import { Trees } from "./trees.js";
 
+const MESSAGE_SECONDS = 8;
 const $ = (selector) => document.querySelector(selector);
 const charts = new Charts($(".charts"));
 const trees = new Trees($(".trees"), $("#tree-summary"));
@@ -19,6 +20,7 @@ let frame = null; // number and time of the newest frame
 let paused = false;
 let closed = false; // whether the server has announced its shutdown
 let silent = false; // whether the server does not answer
+let fading = 0; // the timer of the message
 let events = null; // the connection to the server, null while the page is hidden
 const stream = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // its name, on the page of a fleet
 
@@ -42,9 +44,14 @@ async function sendCommand(verb, more = {}) {
   return answer;
 }
 
-function showMessage(text, wrong = false) {
-  $("#message").textContent = text;
-  $("#message").classList.toggle("wrong", wrong);
+/** Show a message until the next one; one that nothing has to be done about fades. */
+function showMessage(text, wrong = false, fades = !wrong) {
+  const message = $("#message");
+  message.textContent = text;
+  message.classList.toggle("wrong", wrong);
+  message.classList.remove("faded");
+  clearTimeout(fading);
+  if (fades) fading = setTimeout(() => message.classList.add("faded"), MESSAGE_SECONDS * 1000);
 }
 
 /** Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. */
@@ -53,7 +60,7 @@ async function pause() {
   const before = paused;
   const answer = await sendCommand("pause");
   if (!answer) return null;
-  showMessage("Paused for your box.");
+  showMessage("Paused for your box.", false, false);
   // A paused pipeline holds the frame after the last tracked one; the box applies to that frame.
   return { frame: answer.frame + 1, leave: before ? null : () => sendCommand("resume") };
 }
@@ -134,6 +141,7 @@ function showState() {
   showSource();
   $("#overlay").textContent = overlay(running);
   $("#stage").classList.toggle("over", status.phase === "ended" && stage.hasPicture);
+  $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // else there is no need of one
   for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
 }
 
@@ -246,7 +254,9 @@ $("#stop-dialog").onclose = (event) => {
   if (event.target.returnValue === "stop") sendCommand("stop");
   event.target.returnValue = "";
 };
-addEventListener("resize", () => { stage.draw(); trees.redraw(); });
+addEventListener("resize", () => { stage.draw(); charts.draw(); trees.redraw(); });
+$("#trees details").open = matchMedia("(min-width: 40rem)").matches; // on a phone, they are much longer than the rest
+$("#trees details").ontoggle = () => trees.redraw();
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { stage.draw(); surprising.draw(); });
 $("#fleet").hidden = !stream;
 document.addEventListener("visibilitychange", () => { // a browser opens few connections to a server, over all its tabs

@@ -8,10 +8,9 @@ export function make(name, attributes = {}, ...children) {
 }
 
 /** A figure with a left and a right caption, and a drawing below. */
-export function figure(kind, title, tone, drawing) {
+export function figure(kind, title, drawing) {
   const element = document.createElement("figure");
   element.className = kind;
-  element.style.setProperty("--tone", `var(--${tone})`);
   const caption = document.createElement("figcaption");
   const [left, right] = [document.createElement("span"), document.createElement("b")];
   left.textContent = title;

@@ -3,7 +3,6 @@
 
 import { figure, make } from "./svg.js";
 
-const TONES = ["accent", "blue", "violet", "green"];
 const [HEIGHT, EDGE] = [120, 8];
 const CLOSEST = 7; // pixels between two nodes of a level that is still drawn
 
@@ -29,15 +28,15 @@ export class Trees {
     const { leaves = [], rows = 0, bytes = 0 } = part.objects[this.name] ?? {};
     this.kept.textContent = rows ? `${rows.toLocaleString("en")} rows in ${(bytes / 1e6).toFixed(1)} MB.` : "";
     for (const [place, { title, meaning }] of part.kinds.entries()) {
-      const tree = this.trees[place] ??= this.add(title, meaning, TONES[place % TONES.length]);
+      const tree = this.trees[place] ??= this.add(title, meaning);
       const count = leaves[place] ?? 0;
       if (count !== tree.leaves) this.draw(tree, count);
     }
   }
 
-  add(title, meaning, tone) {
+  add(title, meaning) {
     const drawing = make("svg", { role: "img" });
-    const parts = figure("tree", "", tone, drawing);
+    const parts = figure("tree", "", drawing);
     parts.left.textContent = title;
     parts.left.className = "label";
     parts.caption.append(Object.assign(document.createElement("small"), { textContent: meaning }));
