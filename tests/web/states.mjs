@@ -44,6 +44,7 @@ const STATES = {
   "no pipeline": { pipeline: 0, status: { ...status, phase: "waiting", source: "", endpoint: "", reason: "no pipeline of yours is running" },
     ...nothing },
   "waiting for a box": { ...all, ...changed({ waiting: true }), tracks: tracks() },
+  "the first tracks": { tracks: unnamed("present") }, // before a status
   bootstrapping: { ...all, ...changed({}, "bootstrapping") },
   present: { ...all },
   absent: changed({}, "absent"),

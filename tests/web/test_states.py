@@ -36,7 +36,7 @@ def seen(tmp_path):
 
 
 def test_each_state_of_the_page_is_accessible_and_correct(seen):
-    assert len(seen) == 38
+    assert len(seen) == 40
     assert {key: state["violations"] for key, state in seen.items() if state["violations"]} == {}, "found by axe"
     assert {key for key, state in seen.items() if state["wide"] > 0} == set(), "wider than its window"
     wide, phone = seen["light", "present"], seen["dark", "present"]
@@ -46,6 +46,10 @@ def test_each_state_of_the_page_is_accessible_and_correct(seen):
         assert seen[scheme, "lost"]["source"] == "walk.mp4, 40 frames skipped"
         assert seen[scheme, "present"]["loud"] == [], "all is well"
         assert {tuple(seen[scheme, name]["loud"]) for name in ("waiting for a box", "absent")} == {("Draw a box",)}
+        assert [seen[scheme, name]["pill"] for name in ("waiting for a box", "the first tracks")] == [
+            "waiting for a box",
+            "present",
+        ]
         assert seen[scheme, "three objects"]["header"].startswith("2 of 3 present"), "the state is first"
         assert len(seen[scheme, "three objects"]["lines"]) == 1, "colours are those of objects"
         assert [seen[scheme, name]["role"] for name in ("drawing one more", "drawing")] == ["new", "new"]

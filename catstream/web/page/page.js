@@ -56,7 +56,7 @@ function showMessage(text, wrong = false, fades = !wrong) {
 
 /** Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. */
 async function pause() {
-  if (status.waiting) return { frame: Infinity, leave: null };
+  if (isWaiting()) return { frame: Infinity, leave: null };
   const before = paused;
   const answer = await sendCommand("pause");
   if (!answer) return null;
@@ -127,7 +127,7 @@ function showPaused(now) {
 function showState() {
   const running = status.phase === "running" && !silent;
   const lost = running && status.lost_seconds > 0;
-  const waiting = running && status.waiting;
+  const waiting = running && isWaiting();
   let state = running && !waiting ? stateOfAll() : running ? "waiting" : status.phase;
   let words = { waiting: "waiting", silent: "pipeline silent", ended: "ended" }[state] || state;
   if (silent && status.phase !== "ended") [state, words] = ["silent", "page stopped"];
@@ -143,6 +143,11 @@ function showState() {
   $("#stage").classList.toggle("over", status.phase === "ended" && stage.hasPicture);
   $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // else there is no need of one
   for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
+}
+
+/** Whether there is no object. The status is one of each second, so after the first box the tracks are newer. */
+function isWaiting() {
+  return status.waiting && !objects.list.length;
 }
 
 /** The state of the objects together: present if one of them is. */
