@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from catstream.arrays import is_finite
 from catstream.errors import FrameError
 
 __all__ = ["as_bgr"]
@@ -67,12 +68,16 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
         return (image >> 8).astype(np.uint8)
     if image.dtype == bool:
         raise FrameError(f"{_EXPECTED}, got bool: a mask is no picture, 255 * frame.astype(np.uint8) would be one")
+    if image.dtype.kind not in "fui":
+        raise FrameError(f"{_EXPECTED}, got {image.dtype}, which is no brightness: check where the frame comes from")
     if image.dtype.kind != "f":
         raise FrameError(
             f"{_EXPECTED}, got {image.dtype}: frame.astype(np.uint8) if its values are brightness from 0 to 255"
         )
+    if not is_finite(image):
+        raise FrameError(f"{_EXPECTED}, got {image.dtype} with NaN or infinity: check how the frame was computed")
     low, high = float(image.min()), float(image.max())
-    if not (low >= -_HALF_STEP and high <= 1 + _HALF_STEP):  # also of NaN
+    if not (low >= -_HALF_STEP and high <= 1 + _HALF_STEP):
         raise FrameError(
             f"{_EXPECTED}, got {image.dtype} from {low:g} to {high:g}: "
             "frame.astype(np.uint8) if its values are brightness from 0 to 255"

@@ -106,6 +106,13 @@ class MultiTracker:
         self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
         self._tracks: dict[str, Track] | None = None
 
+    def __repr__(self) -> str:
+        if self._tracks is None:
+            return "<catstream.MultiTracker, before init>"
+        frame = max((track.frame for track in self._tracks.values()), default=0)
+        states = ", ".join(f"{name or 'the object'} {track.state}" for name, track in self._tracks.items())
+        return f"<catstream.MultiTracker, at frame {frame}: {states or 'no object'}>"
+
     @property
     def tracks(self) -> dict[str, Track]:
         """The result of each object for the last frame, by name.

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from numbers import Number
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -341,6 +341,19 @@ class Settings:
     belief: BeliefSettings = field(default_factory=BeliefSettings)
     teaching: TeachingSettings = field(default_factory=TeachingSettings)
     extent: ExtentSettings = field(default_factory=ExtentSettings)
+
+    if TYPE_CHECKING:  # a group may be given as a mapping, and is read as a group
+
+        def __init__(
+            self,
+            *,
+            run: RunSettings | Mapping[str, object] = ...,
+            coreset: CoresetSettings | Mapping[str, object] = ...,
+            search: SearchSettings | Mapping[str, object] = ...,
+            belief: BeliefSettings | Mapping[str, object] = ...,
+            teaching: TeachingSettings | Mapping[str, object] = ...,
+            extent: ExtentSettings | Mapping[str, object] = ...,
+        ) -> None: ...
 
     def __new__(cls, *unnamed: object, **groups: object) -> Self:
         if unnamed:

@@ -47,6 +47,9 @@ class Tracker:
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
         self._objects = MultiTracker(settings)
 
+    def __repr__(self) -> str:
+        return repr(self._objects).replace("MultiTracker", "Tracker", 1)
+
     @property
     def settings(self) -> Settings:
         """All settings."""

@@ -22,7 +22,8 @@ import catstream
 
 async def show_tracks(endpoint: str) -> None:
     """Log each track."""
-    count, states = 0, {}
+    count = 0
+    states: dict[str, str] = {}
     with catstream.subscribe(endpoint, "tracks") as tracks:
         async for track in tracks:
             count += 1
@@ -40,7 +41,7 @@ async def show_tracks(endpoint: str) -> None:
             if track.state != states.get(track.object):
                 rr.log(f"state{below}", rr.TextLog(track.state))
                 states[track.object] = track.state
-        print(f"{count} tracks, {tracks.losses()}: {tracks.end.reason}")
+        print(f"{count} tracks, {tracks.losses()}: {tracks.end.reason if tracks.end else 'no end'}")
 
 
 async def show_pictures(endpoint: str) -> None:
@@ -48,6 +49,8 @@ async def show_pictures(endpoint: str) -> None:
     with catstream.subscribe(endpoint, "previews") as previews:
         async for preview in previews:
             picture = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
+            if picture is None:
+                continue
             rr.set_time("frame", sequence=preview.frame)
             rr.log("camera", rr.Image(cv2.resize(picture, (preview.width, preview.height)), "BGR").compress())
 

@@ -20,6 +20,7 @@ def main(source: str, *objects: str) -> None:
     present: Counter[str] = Counter()
     together: set[tuple[str, str]] = set()
     with catstream.Pipeline(source, boxes) as pipeline:
+        frame = -1
         for frame, tracks in enumerate(pipeline.by_frame()):
             found = {name: track.box for name, track in tracks.items() if track.box is not None}
             present.update(found.keys())

@@ -16,6 +16,7 @@ import sys
 import tomllib
 from array import array
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import zmq
@@ -31,9 +32,9 @@ def address(endpoint: str, channel: str) -> str:
     return f"ipc://{endpoint}/{channel}"
 
 
-def attach(endpoint: str, channel: str, keys: str) -> zmq.Socket:
+def attach(endpoint: str, channel: str, keys: str) -> zmq.Socket[bytes]:
     """Return a socket that subscribes to a channel."""
-    socket = zmq.Context.instance().socket(zmq.SUB)
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
     socket.subscribe(b"")
     if keys:
         own = tomllib.loads((Path(keys) / "client.key").read_text())
@@ -43,7 +44,7 @@ def attach(endpoint: str, channel: str, keys: str) -> zmq.Socket:
     return socket
 
 
-def receive(socket: zmq.Socket) -> tuple[str, dict]:
+def receive(socket: zmq.Socket[bytes]) -> tuple[str, dict[str, Any]]:
     """Receive the next message: its kind and its fields."""
     version, kind, _, _, fields = msgpack.unpackb(socket.recv())
     if version != 4:
@@ -51,7 +52,7 @@ def receive(socket: zmq.Socket) -> tuple[str, dict]:
     return kind, fields
 
 
-def norm(weights: dict) -> float:
+def norm(weights: dict[str, Any]) -> float:
     """Return the Euclidean norm of an encoded vector: dtype "<f4", shape, and bytes."""
     numbers = array("f", weights["data"])
     if sys.byteorder == "big":
@@ -65,7 +66,7 @@ def main(endpoint: str, keys: str = "") -> None:
     poller.register(tracks)
     poller.register(models)
     seq = missed = 0
-    versions = {}  # of the last model of each object
+    versions: dict[str, int] = {}  # of the last model of each object
     while True:
         ready = dict(poller.poll())
         if models in ready:

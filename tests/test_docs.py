@@ -18,6 +18,7 @@ from pathlib import Path
 
 import click
 import pytest
+from mypy import api as mypy
 
 import catstream
 from catstream.cli import VERBS, verb
@@ -229,6 +230,20 @@ def test_the_python_examples_use_existing_names():
     assert not errors_on(unknown_names)
 
 
+def test_a_type_checker_accepts_the_python_examples(tmp_path):
+    for page in (ROOT / "README.md", DOCS / "tutorial.md"):
+        for number, block in enumerate(blocks(page, "python")):
+            if "import" in block:  # otherwise it continues the one before
+                file = tmp_path / f"{page.stem}_{number}.py"
+            with file.open("a") as program:
+                program.write(block)
+    strict = ["--strict", "--allow-redefinition", "--no-error-summary", "--cache-dir", str(tmp_path / "cache")]
+    said, errors, _ = mypy.run(
+        [*strict, *map(str, [*sorted(tmp_path.glob("*.py")), *(ROOT / "examples").glob("*.py")])]
+    )
+    assert (said, errors) == ("", "")
+
+
 def test_the_tutorials_tracker_follows(demo_video, tmp_path, monkeypatch):
     (tmp_path / "demo").symlink_to(demo_video(24)[0].parent)
     monkeypatch.chdir(tmp_path)
@@ -238,7 +253,7 @@ def test_the_tutorials_tracker_follows(demo_video, tmp_path, monkeypatch):
     alike, state, again, video = printed.getvalue().splitlines()
     assert (alike, again) == ("True True", "True")
     assert state.startswith("present")
-    assert video.startswith("True")
+    assert video.startswith("present")
 
 
 def test_every_test_that_a_page_names_exists():

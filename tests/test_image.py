@@ -62,8 +62,9 @@ def test_grey_is_expanded(bgr, form):
         (np.zeros((0, 5, 3), np.uint8), "has no pixels"),
         (np.full((4, 5, 3), 200.0), "got float64 from 200 to 200: frame.astype"),
         (np.full((4, 5, 3), -1, np.float32), "got float32 from -1 to -1"),
-        (np.full((4, 5, 3), np.nan), "got float64 from nan to nan"),
-        (np.full((4, 5, 3), 1j), "got complex128"),
+        (np.full((4, 5, 3), np.nan), "got float64 with NaN or infinity: check how the frame was computed"),
+        (np.full((4, 5, 3), "x", object), "got object, which is no brightness"),
+        (np.full((4, 5, 3), 1j), "got complex128, which is no brightness: check where the frame comes from"),
     ],
 )
 def test_an_array_that_is_no_image_is_one_line_of_error_with_a_remedy(image, told):

@@ -84,6 +84,14 @@ def test_update_before_init_is_rejected(video):
         Tracker().update(video[0][0])
 
 
+def test_a_tracker_says_what_it_is(video):
+    frames, boxes = video
+    tracker = Tracker()
+    assert repr(tracker) == "<catstream.Tracker, before init>"
+    tracker.init(frames[0], boxes[0])
+    assert repr(tracker) == "<catstream.Tracker, at frame 0: the object bootstrapping>"
+
+
 def test_a_rejected_box_does_not_change_the_tracked_object(video):
     frames, boxes = video
     tracker = Tracker()
