@@ -38,7 +38,7 @@ def measured(task: tuple[Sequence, int]) -> tuple[str, Row, float, float] | None
         return None
     halves = [features(sequence, start, third, settings) for start in (0, third)]
     first, second = (model_of(half, settings) for half in halves)
-    merged, one = merge([first, second]), model_of([*halves[0], *halves[1]], settings)
+    merged, one = merge([first, second], force=True), model_of([*halves[0], *halves[1]], settings)
     models = {"first third": first, "second third": second, "merged": merged, "one tree": one}
     row = {}
     for name, learned in models.items():

@@ -7,6 +7,7 @@ them. A run in another video continues from it, as if the frames of both had com
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -39,6 +40,9 @@ _KIND = "learned 3"  # and the version of what the file holds
 
 #: Settings that say what a feature row and a tree contain: models can be merged, and continued, only if they agree.
 _SAME = ("coreset.size", "coreset.reduction", "search.context", "teaching.colours", "teaching.classifier")
+
+#: Likeness of two models, below which a merge is rejected, and below which it gives a warning: see decision 54.
+_UNLIKE, _DOUBTFUL = 0.25, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,7 +223,7 @@ def begun(features: Features, settings: Settings) -> dict[str, Compressor]:
     }
 
 
-def merge(parts: Sequence[Learned]) -> Learned:
+def merge(parts: Sequence[Learned], *, force: bool = False) -> Learned:
     """One saved model from several of the same object, as if one stream had contained all their frames.
 
     The trees are merged, and a model is trained from them. The bound of the merged tree is the sum of the bounds plus
@@ -228,10 +232,20 @@ def merge(parts: Sequence[Learned]) -> Learned:
 
     The size is the geometric mean of the sizes. An object without a name may be merged with one that has a name.
 
+    The objects must look alike: each model is compared with the others by the likeness of its mean appearance (see
+    `catstream.detection.likeness`), of the two directions the higher one. Models of one object have 0.34 or more,
+    most pairs of different objects less than 0.25. Below 0.5 there is a UserWarning. Several models may be a chain, for
+    example of views from different sides: each needs to look like one of the others only.
+
+    Parameters
+    ----------
+    force : merge without comparing the objects
+
     Raises
     ------
     SettingsError
-        If there are fewer than two, if their settings or names differ, or if two contain the same frames.
+        If there are fewer than two, if their settings or names differ, if two contain the same frames, or if their
+        objects do not look alike (below 0.25).
     """
     if len(parts) < 2:
         raise SettingsError(f"{len(parts)} saved model given: a merge needs two or more")
@@ -240,6 +254,8 @@ def merge(parts: Sequence[Learned]) -> Learned:
     for part in parts[1:]:
         _check_merge(named if part.object else first, part, origins)
         origins.update(part.origins)
+    if not force:
+        _check_alike(parts)
     trees = {name: reduce(CoresetTree.merged, [part.trees[name] for part in parts]) for name in TREES}
     name = next((part.object for part in parts if part.object), "")
     centres = next((part.centres for part in parts if len(part.centres)), first.centres)
@@ -268,6 +284,35 @@ def _check_merge(one: Learned, other: Learned, origins: set[str]) -> None:
         raise SettingsError(
             "two of the saved models have learned from the same frames, which would count twice: "
             "merge models of different videos"
+        )
+
+
+def _check_alike(parts: Sequence[Learned]) -> None:
+    """Raise SettingsError, or warn, if the models do not look like those of one object.
+
+    The models are connected by their highest likenesses, as in a maximum spanning tree; the lowest of these decides.
+    """
+    with one_thread():
+        measures = [part.likeness() for part in parts]
+    means = [(tree.sum / tree.rows_seen).astype(np.float32) for tree in (part.trees["object"] for part in parts)]
+    lowest, connected, rest = (1.0, 0, 0), [0], set(range(1, len(parts)))
+    while rest:
+        link = max((max(measures[i](means[j]), measures[j](means[i])), i, j) for i in connected for j in rest)
+        lowest = min(lowest, link)
+        connected.append(link[2])
+        rest.remove(link[2])
+    likeness, one, other = lowest
+    if likeness < _DOUBTFUL:
+        one, other = sorted((one + 1, other + 1))
+        text = f"saved models {one} and {other} look like different objects (likeness {likeness:.2f}"
+        if likeness < _UNLIKE:
+            raise SettingsError(
+                f"{text}, at least {_UNLIKE} is needed): merge models of the same object, or pass --force "
+                "(force=True in Python) if it is the same one"
+            )
+        warnings.warn(
+            f"{text}, that of one object is mostly above {_DOUBTFUL}): check that the object is the same",
+            stacklevel=3,
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from itertools import islice
 
 import numpy as np
@@ -26,18 +27,18 @@ SETTINGS = Settings(coreset={"size": SIZE})
 BOX = Box(1.0, 2.0, 30.0, 40.0)
 
 
-def features(rng):
-    """The features of an object in a frame: rows of the object around 1, and of a background around -1."""
+def features(rng, appearance=1.0):
+    """The features of an object in a frame: rows of the object around its appearance, and of a background around -1."""
     labels = np.repeat(np.float32([1, 0]), 4)
-    rows = rng.normal(scale=0.2, size=(8, WIDTH)).astype(np.float32) + np.where(labels[:, None], 1, -1)
+    rows = rng.normal(scale=0.2, size=(8, WIDTH)).astype(np.float32) + np.where(labels[:, None], appearance, -1)
     training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
     window = Window(0.0, 0.0, 40.0, 50.0)
     return ObjectFeatures(BOX, training, DetectorState(0, "confident", window, window, window))
 
 
-def stream(seed, frames=FRAMES):
+def stream(seed, frames=FRAMES, appearance=1.0):
     rng = np.random.default_rng(seed)
-    return [features(rng) for _ in range(frames)]
+    return [features(rng, np.float32(appearance)) for _ in range(frames)]
 
 
 def compressed(messages, compressor=None, settings=SETTINGS, name=""):
@@ -212,6 +213,32 @@ def test_models_that_do_not_fit_are_not_merged(learned):
             merge([learn(stream(1), name="anna"), wrong])
     with pytest.raises(SettingsError, match="two or more"):
         merge([learned])
+
+
+def turned(*parts):
+    """A model of an object whose features differ from the background's in some of four parts of the row."""
+    return learn(stream(sum(parts), appearance=np.where(np.isin(np.arange(WIDTH) * 4 // WIDTH, parts), 1, -1)))
+
+
+def test_models_of_different_objects_are_merged_only_by_force():
+    one, other = turned(0, 1), turned(2, 3)
+    with pytest.raises(SettingsError, match=r"models 1 and 2 look like different objects \(likeness 0\.0.*--force"):
+        merge([one, other])
+    assert merge([one, other], force=True).trees["object"].rows_seen == 2 * one.trees["object"].rows_seen
+
+
+def test_models_in_doubt_are_merged_with_a_warning():
+    with pytest.warns(UserWarning, match=r"models 1 and 2 look like different objects \(likeness 0\.[34]"):
+        merge([turned(0, 1, 2), turned(1, 2, 3)])
+
+
+def test_views_of_an_object_need_to_look_like_one_of_the_others_only():
+    front, between, back = turned(0, 1), turned(0, 1, 2, 3), turned(2, 3)
+    for parts in ([front, back, between], [between, front, back], [front, between, back]):
+        with warnings.catch_warnings(action="ignore"):
+            merge(parts)
+    with pytest.raises(SettingsError, match=r"models [12] and 3 look like"):
+        merge([front, turned(0, 1, 1), back])  # the second one is of other frames of the front
 
 
 def test_a_model_with_a_name_and_one_without_are_of_the_same_object(learned):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import click
@@ -17,13 +18,15 @@ __all__ = ["merge"]
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="FILE", help="File to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def merge(files: tuple[Path, ...], output: Path, overwrite: bool) -> None:
+@click.option("--force", is_flag=True, help="Merge models although their objects look different.")
+def merge(files: tuple[Path, ...], output: Path, overwrite: bool, force: bool) -> None:
     """Merge saved models of one object, for example from two cameras.
 
     The coreset trees of all files are merged, and a model is trained from them.
     Its scores are those of one tree that has seen all the videos, within the
     bound of the coreset. The files must be of the same object and settings, and
-    no two of them may contain the same frames.
+    no two of them may contain the same frames. Models that look like those of
+    different objects are rejected; in case of doubt there is a warning.
 
     \b
     EXAMPLES
@@ -31,7 +34,11 @@ def merge(files: tuple[Path, ...], output: Path, overwrite: bool) -> None:
     """
     if output.exists() and not overwrite:
         raise ServiceError(f"{output} exists already: replace it with --overwrite, or give another name")
-    whole = merged([Learned.load(file) for file in files])
+    parts = [Learned.load(file) for file in files]
+    with warnings.catch_warnings(record=True, action="always", category=UserWarning) as doubts:
+        whole = merged(parts, force=force)
+    for doubt in doubts:
+        click.echo(f"catstream: warning: {doubt.message}", err=True)
     whole.save(output)
     tree = whole.trees["object"]
     click.echo(

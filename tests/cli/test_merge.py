@@ -11,38 +11,42 @@ from catstream.learned import Learned
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 
+#: A part of the background of the demo video.
+LAKE = Box(20.0, 160.0, 60.0, 60.0)
+
 
 @pytest.fixture(scope="session")
 def models(demo_video, once):
-    """Two saved models of one object, learned from two parts of the demo video."""
+    """Two saved models of one object, learned from two parts of the demo video, and one of a part of the background."""
     path, boxes = demo_video(60)
 
     def learn(folder):
-        for name, first in (("door", 0), ("yard", 30)):
+        for name, first, box in (("door", 0, boxes[0]), ("yard", 30, boxes[30]), ("lake", 0, LAKE)):
             tracker = Tracker({"coreset.size": 16})
             with open_source(str(path)) as source:
                 for frame in islice(source, first, first + 15):
                     if frame.number == first:
-                        tracker.init(frame.image, Box(*boxes[first]))
+                        tracker.init(frame.image, box)
                     else:
                         tracker.update(frame.image)
             tracker.learned().save(folder / name)
 
     folder = once("models", learn)
-    return folder / "door", folder / "yard"
+    return folder / "door", folder / "yard", folder / "lake"
 
 
 def test_models_of_two_cameras_are_merged_into_one_file(said, models, tmp_path):
-    code, output, errors = said("merge", *models, "-o", tmp_path / "both")
+    door, yard, _ = models
+    code, output, errors = said("merge", door, yard, "-o", tmp_path / "both")
     assert (code, errors) == (0, "")
-    one, other, both = map(Learned.load, (*models, tmp_path / "both"))
+    one, other, both = map(Learned.load, (door, yard, tmp_path / "both"))
     rows = both.trees["object"].rows_seen
     assert rows == one.trees["object"].rows_seen + other.trees["object"].rows_seen
     assert f"2 saved models, 2 videos, {rows} rows of the object" in output
 
 
 def test_a_merge_that_cannot_be_made_is_one_line_and_writes_nothing(said, models, tmp_path):
-    door, yard = models
+    door, yard, _ = models
     damaged, kept = tmp_path / "damaged", tmp_path / "kept"
     damaged.write_bytes(door.read_bytes()[:-9])
     kept.write_text("kept")
@@ -59,3 +63,24 @@ def test_a_merge_that_cannot_be_made_is_one_line_and_writes_nothing(said, models
     assert not (tmp_path / "new").exists()
     assert kept.read_text() == "kept"
     assert said("merge", door, yard, "-o", kept, "--overwrite")[0] == 0
+
+
+def test_models_of_different_objects_are_merged_only_with_force(said, models, tmp_path):
+    door, _, lake = models
+    code, output, errors = said("merge", door, lake, "-o", tmp_path / "both")
+    assert (code, output, errors.count("\n")) == (1, "", 1), errors
+    assert "saved models 1 and 2 look like different objects" in errors
+    assert "--force" in errors
+    assert not (tmp_path / "both").exists()
+    code, output, errors = said("merge", door, lake, "-o", tmp_path / "both", "--force")
+    assert (code, errors) == (0, "")
+    assert "2 saved models" in output
+
+
+def test_a_doubt_is_one_line_and_the_models_are_merged(said, models, tmp_path, monkeypatch):
+    monkeypatch.setattr("catstream.learned._UNLIKE", 0.0)
+    door, _, lake = models
+    code, output, errors = said("merge", door, lake, "-o", tmp_path / "both")
+    assert (code, errors.count("\n")) == (0, 1)
+    assert "catstream: warning: saved models 1 and 2 look like different objects (likeness 0." in errors
+    assert "2 saved models" in output
