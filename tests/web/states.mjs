@@ -59,6 +59,7 @@ const STATES = {
   forgetting: {},
   "two objects": { tracks: tracks(anna, carl), surprising: { measured: 60, frames: frames(anna, carl) } },
   drawing: { ...all },
+  "drawing the next one while the answer comes": {},
   stopping: {},
   "the end": changed({ phase: "ended", reason: "the source has ended" }),
   "the end, and of the server": { closed: true },
@@ -80,6 +81,7 @@ const draw = async (page, viewport) => {
   }
   await page.waitForSelector("#follow:not([disabled])");
 };
+let answered = null; // what the answer to a command waits for
 const doing = {
   drawing: draw,
   "another one chosen": (page) => page.click('.choose:has-text("ben")'),
@@ -89,6 +91,20 @@ const doing = {
     await page.click('[aria-label="Forget ben"]');
   },
   "two objects": (page) => page.click("#forget-dialog .danger"),
+  "drawing the next one while the answer comes": async (page) => {
+    let answer;
+    answered = new Promise((resolve) => { answer = resolve; });
+    const { x, y } = await page.locator("#picture").boundingBox();
+    await page.click("#follow");
+    await page.mouse.move(x + 20, y + 20);
+    await page.mouse.down();
+    await page.mouse.move(x + 60, y + 60);
+    answer();
+    await page.waitForSelector("#drawing", { state: "hidden" });
+    await page.mouse.move(x + 90, y + 90);
+    await page.mouse.up();
+    await page.waitForSelector("#follow:not([disabled])");
+  },
   stopping: async (page) => {
     await page.click("#cancel");
     await page.click("#stop");
@@ -116,8 +132,9 @@ try {
     });
     await page.route("**/pictures/*", (route) => route.fulfill({ path: picture, contentType: "image/jpeg" }));
     const sent = []; // commands
-    await page.route("**/control", (route) => {
+    await page.route("**/control", async (route) => {
       sent.push(route.request().postDataJSON());
+      await answered;
       return route.fulfill({ json: { done: true, reason: "paused after frame 210", frame: 210, version: 12, object: "" } });
     });
     await page.goto(url);

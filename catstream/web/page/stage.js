@@ -75,7 +75,10 @@ export class Stage {
     const { x, y, w, h } = this.box;
     const done = await this.actions.follow([x, y, w, h], this.still.leave);
     this.asking = false;
-    if (done) this.end();
+    if (!done) return;
+    const { start } = this; // of the next box: the picture may run again before the answer is here
+    this.end();
+    this.start = start;
   }
 
   /** Cancel the drawing, and resume the pipeline if this page paused it. */
@@ -98,7 +101,7 @@ export class Stage {
   }
 
   drag(event) {
-    if (!this.start) return;
+    if (!this.start || this.asking) return;
     const [across, down] = this.start.screen;
     if (!this.box && Math.hypot(event.clientX - across, event.clientY - down) < STILL) return;
     this.begin();
