@@ -5,11 +5,23 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import combinations
 
 from catstream.box import Box
 from catstream.errors import BoxError, ObjectError
 
-__all__ = ["UNNAMED", "Boxes", "boxes_by_name", "check_boxes", "check_count", "check_name", "listed", "split_name"]
+__all__ = [
+    "UNNAMED",
+    "Boxes",
+    "boxes_by_name",
+    "check_boxes",
+    "check_count",
+    "check_name",
+    "counted",
+    "doubtful",
+    "listed",
+    "split_name",
+]
 
 #: The name of an object that has none.
 UNNAMED = ""
@@ -18,6 +30,7 @@ UNNAMED = ""
 Boxes = str | Iterable[float] | Mapping[str, str | Iterable[float]]
 
 _LONGEST = 64
+_SAME = 0.95  # overlap of boxes that were meant to be one
 _NAME = re.compile(rf"(\w[\w.-]{{0,{_LONGEST - 1}}})?")
 
 
@@ -82,6 +95,27 @@ def check_boxes(boxes: Mapping[str, Box], width: int, height: int) -> None:
             box.validated(width, height)
 
 
+def doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
+    """Descriptions of boxes that can be followed, but hardly are what was meant: the whole frame, or one box twice.
+
+    Examples
+    --------
+    >>> doubtful({"anna": Box(8, 9, 40, 40), "ben": Box(8, 9, 40, 40)}, 320, 240)
+    ['anna and ben have the same box: each costs time']
+    """
+    whole = Box(0, 0, width, height)
+    told = [
+        f"the box of {listed([name])} is the whole frame: draw it around one object"
+        for name, box in boxes.items()
+        if box.overlap(whole) > _SAME
+    ]
+    return told + [
+        f"{one} and {other} have the same box: each costs time"
+        for (one, box), (other, twin) in combinations(boxes.items(), 2)
+        if box.overlap(twin) > _SAME
+    ]
+
+
 @contextmanager
 def _errors_about(name: str) -> Iterator[None]:
     """Add the name of an object to a BoxError."""
@@ -109,3 +143,14 @@ def listed(names: Iterable[str]) -> str:
     ('anna, the object without a name', 'none')
     """
     return ", ".join(name or "the object without a name" for name in names) or "none"
+
+
+def counted(number: float, noun: str) -> str:
+    """A number and what is counted, in the singular or the plural.
+
+    Examples
+    --------
+    >>> counted(1, "frame"), counted(0, "frame")
+    ('1 frame', '0 frames')
+    """
+    return f"{number:.0f} {noun}" if number == 1 else f"{number:.0f} {noun}s"

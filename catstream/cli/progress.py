@@ -12,7 +12,7 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
 from catstream.messages import Track
-from catstream.names import UNNAMED
+from catstream.names import UNNAMED, counted
 from catstream.pipeline import Pipeline
 from catstream.sinks.sink import STDOUT
 
@@ -104,20 +104,23 @@ class RunProgress:
         rate = f"first track after {self._first:.2f} s"
         if (now := time.perf_counter()) - self._started - self._first >= _SHORTEST_SECONDS:
             rate = f"{self._rate(now):.0f} frames/s, {rate}"
+        frames = counted(self.frames, "frame")
         if self._objects.keys() == {UNNAMED}:
             alone = self._objects[UNNAMED]
-            lines = [f"{self.frames} frames, present in {alone.present}, {rate}, model version {alone.version}"]
+            lines = [f"{frames}, present in {alone.present}, {rate}, model version {alone.version}"]
         else:
-            lines = [f"{self.frames} frames, {rate}", *self._of_each()]
+            lines = [f"{frames}, {rate}", *self._of_each()]
         if self._pipeline.live:
             lines.append(
-                f"live: {self._detector('skipped'):.0f} frames skipped, "
-                f"lost and opened again {self._detector('reopened'):.0f} times"
+                f"live: {counted(self._detector('skipped'), 'frame')} skipped, "
+                f"lost and opened again {counted(self._detector('reopened'), 'time')}"
             )
         if damaged := self._detector("damaged"):
-            lines.append(f"damaged: {damaged:.0f} frames could not be decoded, and were skipped")
+            lines.append(f"damaged: {counted(damaged, 'frame')} could not be decoded, and skipped")
         if totals := self._pipeline.totals:
-            lines.append(f"features: {totals['sent']} messages sent, {totals['stored']} stored in the coreset trees")
+            lines.append(
+                f"features: {counted(totals['sent'], 'message')} sent, {totals['stored']} stored in the coreset trees"
+            )
         if self._pipeline.restarts:
             lines.append(f"processes restarted: {self._pipeline.restarts}")
         if written := [_shown(file) for file in results if file != STDOUT]:
@@ -127,7 +130,7 @@ class RunProgress:
     def _of_each(self) -> Iterator[str]:
         """A line for each object; the numbers are the ids in MOT text."""
         for number, (name, each) in enumerate(self._objects.items(), 1):
-            frames = f"present in {each.present} of {each.frames} frames, model version {each.version}"
+            frames = f"present in {each.present} of {counted(each.frames, 'frame')}, model version {each.version}"
             yield f"  {number} {name or '(no name)'}: {frames}"
 
     def _detector(self, counter: str) -> float:

@@ -11,7 +11,7 @@ from rich.console import Console
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.interrupts import Interrupts
 from catstream.messages import Run
-from catstream.names import listed
+from catstream.names import counted, listed
 from catstream.services.options import with_part
 from catstream.settings import Settings
 from catstream.sinks.sink import check_writable, open_sink
@@ -87,7 +87,7 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
         if tracks.end is not None:
             reason = f": {tracks.end.reason}"
         of = f" of {listed(newest)}" if any(newest) else ""
-        click.echo(f"{written} tracks{of}, {tracks.losses()}{reason}", err=True)
+        click.echo(f"{counted(written, 'track')}{of}, {tracks.losses()}{reason}", err=True)
 
 
 def _max_repeats(place: Endpoint) -> int:

@@ -21,7 +21,7 @@ from catstream.errors import RecordingError, ServiceError
 from catstream.extras import require_extra
 from catstream.job import Job, Results
 from catstream.messages import Track
-from catstream.names import UNNAMED
+from catstream.names import UNNAMED, doubtful, listed
 from catstream.pipeline import Pipeline
 from catstream.recording.file import Recording
 from catstream.services.options import named, with_given, with_object, with_part, with_reading
@@ -180,10 +180,17 @@ def track(
     _check_models(saved, overwrite)
     if UNNAMED in saved and len(boxes) + len(models) > 1:
         raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
+    console = Console(stderr=True, soft_wrap=True)
+    if (boxes or models) and (unknown := saved.keys() - {*boxes, *models}):
+        console.print(
+            f"there is no object {listed(sorted(unknown))} yet: its model is saved if one begins under this name",
+            highlight=False,
+        )
+    for line in doubtful(boxes, *pipeline.size):
+        console.print(line, highlight=False)
     if resume is not None:
         pipeline = pipeline.starting_after(files.position())
     output = results.output
-    console = Console(stderr=True, soft_wrap=True)
     if resume is not None and pipeline.complete:
         if boxes:
             raise click.UsageError(f"{_complete(pipeline, resume, output)}: no frame is left for a box")
@@ -205,6 +212,8 @@ def track(
                 console.print(f"recording: {record}, {recording}", highlight=False)
     if resume is not None and not run.frames and not interrupted:
         console.print(f"no frames were left to track: the run in {resume} is complete", highlight=False)
+    for file in results.models.values():
+        console.print(f"saved model: {file}", highlight=False)
     if interrupted:
         hint = f"; to continue: catstream track --resume {state or resume}" if state or resume else ""
         console.print(f"stopped: the results so far are kept{hint}", highlight=False)

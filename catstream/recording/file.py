@@ -19,6 +19,7 @@ from typing import BinaryIO, Self, TypeVar
 
 from catstream.errors import ProtocolError, RecordingError
 from catstream.messages import End, Features, Health, Model, Run, Track
+from catstream.names import counted
 from catstream.recording.container import (
     MAGIC,
     Entry,
@@ -56,7 +57,7 @@ _TOPICS = list(TOPICS.values())
 _NUMBERS = {kind: number for number, kind in enumerate(TOPICS, 1)}
 _KINDS = {number: kind for kind, number in _NUMBERS.items()}
 
-_NOUNS = {Features: "features", Model: "models", Track: "tracks", Health: "reports of health"}
+_NOUNS = {Features: "feature", Model: "model", Track: "track", Health: "health report"}
 
 
 class RecordingWriter:
@@ -214,10 +215,10 @@ class Recording:
 
     def __str__(self) -> str:
         """A summary for a person."""
-        counts = ", ".join(f"{self.counts[kind]} {noun}" for kind, noun in _NOUNS.items())
-        lost = [f"{number} {_NOUNS[kind]}" for kind, number in self.missing.items() if number]
-        damaged = f"; {self.damaged} damaged bytes are skipped" * bool(self.damaged)
-        torn = f"; {self.torn} torn bytes at its end are skipped" * bool(self.torn)
+        counts = ", ".join(counted(self.counts[kind], noun) for kind, noun in _NOUNS.items())
+        lost = [counted(number, _NOUNS[kind]) for kind, number in self.missing.items() if number]
+        damaged = f"; {counted(self.damaged, 'damaged byte')} skipped" * bool(self.damaged)
+        torn = f"; {counted(self.torn, 'torn byte')} at its end skipped" * bool(self.torn)
         cut = "; it ends before the run did" * (self.end is None)
         return f"{counts}, {self.size / 1e6:.0f} MB; {' and '.join(lost) or 'none'} missing{cut}{damaged}{torn}"
 

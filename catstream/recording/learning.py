@@ -13,6 +13,7 @@ from catstream.errors import RecordingError
 from catstream.heads import APPEARANCE
 from catstream.learned import begun
 from catstream.messages import Features, Model, ObjectFeatures
+from catstream.names import counted
 from catstream.recording.file import Recording
 from catstream.settings import Settings
 from catstream.threads import one_thread
@@ -89,8 +90,8 @@ def require_features(recording: Recording, *, incomplete: bool = False) -> None:
         raise RecordingError(f"{recording.path} holds no features to learn from: {recording}")
     if (missing := recording.missing[Features]) and not incomplete:
         raise RecordingError(
-            f"{recording.path} misses the features of {missing} frames, so the models cannot be reproduced: record a "
-            "whole run with `catstream track --record`, or train from the features that it has (--incomplete)"
+            f"{recording.path} misses the features of {counted(missing, 'frame')}, so the models cannot be reproduced: "
+            "record a whole run with `catstream track --record`, or train from the features that it has (--incomplete)"
         )
 
 

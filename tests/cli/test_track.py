@@ -173,7 +173,7 @@ def test_damaged_frames_are_skipped_if_requested_and_counted(video, said, tmp_pa
         good = sum(1 for _ in whole)
     code, _, errors = said("track", damaged, "--box", box, "--output", tmp_path / "out", "--skip-damaged")
     assert code == 0, errors
-    assert "frames could not be decoded, and were skipped" in errors
+    assert "frames could not be decoded, and skipped" in errors
     assert readable(damaged) < len((tmp_path / "out" / "damaged.txt").read_text().splitlines()) == good < 32
 
 
@@ -292,3 +292,17 @@ def readable(path):
     with open_source(path) as source, pytest.raises(VideoError, match="is damaged at frame"):
         frames.extend(frame.number for frame in source)
     return len(frames)
+
+
+def test_what_is_hardly_meant_is_said_before_the_run_and_models_that_were_saved_after_it(video, said, tmp_path):
+    source, box = video
+    words = ["--box", f"a={box}", "--box", f"b={box}", "--save-model", f"a={tmp_path / 'a'}"]
+    code, _, errors = said("track", source, *words, "--end", 24)
+    assert code == 0, errors
+    assert "a and b have the same box: each costs time" in errors
+    assert f"saved model: {tmp_path / 'a'}" in errors.replace("\n", "")
+    code, _, errors = said("track", source, "--box", f"a={box}", "--save-model", f"c={tmp_path / 'c'}", "--end", 12)
+    first, last = errors.splitlines()[0], errors.splitlines()[-1]
+    assert code == 1
+    assert first == "there is no object c yet: its model is saved if one begins under this name"
+    assert "c" in last

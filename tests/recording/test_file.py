@@ -100,7 +100,7 @@ def test_a_changed_bit_invalidates_its_own_message_only(tmp_path_factory, share,
     if not all(kept):
         size = places[kept.index(False)][1]
         assert (recording.damaged, recording.torn) == (size, 0)
-        assert f"{size} damaged bytes are skipped" in str(recording)
+        assert f"{size} damaged bytes skipped" in str(recording)
 
 
 def test_a_hole_costs_the_messages_that_lie_in_it(written):

@@ -55,7 +55,7 @@ def test_other_settings_give_other_models_of_the_same_rows(said, written, change
 
 def test_if_features_are_missing_nothing_is_learned_unless_requested(said, written):
     recording = Recording(written([message for message in said if getattr(message, "seq", 0) != 4]))
-    with pytest.raises(RecordingError, match="misses the features of 1 frames"):
+    with pytest.raises(RecordingError, match="misses the features of 1 frame,"):
         learn(recording, recording.settings)
     result = learn(recording, recording.settings, incomplete=True)
     assert result.models
