@@ -26,8 +26,8 @@ const box = [120, 90, 60, 50];
 const names = ["", anna.name, ben.name, carl.name];
 const byName = (value) => Object.fromEntries(names.map((name) => [name, value]));
 const points = [...Array(40).keys()].map((n) => [n / 4, 60 + n, byName([Math.sin(n / 6) / 2 + 0.5, 0.2, Math.floor(n / 4), n < 30])]);
-const heads = [0, 1, 2, 3].map((place) => ({ title: `Tree ${place}`, meaning: "what it summarises" }));
-const trees = (...leaves) => ({ heads, objects: leaves.length ? byName({ leaves, bytes: 4e6, rows: 5120 }) : {} });
+const kinds = [0, 1, 2, 3].map((place) => ({ title: `Tree ${place}`, meaning: "what it summarises" }));
+const trees = (...leaves) => ({ kinds, objects: leaves.length ? byName({ leaves, bytes: 4e6, rows: 5120 }) : {} });
 const frames = (...objects) => objects.map(({ name, colour }, place) => ({ frame: 20 + 70 * place, time: 1 + 3 * place, object: name, colour,
   surprise: 1 + place / 2, box, width: 320, height: 240 }));
 const nothing = { tracks: tracks(), picture: null, trees: trees(), surprising: { measured: 0, frames: [] } };
