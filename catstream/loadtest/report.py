@@ -15,11 +15,13 @@ from catstream.loadtest.latencies import PERCENTILES, Latencies
 from catstream.loadtest.load_test import LoadTest
 from catstream.loadtest.measures import Measures
 from catstream.loadtest.run import Result
-from catstream.loadtest.usage import summary
+from catstream.loadtest.usage import REST, summary
+from catstream.names import counted
 
 __all__ = ["write_report"]
 
 _STREAMS = 6  # maximum number of curves in a plot
+_SUSTAINED = 0.01  # share of skipped frames up to which a rate counts as sustained
 _POINTS = 200  # maximum number of points of a curve over time
 
 
@@ -42,6 +44,7 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
         "load test",
         [
             "<h1>Load test</h1>",
+            _verdict(result),
             f'<p class="about">{about}</p>',
             *(f'<p class="bad">{escape(error)}</p>' for error in result.errors),
             _limits(load_test),
@@ -61,6 +64,19 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
             "<h2>Settings that are not the default</h2>",
             f"<pre>{escape(chr(10).join(plan.settings.changed()) or 'none')}</pre>",
         ],
+    )
+
+
+def _verdict(result: Result) -> str:
+    """Whether every stream was followed at its rate, or where and when most frames were skipped."""
+    worst, measures = max(enumerate(result.streams), key=lambda each: each[1].skipped_share)
+    rate = f"{counted(len(result.streams), 'stream')} of {result.plan.rate:g} frames/s"
+    if measures.skipped_share <= _SUSTAINED:
+        return f'<p class="good">Sustained: {rate}, at most {100 * measures.skipped_share:.1f} % of the frames skipped.</p>'
+    since = measures.due[~measures.followed][0] - measures.due[0]
+    return (
+        f'<p class="bad">Not sustained: of {rate}, stream {worst} skipped {100 * measures.skipped_share:.1f} % of its '
+        f"frames, the first after {since:.1f} s: it was followed at {measures.rate(result.plan.rate):.1f} frames/s.</p>"
     )
 
 
@@ -97,7 +113,7 @@ def _steps(load_test: LoadTest) -> str:
 
 def _streams(result: Result) -> str:
     heads = ["stream", "frames", "frames/s", "skipped", *(f"track {name}" for name in PERCENTILES)]
-    heads += [f"model {name}" for name in ("p50", "p99")] + ["lag", "not stored", "success", "of tracked"]
+    heads += [f"model {name}" for name in ("p50", "p99")] + ["lag", "not stored", "success", "success of tracked"]
     rows = [
         [
             number,
@@ -122,7 +138,8 @@ def _streams(result: Result) -> str:
     note = (
         '<p class="about">Latencies in milliseconds. Lag: maximum number of messages that the compressor had not yet '
         "received. Success: share of frames with an overlap with the ground truth above 0.5; a skipped frame has the "
-        "last known box.</p>"
+        "last known box. Success of tracked: the same over the frames that were not skipped. Not stored: features "
+        "messages that were not in the coreset trees at the end.</p>"
     )
     return table(heads, rows, means=several) + note
 
@@ -146,7 +163,10 @@ def _plots(result: Result) -> str:
         _lines("Lag of the compressor", seconds, "messages", lag, minimum=5),
     ]
     for title, unit, column, scale in (("Processor", "cores", 1, 1.0), ("Memory", "MB", 2, 1e-6)):
-        parts.append(_lines(title, seconds, unit, _kinds(result, column, scale, start)))
+        kinds = _kinds(result, column, scale, start)
+        if title == "Memory":  # that of all other programs would set the scale
+            kinds.pop(REST, None)
+        parts.append(_lines(title, seconds, unit, kinds))
     return f'<div class="plots">{"".join(parts)}</div>'
 
 

@@ -241,7 +241,7 @@ class Monitor:
                 break
             if now - self._last_reading >= _READING_SECONDS:
                 self._last_reading = now
-                own = {"camera": [self._camera.pid], "this process": [getpid()]}
+                own = {"camera": [self._camera.pid], "load test": [getpid()]}
                 self.usage.read(now, self._pids() | own)
             passed = min(max(now - schedules[0].start, 0.0), self._plan.duration)
             latest = max(

@@ -42,6 +42,20 @@ def test_a_search_shows_the_highest_rate_and_the_violations_of_the_others(result
     assert [step["rate"] for step in to_json(load_test)["steps"]] == [25.0, 50.0, 37.5]
 
 
+@pytest.mark.parametrize(
+    ("followed", "told"),
+    [
+        (1.0, "Sustained: 2 streams of 25 frames/s, at most 0.0 %"),
+        (0.8, "stream 0 skipped 20.0 % of its frames, the first after 4.0 s"),
+    ],
+)
+def test_the_report_begins_with_whether_the_rate_was_sustained(result, tmp_path, followed, told):
+    run = result([0.01] * 50, [0.01] * 50, followed=followed)
+    page = write_report(tmp_path / "report.html", LoadTest([], False, [Step(run, run.errors)])).read_text()
+    assert told in page
+    assert page.index("ustained") < page.index("<h2>Streams</h2>")
+
+
 def test_a_search_without_a_result_is_reported(result, tmp_path):
     load_test = is_search(result([0.3] * 50))
     assert load_test.violations == ["no rate meets p99=0.1: the lowest tried was 25"]
