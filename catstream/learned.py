@@ -102,6 +102,7 @@ class Learned:
         """Raise SettingsError if a run with these settings cannot continue the trees."""
         _check_same(self.settings, settings, "the saved model was learned", "this run has")
 
+    @one_thread()
     def likeness(self) -> Likeness:
         """Measures the likeness of a window to the object, from the trees: see `catstream.detection.likeness`."""
         tree, background = self.trees["object"], self.trees["background"]
@@ -223,6 +224,7 @@ def begun(features: Features, settings: Settings) -> dict[str, Compressor]:
     }
 
 
+@one_thread()  # of the trees, too: more threads add in another order, which changes the bits
 def merge(parts: Sequence[Learned], *, force: bool = False) -> Learned:
     """One saved model from several of the same object, as if one stream had contained all their frames.
 
@@ -292,8 +294,7 @@ def _check_alike(parts: Sequence[Learned]) -> None:
 
     The models are connected by their highest likenesses, as in a maximum spanning tree; the lowest of these decides.
     """
-    with one_thread():
-        measures = [part.likeness() for part in parts]
+    measures = [part.likeness() for part in parts]
     means = [(tree.sum / tree.rows_seen).astype(np.float32) for tree in (part.trees["object"] for part in parts)]
     lowest, connected, rest = (1.0, 0, 0), [0], set(range(1, len(parts)))
     while rest:
@@ -312,7 +313,7 @@ def _check_alike(parts: Sequence[Learned]) -> None:
             )
         warnings.warn(
             f"{text}, that of one object is mostly above {_DOUBTFUL}): check that the object is the same",
-            stacklevel=3,
+            stacklevel=4,  # the caller of the decorated `merge`
         )
 
 

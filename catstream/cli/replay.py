@@ -137,8 +137,9 @@ def _learn(
     Console().print(table)
     if differing and not incomplete:
         raise RecordingError(
-            f"{differing} of {recorded} recorded models were not reproduced: the machine, or the version of a "
-            f"library, differs from that of the recording by catstream {recording.run.program}"
+            f"{differing} of {recorded} recorded models were not reproduced: they were recorded by catstream "
+            f"{recording.run.program} on another kind of processor (OpenBLAS chooses its instructions by it), with "
+            "another version of catstream, numpy, scipy or OpenBLAS, or with OPENBLAS_NUM_THREADS set"
         )
 
 
