@@ -19,6 +19,7 @@ __all__ = [
     "check_name",
     "counted",
     "doubtful",
+    "is_name",
     "listed",
     "split_name",
 ]
@@ -34,6 +35,11 @@ _SAME = 0.95  # overlap of boxes that were meant to be one
 _NAME = re.compile(rf"(\w[\w.-]{{0,{_LONGEST - 1}}})?")
 
 
+def is_name(text: str) -> bool:
+    """Whether a text may be the name of an object."""
+    return _NAME.fullmatch(text) is not None
+
+
 def check_name(name: str) -> str:
     """Return the name of an object; raise ObjectError if it is not valid.
 
@@ -42,7 +48,7 @@ def check_name(name: str) -> str:
     >>> check_name("anna-2")
     'anna-2'
     """
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise ObjectError(
             f"{name[:80]!r} is not a name: expected 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
             "the first of them a letter, a digit or '_'"

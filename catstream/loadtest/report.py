@@ -72,7 +72,8 @@ def _verdict(result: Result) -> str:
     worst, measures = max(enumerate(result.streams), key=lambda each: each[1].skipped_share)
     rate = f"{counted(len(result.streams), 'stream')} of {result.plan.rate:g} frames/s"
     if measures.skipped_share <= _SUSTAINED:
-        return f'<p class="good">Sustained: {rate}, at most {100 * measures.skipped_share:.1f} % of the frames skipped.</p>'
+        most = f"at most {100 * measures.skipped_share:.1f} % of the frames skipped"
+        return f'<p class="good">Sustained: {rate}, {most}.</p>'
     since = measures.due[~measures.followed][0] - measures.due[0]
     return (
         f'<p class="bad">Not sustained: of {rate}, stream {worst} skipped {100 * measures.skipped_share:.1f} % of its '

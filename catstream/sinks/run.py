@@ -169,12 +169,15 @@ class RunFiles:
         """Return the results files, including the video."""
         if self.output is None:
             return []
-        files = results.result_files(self.name, self.objects or [UNNAMED])
+        # An object that begins later finds no file of an earlier run in its place.
+        left = results.objects_of(self.output, self.name) - {*self.objects}
+        files = results.result_files(self.name, [*(self.objects or [UNNAMED]), *sorted(left)])
         return [*(self.output / file for file in files), self._video_file()]
 
     def _discard_objects(self, folder: Path) -> None:
         """Remove the files of objects that are to be replaced, and those of an earlier run."""
         earlier = {track.object for track in results.read_tracks(folder, self.name)}
+        earlier |= results.objects_of(folder, self.name)
         for name in {*self.objects, *earlier} - ({UNNAMED} & {*self.objects}):  # which the writer replaces itself
             for file in results.object_files(self.name, name):
                 discard(folder / file)

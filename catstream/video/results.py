@@ -14,15 +14,18 @@ for byte, except for the measured times.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
+import sys
 from collections.abc import Iterator, Sequence
+from glob import escape
 from pathlib import Path
 from typing import IO, Self, get_args
 
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import State, Track
-from catstream.names import check_name
+from catstream.names import UNNAMED, check_name, is_name
 
 __all__ = [
     "COLUMNS",
@@ -30,11 +33,14 @@ __all__ = [
     "complete_rows",
     "format_row",
     "object_files",
+    "objects_of",
     "parse_row",
     "read_tracks",
     "result_files",
     "table_file",
 ]
+
+_log = logging.getLogger(__name__)
 
 #: Header of NAME.csv.
 COLUMNS = "frame,seconds,state,x,y,w,h,score,model_version,object"
@@ -54,6 +60,25 @@ def object_files(name: str, thing: str) -> tuple[str, ...]:
         return f"{name}.txt", f"{name}_confidence.value", f"{name}_time.txt"
     # No name of another object gives one of these: `a_time` has the boxes a_time.txt, and `a` the times a_time.value.
     return f"{name}-{thing}.txt", f"{name}-{thing}_confidence.value", f"{name}-{thing}_time.value"
+
+
+def objects_of(directory: Path, name: str) -> set[str]:
+    """Return the names of the objects of a source that have files in a folder, also those left of an earlier run."""
+    found = (path.stem.removeprefix(f"{name}-") for path in directory.glob(f"{escape(name)}-*.txt"))
+    # With a table of its own it is no object, but a source of such a name.
+    return {
+        thing
+        for thing in found
+        if is_name(thing)
+        and not _is_taken(directory, name, thing)
+        and not (directory / table_file(f"{name}-{thing}")).exists()
+    }
+
+
+def _is_taken(directory: Path, name: str, thing: str) -> bool:
+    """Whether a file of something else has the name of an object's boxes: their own come after those of the scores."""
+    boxes, scores, _ = (directory / file for file in object_files(name, thing))
+    return thing != UNNAMED and boxes.exists() and not scores.exists()
 
 
 def result_files(name: str, objects: Sequence[str]) -> tuple[str, ...]:
@@ -91,7 +116,8 @@ class ResultsWriter:
     directory : folder of the results; it is made if it does not exist
     name : name of the run, usually that of the source
     keep : continue the existing files after the frames before `keep`; None replaces the table and the files of an
-        object without a name, and a file of an object with a name must not exist
+        object without a name. A file of something else that has the name of an object's file is kept: the tracks of
+        this object are in the table only, and a warning says so
 
     Raises
     ------
@@ -134,6 +160,8 @@ class ResultsWriter:
                 if thing not in self._objects:
                     self._begin(thing)
             for thing, files in self._objects.items():
+                if not files:
+                    continue
                 row = _row(found[thing], seconds) if thing in found else _NOTHING
                 for file, text, nothing in zip(files, row, _NOTHING, strict=True):
                     file.write((frame - self.rows) * f"{nothing}\n" + f"{text}\n")
@@ -148,15 +176,18 @@ class ResultsWriter:
     def _begin(self, thing: str) -> None:
         """Open the files of an object, with a row for each frame so far."""
         files: list[IO[str]] = []
-        for file, nothing in zip(object_files(self.name, thing), _NOTHING, strict=True):
-            path = self.directory / file
-            if thing and not self._continues and path.exists():
-                raise VideoError(f"{path} exists already: replace it with --overwrite, or give the object another name")
+        paths = [self.directory / file for file in object_files(self.name, thing)]
+        if _is_taken(self.directory, self.name, thing) or (thing and not self._continues and paths[0].exists()):
+            table = table_file(self.name)
+            _log.warning("%s exists already and is kept: the boxes of %s are in %s only", paths[0], thing, table)
+            self._objects[thing] = []
+            return
+        for path, nothing in reversed([*zip(paths, _NOTHING, strict=True)]):
             ends = _row_ends(path)[: self.rows + 1] if self._continues else [0]
             if self._continues and path.exists():
                 os.truncate(path, ends[-1])
-            files.append(self._open(path, "a" if self._continues else "w"))
-            files[-1].write((self.rows + 1 - len(ends)) * f"{nothing}\n")
+            files.insert(0, self._open(path, "a" if self._continues else "w"))
+            files[0].write((self.rows + 1 - len(ends)) * f"{nothing}\n")
         self._objects[thing] = files
 
     def _open(self, path: Path, mode: str) -> IO[str]:
@@ -183,7 +214,9 @@ def read_tracks(directory: Path, name: str) -> Iterator[Track]:
 
 
 def complete_rows(directory: Path, name: str, thing: str) -> int:
-    """Return the number of rows that are complete in every file of an object."""
+    """Return the number of rows that are complete in every file of an object; infinitely many if it has no files."""
+    if _is_taken(directory, name, thing):
+        return sys.maxsize
     return min(len(_row_ends(directory / file)) - 1 for file in object_files(name, thing))
 
 

@@ -208,3 +208,22 @@ def test_a_frame_counts_only_if_it_is_whole_at_each_byte_at_which_a_file_can_end
         run.files[0].write_bytes(data[:end])
         held = sum(line in data[:end] for line in tracks)
         assert run.position().seq == (3 if held == 8 else 2 if held >= 5 else 1 if held > 2 else 0)
+
+
+def test_files_that_an_earlier_run_left_of_an_object_are_seen_before_the_run_and_replaced_only_if_told_so(files):
+    run = files("run", [])
+    with run.opened(resume=False) as keep:
+        keep(frame_of(0, ["anna", "carla"]), 0.01)
+    run.output.joinpath("demo.csv").unlink()
+    source_of_such_a_name = run.output / "demo-2.csv"
+    for name in ("demo-2.csv", "demo-2.txt", "demo-2_confidence.value", "demo-2_time.txt"):
+        (run.output / name).write_text("kept")
+    with pytest.raises(VideoError, match=r"already \(demo-anna\.txt.*demo-carla\.txt"):
+        run.check_writable(overwrite=False, resumable=False)
+    run.check_writable(overwrite=True, resumable=False)
+    with run.opened(resume=False) as keep:
+        keep(frame_of(0, [""]), 0.01)
+        keep(frame_of(1, ["", "carla"]), 0.01)
+    assert len((run.output / "demo-carla.txt").read_text().splitlines()) == 2
+    assert not (run.output / "demo-anna.txt").exists()
+    assert source_of_such_a_name.read_text() == (run.output / "demo-2.txt").read_text() == "kept"

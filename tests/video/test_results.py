@@ -76,11 +76,15 @@ def test_each_object_with_a_name_has_its_own_files_with_a_row_for_every_frame(tm
     assert table == [["0", "anna"], ["2", "zoë"], ["2", "anna"], ["3", "zoë"]]
 
 
-def test_a_file_of_another_run_that_has_the_name_of_an_object_file_is_kept(tmp_path):
+def test_a_file_of_something_else_that_has_the_name_of_an_object_file_is_kept(tmp_path, caplog):
     (tmp_path / "walk-2.txt").write_text("dear to somebody")
-    with ResultsWriter(tmp_path, "walk") as results, pytest.raises(VideoError, match=r"walk-2\.txt exists already"):
-        results.write([named("2", 0)], 0.01)
+    for keep in (None, 1):
+        with ResultsWriter(tmp_path, "walk", keep=keep) as results:
+            results.write([named("2", keep or 0), named("anna", keep or 0)], 0.01)
     assert (tmp_path / "walk-2.txt").read_text() == "dear to somebody"
+    assert "the boxes of 2 are in walk.csv only" in caplog.text
+    assert len(rows(tmp_path / "walk-anna.txt")) == 2
+    assert len((tmp_path / "walk.csv").read_text().splitlines()) == 5
 
 
 def test_the_same_tracks_give_the_same_bytes(tmp_path):
