@@ -19,7 +19,6 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from secrets import token_hex
 from typing import Self
 
 from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
@@ -231,7 +230,6 @@ class Pipeline:
         return replace(
             self._job,
             endpoint=endpoint,
-            run=token_hex(8),
             owned=True,
             record=self._record,
             state=self._state and self._state.absolute(),

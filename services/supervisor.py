@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from secrets import token_hex
 
 from catstream.errors import ServiceError
 from catstream.job import Job
@@ -43,9 +44,9 @@ class Supervisor:
     """
 
     def __init__(self, job: Job, folder: Path) -> None:
-        # A restarted detector continues the timestamps of a live source.
+        # A restarted detector continues the timestamps of a live source, and every process the run.
         since = time.monotonic() if job.since is None else job.since
-        file = replace(job, state=job.state or folder, since=since).save(folder)
+        file = replace(job, state=job.state or folder, since=since, run=token_hex(8)).save(folder)
         self._checked = time.monotonic()
         self._children = {name: Child(name, file, folder) for name in NAMES}
         for child in self._children.values():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from dataclasses import replace
 
 import cv2
 import psutil
@@ -161,6 +162,38 @@ def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder):
         assert supervisor.restarts == 6
     finally:
         supervisor.stop()
+
+
+def test_a_process_that_is_restarted_continues_the_run_and_a_resume_is_another_one(video, folder):
+    path, boxes = video
+    job, runs = Job(path, {"": boxes[0]}, endpoint=str(folder), owned=True), []
+    for resume in (False, True):
+        supervisor = Supervisor(replace(job, resume=resume), folder)
+        try:
+            with Subscriber(HEALTH, Endpoint.parse(str(folder))) as reports:
+                before = runs_of_all(supervisor, reports)
+                os.kill(killed := supervisor.pids["detector"], signal.SIGKILL)
+                while supervisor.pids.get("detector", killed) == killed:
+                    supervisor.check_children()
+            with Subscriber(HEALTH, Endpoint.parse(str(folder))) as reports:
+                assert runs_of_all(supervisor, reports) == before
+        finally:
+            supervisor.stop()
+        assert len(before) == 1, "the processes agree"
+        runs += before
+    assert len(set(runs)) == 2
+    assert "" not in runs
+
+
+def runs_of_all(supervisor, reports):
+    """The runs that the health reports of all processes are from."""
+    runs, deadline = {}, time.monotonic() + 60
+    while runs.keys() < set(NAMES) and time.monotonic() < deadline:
+        supervisor.check_children()
+        if (report := reports.receive(0.1)) is not None:
+            runs[report.process] = reports.run
+    assert runs.keys() == set(NAMES)
+    return set(runs.values())
 
 
 def check_for_a_minute(supervisor, turn=lambda: None):
