@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from secrets import token_hex
 from typing import Self
 
 from catstream.messages import End, Features, Health, Model, Run, Track
@@ -34,6 +35,7 @@ class Player:
 
     def __init__(self, recording: Recording, endpoint: Endpoint) -> None:
         self._recording = recording
+        endpoint = replace(endpoint, run=token_hex(8))  # a page does not mix it with what was here before
         with ExitStack() as stack:
             self._publishers = {
                 name: stack.enter_context(Publisher(CHANNELS[name], endpoint, first_message=first_message))

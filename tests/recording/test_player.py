@@ -66,6 +66,18 @@ def test_a_subscriber_receives_all_recorded_messages_until_the_end(said, written
     assert tracks.missed == 0
 
 
+def test_each_replay_is_a_run_of_its_own(said, written, endpoint):
+    recording, runs = Recording(written(said)), []
+    for _ in range(2):
+        with Subscriber(TRACKS, endpoint) as tracks, Player(recording, endpoint) as player:
+            player.wait()
+            list(player.play(None))
+            assert tracks.receive(10) is not None
+            runs.append(tracks.run)
+    assert "" not in runs
+    assert runs[0] != runs[1], "a page that shows the first one has to begin anew"
+
+
 def test_a_subscriber_to_one_object_receives_its_recorded_tracks_and_no_others(said_of_two, written, playing, endpoint):
     playing(Recording(written([*said_of_two, End(51, "the source has ended")])))
     with catstream.subscribe(str(endpoint), "tracks", object="ben", timeout=30) as tracks:
