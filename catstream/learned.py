@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -25,7 +25,7 @@ from catstream.detection.likeness import Likeness
 from catstream.errors import MissingFileError, ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
 from catstream.heads import TREES
-from catstream.messages import Features, Model
+from catstream.messages import LARGEST_GIVEN_MODEL, LARGEST_GIVEN_MODELS, Features, Model
 from catstream.names import check_name, listed
 from catstream.packing import pack, unpack
 from catstream.settings import Settings
@@ -34,7 +34,7 @@ from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 from catstream.wire.checks import check_message
 
-__all__ = ["Learned", "begun", "merge"]
+__all__ = ["Learned", "begun", "check_sizes", "merge"]
 
 _KIND = "learned 3"  # and the version of what the file holds
 
@@ -205,6 +205,27 @@ class Learned:
             tree, width = self.trees[name], len(self.model.weights) + kind.more_columns
             if tree.size != self.settings.coreset.size or tree.width not in (0, width):
                 raise ValueError(f"its tree {name!r} has {tree.size} rows of length {tree.width}")
+
+
+def check_sizes(sizes: Mapping[str, int]) -> None:
+    """Raise SettingsError if the saved models that objects begin with in one frame are too large for a message.
+
+    Parameters
+    ----------
+    sizes : bytes of each, by the object's name
+    """
+    advice = "track fewer at once, or learn them again with a smaller coreset.size"
+    for name, size in sizes.items():
+        if size > LARGEST_GIVEN_MODEL:
+            raise SettingsError(
+                f"the saved model of {listed([name])} has {size >> 20} MiB, at most {LARGEST_GIVEN_MODEL >> 20} are "
+                f"possible: {advice}"
+            )
+    if (together := sum(sizes.values())) > LARGEST_GIVEN_MODELS:
+        raise SettingsError(
+            f"the saved models of {listed(sizes)} have {together >> 20} MiB together, at most "
+            f"{LARGEST_GIVEN_MODELS >> 20} can begin in one frame: {advice}"
+        )
 
 
 def begun(features: Features, settings: Settings) -> dict[str, Compressor]:

@@ -65,8 +65,11 @@ Verb = Literal["set-box", "search", "forget", "pause", "resume", "save", "stop"]
 #: Bytes of a saved model at most.
 LARGEST_MODEL = 511 << 20
 
-#: The same for one that is given by a command.
+#: The same for one that an object begins with.
 LARGEST_GIVEN_MODEL = 63 << 20
+
+#: Bytes at most of all saved models that objects begin with in one frame: one message contains them.
+LARGEST_GIVEN_MODELS = 200 << 20
 
 #: The state of a stream of a fleet: "waiting" is for a box, "unplaced" is without a node that fits.
 StreamState = Literal["starting", "running", "waiting", "paused", "moving", "unplaced", "failed", "ended"]
@@ -174,7 +177,7 @@ class ObjectFeatures:
     training: Annotated[dict[str, TrainingRows], Named(dict.fromkeys(GROUPS, 0))] = field(default_factory=dict)
     detector: DetectorState | None = None
     begins: bool = False
-    model: Annotated[bytes, Bytes("a saved model", longest=LARGEST_MODEL, begin=b"")] = b""
+    model: Annotated[bytes, Bytes("a saved model", longest=LARGEST_GIVEN_MODEL, begin=b"")] = b""
 
 
 @dataclass(frozen=True, slots=True)

@@ -136,7 +136,7 @@ def check_count(count: int, most: int) -> None:
     if count > most:
         raise ObjectError(
             f"{count} objects are more than {most}: follow fewer, or raise the limit "
-            f"(--set run.objects_most={count}, up to 256)"
+            f"(--set run.objects_most={count}, up to 64)"
         )
 
 

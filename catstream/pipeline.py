@@ -23,7 +23,7 @@ from typing import Self
 
 from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
 from catstream.job import Job, Results
-from catstream.learned import Learned
+from catstream.learned import Learned, check_sizes
 from catstream.messages import End, Health, ObjectPosition, Position, Track, Tracks
 from catstream.names import UNNAMED, Boxes, boxes_by_name, check_boxes, check_name
 from catstream.services.start_server import start_server, start_server_lines
@@ -167,6 +167,7 @@ class Pipeline:
         self._job = replace(job, source=path, size=self.size, settings=job.settings.for_length(self.frames))
         for file in job.models.values():
             Learned.load(file).check_fits(self._job.settings)
+        check_sizes({name: file.stat().st_size for name, file in job.models.items()})
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
         self._record, self._save_models = _path(record), _files_by_name(save_model)

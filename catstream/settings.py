@@ -117,7 +117,7 @@ class RunSettings(_Group):
     ] = 256
     objects_most: Annotated[
         int,
-        _about("Objects that a stream may have at most: each takes memory and time of its own.", ge=1, le=256),
+        _about("Objects that a stream may have at most: each takes memory and time of its own.", ge=1, le=64),
     ] = 32
     checkpoint_seconds: Annotated[
         float,

@@ -14,7 +14,7 @@ from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, ObjectError
 from catstream.features.pyramid import Pyramid
-from catstream.learned import Learned
+from catstream.learned import Learned, check_sizes
 from catstream.messages import Answer, Command
 from catstream.names import UNNAMED, check_count, check_name, listed
 from catstream.services.desired import DesiredState
@@ -184,9 +184,11 @@ class CommandHandler:
                 check_count(len(self.desired.objects) + 1, settings.run.objects_most)
             learned = Learned.from_bytes(command.model or b"", "the file")
             learned.check_fits(settings)
+            new = self.desired.begun(name, learned.box, seq + 1, self.models.add(learned))
+            check_sizes({other: self.models.size(each.model) for other, each in new.objects.items() if each.begins > seq})
         except CatstreamError as error:
             return self._answer(command, False, str(error))
-        self.desired = self.desired.begun(name, learned.box, seq + 1, self.models.add(learned))
+        self.desired = new
         reason = f"{listed([name])} is searched for from frame {seq} on, by model {learned.model.version}"
         return self._answer(command, True, reason, name)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+from contextlib import nullcontext
 from itertools import islice
 
 import numpy as np
@@ -16,7 +17,7 @@ from catstream.compression.reduce import energy
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
 from catstream.heads import APPEARANCE, EXTENT, TREES
-from catstream.learned import Learned, merge
+from catstream.learned import Learned, check_sizes, merge
 from catstream.messages import DetectorState, ObjectFeatures, TrainingRows
 from catstream.settings import Settings
 from catstream.tracker import Tracker
@@ -273,3 +274,17 @@ def test_a_file_without_any_of_its_parts_is_an_error(learned):
             Learned.from_bytes(storage.encode(rest | {name: np.float32([[np.nan]])}, metadata), "one")
         with pytest.raises(ProtocolError, match="not a saved model"):
             Learned.from_bytes(storage.encode(rest | {name: np.float32(1)}, metadata), "one")
+
+
+@pytest.mark.parametrize(
+    ("mebibytes", "message"),
+    [
+        ({"anna": 63, "ben": 63, "": 63}, None),
+        ({"anna": 64}, "the saved model of anna has 64 MiB, at most 63 are possible: .*coreset.size"),
+        ({"a": 60, "b": 60, "c": 60, "d": 30}, "of a, b, c, d have 210 MiB together, at most 200 can begin in one frame"),
+    ],
+)
+def test_saved_models_that_begin_in_one_frame_fit_into_a_message(mebibytes, message):
+    sizes = {name: size << 20 for name, size in mebibytes.items()}
+    with nullcontext() if message is None else pytest.raises(SettingsError, match=message):
+        check_sizes(sizes)

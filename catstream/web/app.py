@@ -172,11 +172,10 @@ def _command(body: bytes | None) -> _Command:
     if body is None:
         raise ValueError("expected a command, got more than 4096 bytes")
     try:
-        command: object = json.loads(
-            body, parse_int=float
-        )  # an integer that is too large becomes infinite, and is rejected
-    except RecursionError:
-        raise ValueError("expected a command, got deeply nested JSON") from None
+        # An integer that is too large becomes infinite, and is rejected.
+        command: object = json.loads(body, parse_int=float)
+    except (RecursionError, ValueError) as error:
+        raise ValueError(f"expected a command in JSON: {error}") from None
     if not isinstance(command, dict) or command.get("verb") not in _VERBS:
         raise ValueError(f'expected "verb": one of {", ".join(_VERBS)}')
     verb, name, box, keep = (command.get(key, default) for key, default in _DEFAULTS.items())

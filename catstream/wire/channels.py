@@ -109,7 +109,7 @@ class Channel(Generic[Message]):
 
 
 _ALL = ("detector", "compressor", "trainer")
-_FEATURES = 1280  # MiB: an object takes 4.3 MB in its first frame, and there are at most 256
+_FEATURES = 512  # MiB: an object takes 4.3 MB in its first frame, there are at most 64, and their saved models
 
 FEATURES: Channel[Features | End] = Channel(
     "features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES

@@ -259,3 +259,17 @@ def test_commands_that_wait_when_the_stream_ends_are_rejected():
     assert handler.carry_out([Command("1", "forget", object="anna")], repeats=True) == []
     (answer,) = handler.end("it was stopped")
     assert (answer.id, answer.done, answer.reason) == ("1", False, "the pipeline is ending: it was stopped")
+
+
+def test_a_saved_model_that_is_too_large_for_the_message_of_a_frame_is_refused_and_the_run_goes_on(monkeypatch):
+    data = saved().to_bytes()
+    monkeypatch.setattr("catstream.learned.LARGEST_GIVEN_MODELS", 2 * len(data))
+    handler = CommandHandler(Detectors(QUICK.but({"run.objects_most": 3})), DesiredState(), ModelFiles(None))
+    answers = [
+        answer
+        for number, name in enumerate(["anna", "ben", "carla"])
+        for answer in handler.carry_out([Command(str(number), "search", None, object=name, model=data)])
+    ]
+    assert [answer.done for answer in answers] == [True, True, False]
+    assert "of anna, ben, carla have" in answers[2].reason
+    assert list(handler.desired.objects) == ["anna", "ben"]

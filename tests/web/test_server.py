@@ -287,7 +287,9 @@ def test_an_invalid_command_is_rejected_before_it_is_sent(page, command):
 
 
 @pytest.mark.parametrize(
-    "body", ["[" * 4000, '{"verb": "set-box", "box": [1, 2, 3, %s]}' % ("9" * 400)], ids=["deep", "many digits"]
+    "body",
+    ["[" * 4000, '{"verb": "set-box", "box": [1, 2, 3, %s]}' % ("9" * 400), "pause"],
+    ids=["deep", "many digits", "no JSON"],
 )
 def test_malformed_json_is_rejected_like_any_invalid_command(page, body):
     answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
