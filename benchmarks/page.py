@@ -1,7 +1,7 @@
 """Writes the pages of `PAGES` from the records in `benchmarks/results`: `make results`.
 
-The pages have nothing that is not in a record but the headings and the few sentences below. README's figures come from
-the same records.
+The pages have nothing that is not in a record but the headings and the few sentences below. The figures of README and
+of the tutorial come from the same records.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from scale_page import SCALE
 from sections import DOCS, Page, Record, Section, Shown, every, filled, records, select, written
 from table import Cell, Table
 
-__all__ = ["PAGES", "README", "readme", "shown"]
+__all__ = ["MARKED", "PAGES", "shown", "with_figures"]
 
-README = Path(__file__).parents[1] / "README.md"
+_README = Path(__file__).parents[1] / "README.md"
 _MARKS = re.compile(r"(<!-- results: .*? -->\n).*?(<!-- /results -->)", re.DOTALL)
 
 
@@ -28,9 +28,10 @@ def shown() -> set[str]:
     return {part.record for page in PAGES for section in page.sections for part in section.parts}
 
 
-def readme(found: Mapping[str, Record], page: str) -> str:
-    """Return the README with the figures between its marks."""
-    return _MARKS.sub(lambda marks: f"{marks[1]}{_figures(found)}\n{marks[2]}", page)
+def with_figures(path: Path, found: Mapping[str, Record]) -> str:
+    """Return a page of `MARKED` with the figures between its marks."""
+    page, figures = path.read_text(encoding="utf-8"), MARKED[path](found)
+    return _MARKS.sub(lambda marks: f"{marks[1]}{figures}\n{marks[2]}", page)
 
 
 def merged(record: Record) -> Iterator[Table]:
@@ -194,10 +195,15 @@ def _accuracy(found: Mapping[str, Record]) -> str:
         [Robustness](robustness.md) shows how much. F-score over the {leaves} in which it disappears: {scores}."""
 
 
+def _rates(speed: Record) -> dict[str, list[float]]:
+    """Frames per second at the start and afterwards, of each tracker."""
+    return {row[0]: row[1:3] for table in speed["tables"] if table["title"] == _PEERS for row in table["rows"]}
+
+
 def _figures(found: Mapping[str, Record]) -> str:
     accuracy, speed = found["accuracy"], found["speed"]
     ours, theirs = (accuracy["mean"][name] for name in ("catstream", "csrt"))
-    rates = {row[0]: row[1:3] for table in speed["tables"] if table["title"] == _PEERS for row in table["rows"]}
+    rates = _rates(speed)
     (start, rest), (one_start, one_rest) = rates["catstream, three processes"], rates["catstream, one core"]
     csrt, threaded = rates["csrt, one core"][1], rates["csrt, all cores"][1]
     sequences = len({row["name"] for row in accuracy["sequences"]})
@@ -210,6 +216,15 @@ def _figures(found: Mapping[str, Record]) -> str:
         first 150 frames), the three processes and the decoding included; `catstream.Tracker` in one process
         {one_rest:.0f} ({one_start:.0f}). CSRT processes {csrt:.0f} frames/s on one core and {threaded:.0f} on
         {speed["machine"]["cores"]} (`{speed["command"]}`).""")
+
+
+def _choice(found: Mapping[str, Record]) -> str:
+    rates = _rates(found["speed"])
+    three, one = rates["catstream, three processes"][1], rates["catstream, one core"][1]
+    (start,) = (row for table in found["startup"]["tables"] for row in table["rows"] if row[0] == "warm")
+    return filled(f"""
+        On {found["speed"]["machine"]["cores"]} cores, three processes follow {three:.0f} frames/s, and a `Tracker`
+        {one:.0f}. The first track of `catstream track` is there {start[2]:.1f} s after the command.""")
 
 
 _HEAD = """
@@ -387,6 +402,9 @@ PAGES = (
     SCALE,
 )
 
+#: Pages with figures between marks, and what writes them.
+MARKED = {_README: _figures, DOCS / "tutorial.md": _choice}
+
 
 if __name__ == "__main__":
     found = records()
@@ -394,4 +412,5 @@ if __name__ == "__main__":
         page.path.write_text(written(page, found), encoding="utf-8")
         for path, plot in page.plots(found).items():
             path.write_text(plot, encoding="utf-8")
-    README.write_text(readme(found, README.read_text(encoding="utf-8")), encoding="utf-8")
+    for path in MARKED:
+        path.write_text(with_figures(path, found), encoding="utf-8")

@@ -111,6 +111,10 @@ class RunSettings(_Group):
             "Without it, the run ends there."
         ),
     ] = False
+    resize: Annotated[
+        bool,
+        _about("Scale images of another size to that of the first one. Without it, the run ends at such an image."),
+    ] = False
     unstored_frames: Annotated[
         int,
         _about("Features messages that may be sent and not yet stored by the compressor.", ge=1, le=65536),

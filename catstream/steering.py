@@ -26,11 +26,13 @@ from catstream.names import UNNAMED, check_name
 from catstream.registry import fleet_and_stream, locate
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
-from catstream.wire.endpoint import Endpoint
+from catstream.wire.endpoint import Endpoint, is_deserted
 from catstream.wire.newest import Subscriber
 
 __all__ = ["Control", "control"]
 
+#: Seconds to wait for an answer from a folder in which no pipeline seems to run; its detector may be restarted.
+_DESERTED_SECONDS = 1.0
 #: Seconds to wait for the registry of a fleet before each command; without an answer, the stream has not moved.
 _REGISTRY_SECONDS = 1.0
 
@@ -52,7 +54,8 @@ class Control:
     CommandRejectedError
         From each command, if the pipeline does not execute it.
     SilenceError
-        From each command, if no answer arrives in time; the command may still be executed later.
+        From each command, if no answer arrives in time; the command may still be executed later. If no pipeline runs at
+        the endpoint, a folder, that is said after a second.
     ServiceError
         From each command, if these keys do not have the role "steer".
     """
@@ -196,7 +199,14 @@ class Control:
 
     def _ask(self, command: Command) -> Answer:
         self._follow()
-        verb, answer = command.verb, self._commands.ask(command, self.timeout)
+        verb, first = command.verb, min(self.timeout, _DESERTED_SECONDS) if self._place.folder is not None else 0.0
+        answer = self._commands.ask(command, first)
+        if answer is None and first and is_deserted(self._place):
+            raise SilenceError(
+                f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
+                "or give the endpoint of one that runs (--endpoint)"
+            )
+        answer = answer or self._commands.ask(command, self.timeout - first)
         if answer is None:
             raise SilenceError(
                 f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "

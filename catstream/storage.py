@@ -28,8 +28,10 @@ __all__ = [
     "is_locked",
     "is_writable",
     "lock",
+    "name_fits",
     "read",
     "remove_parts",
+    "why_not_writable",
     "write",
     "write_atomically",
 ]
@@ -43,6 +45,7 @@ _KEY = "catstream"  # the only metadata key: with several, their order, and so t
 _VERSION = 1  # version of the metadata's format
 #: Names of the types of arrays in the format.
 _TYPES = {"float64": "F64", "float32": "F32", "int64": "I64", "int32": "I32", "uint8": "U8", "bool": "BOOL"}
+_MOST_BYTES_BESIDE = len("..part") + 16  # that the name of an unfinished file is longer than that of the file
 _ABANDONED_SECONDS = 600.0  # after which nothing writes a part of a file any more
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
@@ -129,6 +132,20 @@ def is_writable(folder: Path) -> bool:
             return True
     except OSError:
         return False
+
+
+def name_fits(path: Path) -> bool:
+    """Return whether the file system takes a name of this length in the folder of a file, which has to exist."""
+    return len(os.fsencode(path.name)) + _MOST_BYTES_BESIDE <= os.pathconf(path.parent, "PC_NAME_MAX")
+
+
+def why_not_writable(path: Path) -> str:
+    """Return why a file cannot be made or replaced, and what to do; empty if it can."""
+    if path.is_dir() or not is_writable(path.parent):
+        return f"cannot write {path}: give a file in a folder that exists and that you may write to"
+    if not name_fits(path):
+        return f"cannot write {path}: its name is too long for the folder, give a shorter one"
+    return ""
 
 
 def prepare() -> None:

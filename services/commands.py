@@ -185,7 +185,8 @@ class CommandHandler:
             learned = Learned.from_bytes(command.model or b"", "the file")
             learned.check_fits(settings)
             new = self.desired.begun(name, learned.box, seq + 1, self.models.add(learned))
-            check_sizes({other: self.models.size(each.model) for other, each in new.objects.items() if each.begins > seq})
+            begins = {name: each.model for name, each in new.objects.items() if each.begins > seq}
+            check_sizes({name: self.models.size(model) for name, model in begins.items()})
         except CatstreamError as error:
             return self._answer(command, False, str(error))
         self.desired = new

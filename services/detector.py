@@ -217,6 +217,7 @@ class DetectorLoop:
                 idle=self._idle,
                 image_rate=settings.run.image_rate,
                 skip_damaged=settings.run.skip_damaged,
+                resize=settings.run.resize,
             )
         )
         return self._source if self._source.live else stack.enter_context(closing(read_ahead(self._source)))

@@ -107,14 +107,18 @@ def with_given(command: _Command) -> _Command:
 
 
 def with_reading(command: _Command) -> _Command:
-    """Add `--fps` and `--skip-damaged`, two settings for reading a file, to the argument `given`."""
+    """Add `--fps`, `--skip-damaged` and `--resize`, settings for reading a source, to the argument `given`."""
 
     @click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default.")
     @click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video file.")
+    @click.option("--resize", is_flag=True, help="Scale images of another size to that of the first one.")
     @wraps(command)
-    def wrapped(given: dict[str, object], fps: float | None, skip_damaged: bool, **options: object) -> None:
+    def wrapped(
+        given: dict[str, object], fps: float | None, skip_damaged: bool, resize: bool, **options: object
+    ) -> None:
+        flags = {"run.skip_damaged": skip_damaged, "run.resize": resize}
         rate = {} if fps is None else {"run.image_rate": fps}
-        command(given=given | rate | ({"run.skip_damaged": True} if skip_damaged else {}), **options)
+        command(given=given | rate | {name: True for name, flag in flags.items() if flag}, **options)
 
     return cast(_Command, wrapped)
 

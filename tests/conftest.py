@@ -7,6 +7,7 @@ import os
 import random
 import signal
 import socket
+import subprocess
 import tempfile
 import threading
 import time
@@ -137,6 +138,19 @@ def until():
         return found
 
     return wait
+
+
+@pytest.fixture
+def disk(request, tmp_path):
+    """A disk of 64 MB, a tmpfs; another size in bytes is given as the parameter of this fixture."""
+    folder, size = tmp_path / "disk", getattr(request, "param", 64 << 20)
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder]
+    done = subprocess.run(mount, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"only root may mount a small disk, and where a tmpfs can be: {done.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", "--lazy", folder], check=True)
 
 
 @pytest.fixture

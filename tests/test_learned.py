@@ -281,7 +281,7 @@ def test_a_file_without_any_of_its_parts_is_an_error(learned):
     [
         ({"anna": 63, "ben": 63, "": 63}, None),
         ({"anna": 64}, "the saved model of anna has 64 MiB, at most 63 are possible: .*coreset.size"),
-        ({"a": 60, "b": 60, "c": 60, "d": 30}, "of a, b, c, d have 210 MiB together, at most 200 can begin in one frame"),
+        ({"a": 60, "b": 60, "c": 60, "d": 30}, "a, b, c, d have 210 MiB together, at most 200 can begin in one frame"),
     ],
 )
 def test_saved_models_that_begin_in_one_frame_fit_into_a_message(mebibytes, message):

@@ -1,4 +1,4 @@
-"""The pages of results show what the benchmarks wrote, and README what the pages show."""
+"""The pages of results show what the benchmarks wrote, and README and the tutorial what the pages show."""
 
 from __future__ import annotations
 
@@ -41,9 +41,11 @@ def test_a_page_is_the_one_that_the_records_give(one):
     assert shown.count("\n") <= 200
 
 
-def test_readme_has_the_figures_of_the_records():
-    shown = page.README.read_text(encoding="utf-8")
-    assert shown == page.readme(FOUND, shown), "the figures in README.md are old: run `make results`"
+@pytest.mark.parametrize("path", page.MARKED, ids=lambda path: path.name)
+def test_a_page_with_marks_has_the_figures_of_the_records(path):
+    shown = path.read_text(encoding="utf-8")
+    assert "<!-- results:" in shown
+    assert shown == page.with_figures(path, FOUND), "its figures are old: run `make results`"
 
 
 def test_every_benchmark_has_a_record_and_every_record_its_place_on_a_page():

@@ -27,7 +27,7 @@ from catstream.recording.file import Recording
 from catstream.services.options import named, with_given, with_object, with_part, with_reading
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT
-from catstream.storage import is_writable
+from catstream.storage import why_not_writable
 
 __all__ = ["track"]
 
@@ -111,9 +111,10 @@ def track(
       OUTPUT/NAME.csv               frame, seconds, state, box, score, model version, object
       OUTPUT/NAME.mp4               with --video
 
-    NAME is the name of the source, so that several sources can share a folder.
-    NAME.csv has a row for each object and frame. The first three files are of
-    one object: NAME-anna.txt is that of anna.
+    NAME is the name of the source, so that several sources can share a folder;
+    a/walk.mp4 and b/walk.mp4 need a folder each. NAME.csv has a row for each
+    object and frame. The first three files are of one object: NAME-anna.txt is
+    that of anna.
 
     \b
     --write FILE, may be repeated; each file contains every object and frame
@@ -322,8 +323,8 @@ def _check_models(files: Mapping[str, Path], overwrite: bool) -> None:
     for name, file in files.items():
         if file.exists() and not overwrite:
             raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
-        if file.is_dir() or not is_writable(file.parent):
-            raise ServiceError(f"cannot write {file}: give a file in a folder that exists and that you may write to")
+        if reason := why_not_writable(file):
+            raise ServiceError(reason)
         if any(file == other for named, other in files.items() if named != name):
             raise ServiceError(f"{file} is named twice: give each object its own file")
 

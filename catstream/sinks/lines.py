@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -73,9 +73,14 @@ class LineSink(ABC):
             kept = [end for end, track in self._lines(self.path) if track.frame < keep]
             os.truncate(self.path, kept[-1] if kept else 0)
         self.rows = len(kept)
-        file = self.path.open("x" if keep is None else "a", encoding="utf-8", buffering=1)
-        if not kept:
-            file.write(self.header)
+        with ExitStack() as stack:  # a file whose header the disk does not take is closed, and removed if it is new
+            file = self.path.open("x" if keep is None else "a", encoding="utf-8", buffering=1)
+            if keep is None:
+                stack.callback(self.path.unlink)
+            stack.enter_context(file)
+            if not kept:
+                file.write(self.header)
+            stack.pop_all()
         return file
 
     @classmethod

@@ -17,7 +17,7 @@ from catstream.messages import ObjectPosition, Position, Track
 from catstream.names import UNNAMED
 from catstream.sinks.frames import FIRST, by_frame, in_order, objects_of, whole_frames
 from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, file_exists, is_closed, open_sink, reader
-from catstream.storage import is_writable
+from catstream.storage import is_writable, name_fits
 from catstream.video import results
 from catstream.video.frames import RATE
 from catstream.video.results import ResultsWriter
@@ -69,11 +69,16 @@ class RunFiles:
                     f"cannot write results to {str(self.output)!r}: give a folder that exists or can be made, "
                     "and that you may write to"
                 )
+            if long := [file.name for file in self._results() if not name_fits(nearest / file.name)]:
+                raise VideoError(
+                    f"the names of results of {self.name!r} would be too long for a file ({long[0]!r}): "
+                    "give the source or the object a shorter name, or write to one file (--write FILE)"
+                )
         existing = [file.name for file in self._results() if file.exists()]
         if existing and not overwrite and self.output not in known:
             raise VideoError(
-                f"results of {self.name!r} are in {str(self.output)!r} already ({', '.join(existing)}): "
-                "replace them all with --overwrite, or give another folder"
+                f"results of {self.name!r} are in {str(self.output)!r} already ({', '.join(existing)}), of this source "
+                "or of another of that name: replace them all with --overwrite, or give another folder"
             )
         for count, file in enumerate(self.files):
             if file in self.files[:count]:

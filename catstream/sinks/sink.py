@@ -24,7 +24,7 @@ from catstream.sinks.json import JsonSink, NdjsonSink, StdoutSink
 from catstream.sinks.mot import MotSink
 from catstream.sinks.sqlite import SqliteSink
 from catstream.sinks.video import VideoSink
-from catstream.storage import is_writable
+from catstream.storage import why_not_writable
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 
@@ -84,8 +84,8 @@ def check_writable(path: Path, *, may_exist: bool = False) -> None:
         raise VideoError(f"{path} exists already: give another name, or remove it")
     if path.suffix == ".parquet":
         require_extra("parquet")
-    if path.is_dir() or not is_writable(path.parent):
-        raise VideoError(f"cannot write {path}: give a file in a folder that exists and that you may write to")
+    if reason := why_not_writable(path):
+        raise VideoError(reason)
 
 
 def file_exists(path: Path) -> bool:

@@ -35,8 +35,8 @@ class VideoSink:
             raise VideoError(
                 f"a video needs to read its frames again, but {source} is live: record it, and give the file"
             )
-        # The pipeline either skips damaged frames or ends at the first: in both cases these are its frames.
-        self._frames = open_source(source, part=part, image_rate=image_rate, skip_damaged=True)
+        # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
+        self._frames = open_source(source, part=part, image_rate=image_rate, skip_damaged=True, resize=True)
         self._frame: Frame | None = None  # the last one that has a track, which is not in the video yet
         self._tracks: list[Track] = []
         try:

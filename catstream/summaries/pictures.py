@@ -44,7 +44,7 @@ def pictures_of(frames: list[TaughtFrame], source: str, image_rate: float) -> di
         raise VideoError(f"{source!r} is a live source, and its frames were not kept")
     found: dict[int, bytes] = {}
     waiting = sorted(frames, key=lambda frame: -frame.time)
-    with open_source(source, image_rate=image_rate, skip_damaged=True) as images:
+    with open_source(source, image_rate=image_rate, skip_damaged=True, resize=True) as images:
         for image in images:
             while waiting and waiting[-1].time < image.time - _TOLERANCE_SECONDS:
                 waiting.pop()

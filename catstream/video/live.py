@@ -111,9 +111,9 @@ class LiveSource(Source):
             if self._problem:
                 self.close()
                 hint = f"; the folder of that name is ./{self._text}" if self._text.isdigit() else ""
-                raise VideoError(
-                    f"cannot open {self._address!r} ({self._problem}): check that it is running, and its address{hint}"
-                )
+                problem, _, advice = self._problem.partition(": ")  # what to do about it, if that is known
+                advice = advice or f"check that it is running, and its address{hint}"
+                raise VideoError(f"cannot open {self._address!r} ({problem}): {advice}")
         return self._frame(*newest)
 
     def _wait_for_newest(self) -> tuple[float, VideoFrame] | None:

@@ -26,6 +26,7 @@ from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import State, Track
 from catstream.names import UNNAMED, check_name, is_name
+from catstream.storage import name_fits
 
 __all__ = [
     "COLUMNS",
@@ -81,6 +82,11 @@ def _is_taken(directory: Path, name: str, thing: str) -> bool:
     return thing != UNNAMED and boxes.exists() and not scores.exists()
 
 
+def _fits(directory: Path, name: str, thing: str) -> bool:
+    """Whether the names of an object's files are not too long for the file system."""
+    return all(name_fits(directory / file) for file in object_files(name, thing))
+
+
 def result_files(name: str, objects: Sequence[str]) -> tuple[str, ...]:
     """Return the names of all results files of a run."""
     return (*(file for thing in objects for file in object_files(name, thing)), table_file(name))
@@ -117,7 +123,7 @@ class ResultsWriter:
     name : name of the run, usually that of the source
     keep : continue the existing files after the frames before `keep`; None replaces the table and the files of an
         object without a name. A file of something else that has the name of an object's file is kept: the tracks of
-        this object are in the table only, and a warning says so
+        this object are in the table only, and a warning says so; likewise if the name would be too long for a file
 
     Raises
     ------
@@ -177,9 +183,11 @@ class ResultsWriter:
         """Open the files of an object, with a row for each frame so far."""
         files: list[IO[str]] = []
         paths = [self.directory / file for file in object_files(self.name, thing)]
-        if _is_taken(self.directory, self.name, thing) or (thing and not self._continues and paths[0].exists()):
-            table = table_file(self.name)
-            _log.warning("%s exists already and is kept: the boxes of %s are in %s only", paths[0], thing, table)
+        fits = _fits(self.directory, self.name, thing)
+        taken = _is_taken(self.directory, self.name, thing) or (thing and not self._continues and paths[0].exists())
+        if taken or not fits:
+            reason = "exists already and is kept" if fits else "would be too long a name"
+            _log.warning("%s %s: the boxes of %s are in %s only", paths[0], reason, thing, table_file(self.name))
             self._objects[thing] = []
             return
         for path, nothing in reversed([*zip(paths, _NOTHING, strict=True)]):
@@ -215,7 +223,7 @@ def read_tracks(directory: Path, name: str) -> Iterator[Track]:
 
 def complete_rows(directory: Path, name: str, thing: str) -> int:
     """Return the number of rows that are complete in every file of an object; infinitely many if it has no files."""
-    if _is_taken(directory, name, thing):
+    if _is_taken(directory, name, thing) or not _fits(directory, name, thing):
         return sys.maxsize
     return min(len(_row_ends(directory / file)) - 1 for file in object_files(name, thing))
 

@@ -159,6 +159,7 @@ def open_source(
     idle: Callable[[], bool] | None = None,
     image_rate: float = RATE,
     skip_damaged: bool = False,
+    resize: bool = False,
 ) -> Source:
     """Open the source that `text` names; the docstring of the module lists the kinds.
 
@@ -175,6 +176,7 @@ def open_source(
     image_rate : frames per second of a folder of images
     skip_damaged : continue after damage in a video file. The frames that cannot be decoded are left out; the next good
         frame gets the next number and keeps its own time stamp
+    resize : scale images that have another size than the first one of `part` to that size
 
     Raises
     ------
@@ -197,7 +199,7 @@ def open_source(
             "write the video to a file, or serve it as a stream"
         )
     path = Path(without_scheme(str(text)))
-    images = partial(_open_images, part=part, start=start, rate=image_rate)
+    images = partial(_open_images, part=part, start=start, rate=image_rate, resize=resize)
     video = partial(_open_video, part=part, start=start, skip_damaged=skip_damaged)
     try:
         if path.is_dir():
@@ -275,23 +277,30 @@ def _open_folder(path: Path, images: Callable[..., Source], video: Callable[...,
     raise VideoError(f"the folder {str(path)!r} holds {content}: {_EXPECTED}")
 
 
-def _open_images(name: str, files: list[Path], *, part: slice, start: int, rate: float) -> Source:
-    frames = _read_images(files, range(len(files))[part], start, rate)
+def _open_images(name: str, files: list[Path], *, part: slice, start: int, rate: float, resize: bool) -> Source:
+    frames = _read_images(files, range(len(files))[part], start, rate, resize)
     return _FileSource(name, frames, lambda: len(files), part, start, rate)
 
 
-def _read_images(files: list[Path], wanted: range, start: int, rate: float) -> Iterator[Frame]:
-    shape: tuple[int, ...] | None = None
-    for count, number in enumerate(wanted[start:], start):
+def _read_images(files: list[Path], wanted: range, start: int, rate: float, resize: bool) -> Iterator[Frame]:
+    def read(number: int) -> np.ndarray:
         image = read_image(files[number])
         if image is None:
             raise VideoError(f"cannot read the image {str(files[number])!r} (frame {number}): replace or remove it")
-        if shape is not None and image.shape != shape:
-            raise VideoError(
-                f"all images of a source need one size: {str(files[number])!r} (frame {number}) is "
-                f"{image.shape[1]}x{image.shape[0]}, those before it {shape[1]}x{shape[0]}"
-            )
-        shape = image.shape
+        return image
+
+    shape = read(wanted[0]).shape if start and wanted else None  # a resumed run keeps the size of its first frame
+    for count, number in enumerate(wanted[start:], start):
+        image = read(number)
+        shape = shape or image.shape
+        if image.shape != shape:
+            if not resize:
+                raise VideoError(
+                    f"all images of a source need one size: {str(files[number])!r} (frame {number}) is "
+                    f"{image.shape[1]}x{image.shape[0]}, the first {shape[1]}x{shape[0]}: "
+                    "--resize (run.resize=true) scales it to that"
+                )
+            image = cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
         yield Frame(count, number / rate, image)
 
 

@@ -24,7 +24,17 @@ from catstream.storage import is_locked, lock
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 
-__all__ = ["Endpoint", "find", "fleets", "homes", "meeting_place", "notes", "private_folder", "running"]
+__all__ = [
+    "Endpoint",
+    "find",
+    "fleets",
+    "homes",
+    "is_deserted",
+    "meeting_place",
+    "notes",
+    "private_folder",
+    "running",
+]
 
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
@@ -333,10 +343,24 @@ def _listed(endpoints: list[Endpoint]) -> str:
     return "".join(f"; {place.source or 'a pipeline'} at {place}" for place in sorted(endpoints, key=str))
 
 
+def is_deserted(endpoint: Endpoint) -> bool:
+    """Whether an endpoint is a folder in which no pipeline runs: neither one of this user nor one that takes commands.
+
+    A pipeline that was started by hand is not known here, so the answer is wrong while its detector is restarted.
+    """
+    return endpoint.folder is not None and _running_at(endpoint) is None and not endpoint.taken(CHANNELS["control"])
+
+
 def _source_at(endpoint: Endpoint) -> str:
     """The source of this user's pipeline at an endpoint; empty if it is not known."""
+    known = _running_at(endpoint)
+    return known.source if known is not None else ""
+
+
+def _running_at(endpoint: Endpoint) -> Endpoint | None:
+    """This user's running pipeline at an endpoint."""
     place = str(endpoint.folder.absolute()) if endpoint.folder is not None else str(endpoint)
-    return next((other.source for other in running() if str(other) == place), "")
+    return next((other for other in running() if str(other) == place), None)
 
 
 def _follows(endpoint: Endpoint, source: str) -> bool:

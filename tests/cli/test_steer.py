@@ -146,9 +146,8 @@ def test_a_box_and_a_model_for_one_object_are_an_error(video, said, tmp_path):
 def test_if_no_pipeline_runs_that_is_reported_in_one_line(said, tmp_path, verb):
     assert verb in VERBS
     words = {"set-box": ["1,2,3,4"], "save": [tmp_path / "one"]}.get(verb, [])
-    code, output, errors = said(verb, *words, "--endpoint", tmp_path / "run", "--timeout", 0.2)
+    code, output, errors = said(verb, *words, "--endpoint", tmp_path / "run", "--timeout", 600)
     assert (code, output) == (1, "")
-    assert errors.startswith(f"catstream: no answer to {verb} from ")
-    assert "within 0.2 s: is a pipeline running there" in errors
+    assert errors.startswith(f"catstream: no answer to {verb}: no pipeline runs at {tmp_path / 'run'}, start one")
     nowhere = {**os.environ, "TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}
     assert said(verb, *words, env=nowhere)[2].startswith("catstream: no pipeline of yours is running")

@@ -188,7 +188,14 @@ def test_an_image_of_another_size_ends_the_run_at_that_frame(video, said, tmp_pa
     assert code == 1
     assert "one size" in one_line(errors)
     assert "10.png" in one_line(errors)
+    assert "--resize" in one_line(errors)
     assert len((tmp_path / "out" / "walk.txt").read_text().splitlines()) == 10
+    files = ["--output", tmp_path / "all", "--video"]
+    code, _, errors = said("track", images, "--box", box, *files, "--resize")
+    assert code == 0, errors
+    assert len((tmp_path / "all" / "walk.txt").read_text().splitlines()) == 12
+    with open_source(tmp_path / "all" / "walk.mp4") as film:
+        assert sum(1 for _ in film) == 12
 
 
 REJECTED = {

@@ -123,11 +123,20 @@ def test_existing_results_are_rejected_or_if_requested_replaced_together(files, 
         (["none/t.csv"], False, "a folder that exists"),
         (["t.csv", "t.csv"], False, "named twice"),
         (["t.txt", "t.mp4"], True, "does not hold all tracks"),
+        ([f"{'t' * 244}.csv"], False, "too long"),
     ],
 )
 def test_results_that_cannot_be_written_are_rejected_before_the_run(files, names, resumable, words):
     with pytest.raises(VideoError, match=words):
         files("run", names, output=False).check_writable(overwrite=False, resumable=resumable)
+
+
+def test_names_of_results_that_are_too_long_for_a_file_are_rejected_before_the_run(files, tmp_path):
+    source = files("run").source
+    for name, objects, words in (("s" * 244, [], "give the source"), ("s" * 200, ["a" * 64], "or the object")):
+        run = RunFiles(name, source, ALL_FRAMES, tmp_path, objects=objects)
+        with pytest.raises(VideoError, match=words):
+            run.check_writable(overwrite=False, resumable=False)
 
 
 def test_a_file_of_another_program_is_not_continued(files):

@@ -177,6 +177,14 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
     assert path.read_text() == before
 
 
+@pytest.mark.parametrize("disk", [4096], indirect=True)
+def test_a_new_file_whose_first_line_the_disk_does_not_take_is_not_left(disk):
+    (disk / "ballast").write_bytes(bytes(4096))
+    with pytest.raises(VideoError, match="No space left on device"):
+        open_sink(disk / "t.csv")
+    assert [file.name for file in disk.iterdir()] == ["ballast"]
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_an_existing_file_is_not_overwritten(tmp_path, suffix):
     path = tmp_path / f"tracks{suffix}"

@@ -171,6 +171,6 @@ def test_a_url_of_a_video_file_is_an_error(tmp_path):
     folder = partial(SimpleHTTPRequestHandler, directory=tmp_path)
     with ThreadingHTTPServer(("127.0.0.1", 0), folder) as server:
         threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-        with pytest.raises(VideoError, match="a recording of 2 s: download it"):
+        with pytest.raises(VideoError, match=r"it is a recording of 2 s\): download it, and give the file$"):
             open_source(f"http://127.0.0.1:{server.server_port}/walk.mp4")
         server.shutdown()

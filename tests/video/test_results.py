@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages import Track
-from catstream.video.results import ResultsWriter
+from catstream.video.results import ResultsWriter, complete_rows
 
 BOX = Box(1, 2, 3.5, 4.25)
 
@@ -85,6 +86,16 @@ def test_a_file_of_something_else_that_has_the_name_of_an_object_file_is_kept(tm
     assert "the boxes of 2 are in walk.csv only" in caplog.text
     assert len(rows(tmp_path / "walk-anna.txt")) == 2
     assert len((tmp_path / "walk.csv").read_text().splitlines()) == 5
+
+
+def test_an_object_that_begins_under_a_name_too_long_for_a_file_is_in_the_table(tmp_path, caplog):
+    source, name = "walk" * 45, "a" * 64
+    for keep in (None, 1):
+        with ResultsWriter(tmp_path, source, keep=keep) as results:
+            results.write([named(name, keep or 0)], 0.01)
+    assert f"the boxes of {name} are in {source}.csv only" in caplog.text
+    assert complete_rows(tmp_path, source, name) == sys.maxsize
+    assert [file.name for file in tmp_path.iterdir()] == [f"{source}.csv"]
 
 
 def test_the_same_tracks_give_the_same_bytes(tmp_path):

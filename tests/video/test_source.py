@@ -367,6 +367,14 @@ def test_the_first_image_of_another_size_is_named(images):
     assert "160x120" in message
 
 
+def test_images_of_another_size_are_scaled_to_the_first_one_also_from_a_later_start(images):
+    folder = images("walk", [f"{number}.png" for number in range(5)])
+    cv2.imwrite(str(folder / "3.png"), numbered(3, width=150))
+    for start in (0, 3):
+        with open_source(folder, start, resize=True) as source:
+            assert [frame.image.shape for frame in source] == [(120, 160, 3)] * (5 - start)
+
+
 def test_an_image_that_cannot_be_read_is_named(images):
     folder = images("walk", [f"{number}.png" for number in range(4)])
     (folder / "2.png").write_bytes(b"nothing")

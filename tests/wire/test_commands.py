@@ -182,6 +182,7 @@ def test_a_rejected_command_raises_an_error_with_the_reason(endpoint):
 
 def test_a_command_without_an_answer_raises_an_error(endpoint):
     with (
+        Responder(CONTROL, endpoint),  # a process that hangs
         Control(str(endpoint), timeout=0.3) as control,
         pytest.raises(SilenceError, match=r"no answer to stop from .* within 0\.3 s: is a pipeline running there"),
     ):

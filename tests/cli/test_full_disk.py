@@ -1,0 +1,62 @@
+"""A disk that is full before the run has ended: what is lost is said on the terminal, and what was written is kept."""
+
+from __future__ import annotations
+
+import pytest
+
+#: Bytes of a disk for some of the messages of a short video, and of one for its rows but not for a database of them.
+SMALL, TINY = 1 << 20, 1 << 16
+#: Bytes that are left on that disk, by what is written there.
+ROOM = {"t.ndjson": 8192, "t.json": 8192, "t.csv": 0, "t.txt": 0, "t.sqlite": TINY, "t.parquet": TINY, "t.mp4": TINY}
+
+
+@pytest.mark.parametrize("disk", [SMALL], indirect=True)
+def test_a_recording_on_a_full_disk_is_said_to_end_and_to_lack_frames(video, said, disk, tmp_path):
+    source, box = video
+    record = disk / "run.mcap"
+    code, _, errors = said("track", source, "--box", box, "--output", tmp_path, "--record", record)
+    assert code == 1, "what was asked for is not whole"
+    assert f"cannot record to '{record}' any more: No space left on device" in errors
+    assert "the run continues" in errors
+    assert "missing" in errors.partition("recording: ")[2]
+    assert "none missing" not in errors
+    assert len((tmp_path / "demo.txt").read_text().splitlines()) == 32, "the results are whole"
+    code, _, errors = said("replay", record)
+    assert "missing" in errors
+    assert "none missing" not in errors
+
+
+@pytest.mark.parametrize("disk", [TINY], indirect=True)
+@pytest.mark.parametrize(("file", "room"), [*ROOM.items(), ("a folder", 8192)])
+def test_results_on_a_full_disk_end_the_run_with_one_line(long_video, said, disk, file, room):
+    source, box = long_video
+    files = ["--output", disk / "out"] if file == "a folder" else ["--write", disk / file]
+    (disk / "ballast").write_bytes(bytes(TINY - room))
+    code, _, errors = said("track", source, "--box", box, *files)
+    assert code == 1
+    told = [line for line in errors.splitlines() if line.startswith("catstream: ")]
+    assert len(told) == 1
+    assert "cannot write" in told[0]
+
+
+@pytest.mark.parametrize("disk", [SMALL], indirect=True)
+def test_a_model_for_which_the_disk_has_no_room_is_said_and_the_one_before_is_kept(video, said, disk, tmp_path):
+    source, box = video
+    file = disk / "one.model"
+    file.write_bytes(b"the one before")
+    code, _, errors = said("track", source, "--box", box, "--output", tmp_path, "--save-model", file, "--overwrite")
+    assert code == 1
+    assert "No space left on device" in errors
+    assert "saved model:" not in errors
+    assert file.read_bytes() == b"the one before"
+    assert [path.name for path in disk.iterdir()] == ["one.model"]
+    assert len((tmp_path / "demo.txt").read_text().splitlines()) == 32
+
+
+@pytest.mark.parametrize("disk", [SMALL], indirect=True)
+def test_checkpoints_for_which_the_disk_has_no_room_are_said_and_the_run_goes_on(video, said, disk, tmp_path):
+    source, box = video
+    code, _, errors = said("track", source, "--box", box, "--output", tmp_path, "--state", disk / "kept")
+    assert "No space left on device" in errors
+    assert len((tmp_path / "demo.txt").read_text().splitlines()) == 32
+    assert code == 0
