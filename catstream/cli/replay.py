@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from catstream.errors import RecordingError
 from catstream.messages import Features, Model, Run, Track
@@ -106,7 +106,7 @@ def _learn(
     if pairs:
         trials[" ".join(pairs)] = then.but(pairs).for_length(total)
     newest = next(reversed(trials))
-    table = Table("settings", box=None, header_style="bold", pad_edge=False)
+    table = Table(Column("settings", overflow="fold"), box=None, header_style="bold", pad_edge=False)
     for name in ("models", "identical", "rows", "levels", "MB", "seconds", "error", "apart"):
         table.add_column(name, justify="right")
     recorded = recording.counts[Model]
