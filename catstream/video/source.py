@@ -289,7 +289,7 @@ def _read_images(files: list[Path], wanted: range, start: int, rate: float, resi
             raise VideoError(f"cannot read the image {str(files[number])!r} (frame {number}): replace or remove it")
         return image
 
-    shape = read(wanted[0]).shape if start and wanted else None  # a resumed run keeps the size of its first frame
+    shape = read(wanted[0]).shape if resize and start and wanted else None  # that of the run, if it is resumed
     for count, number in enumerate(wanted[start:], start):
         image = read(number)
         shape = shape or image.shape

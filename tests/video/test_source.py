@@ -367,6 +367,13 @@ def test_the_first_image_of_another_size_is_named(images):
     assert "160x120" in message
 
 
+def test_images_before_the_first_frame_are_not_read(images):
+    folder = images("walk", [f"{number}.png" for number in range(5)])
+    (folder / "0.png").write_bytes(b"nothing")
+    with open_source(folder, 2) as source:
+        assert [frame.number for frame in source] == [2, 3, 4]
+
+
 def test_images_of_another_size_are_scaled_to_the_first_one_also_from_a_later_start(images):
     folder = images("walk", [f"{number}.png" for number in range(5)])
     cv2.imwrite(str(folder / "3.png"), numbered(3, width=150))
