@@ -346,9 +346,12 @@ def _listed(endpoints: list[Endpoint]) -> str:
 def is_deserted(endpoint: Endpoint) -> bool:
     """Whether an endpoint is a folder in which no pipeline runs: neither one of this user nor one that takes commands.
 
-    A pipeline that was started by hand is not known here, so the answer is wrong while its detector is restarted.
+    A folder that does not exist may be that of a pipeline that starts at this moment. A pipeline that was started by
+    hand is not known here, so the answer is wrong while its detector is restarted.
     """
-    return endpoint.folder is not None and _running_at(endpoint) is None and not endpoint.taken(CHANNELS["control"])
+    folder = endpoint.folder
+    is_left = folder is not None and folder.is_dir() and not endpoint.taken(CHANNELS["control"])
+    return is_left and _running_at(endpoint) is None
 
 
 def _source_at(endpoint: Endpoint) -> str:
