@@ -133,7 +133,6 @@ def test_a_stream_over_http_is_followed_by_a_restarted_detector_too(camera, foll
         run.until(lambda counters: counters["sent"] > frames + 40)
         rows, errors = run.stopped()
     assert "processes restarted: 1" in errors
-    assert "frames skipped" in errors
     assert [int(row["frame"]) for row in rows] == list(range(len(rows)))
     seconds = [float(row["seconds"]) for row in rows]
     assert seconds == sorted(seconds)
