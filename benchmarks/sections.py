@@ -35,13 +35,12 @@ class Section(NamedTuple):
 
 
 class Page(NamedTuple):
-    """A page of results: its file, its title, an introduction, the sections, and its plots by file."""
+    """A page of results: its file, its title, an introduction, and the sections."""
 
     path: Path
     title: str
     introduction: str
     sections: tuple[Section, ...]
-    plots: Callable[[Mapping[str, Record]], Mapping[Path, str]] = lambda _: {}
 
 
 def records() -> dict[str, Record]:

@@ -622,7 +622,7 @@ class FleetStatus:
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A question about the streams and nodes of a fleet, anyone -> manager of the fleet.
+    """A question about the streams and nodes of a fleet, anyone -> controller of the fleet.
 
     id      unique for each question
     stream  name of the one stream that it is about; empty for all streams and nodes
@@ -636,7 +636,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """The answer to a Question, manager of the fleet -> its sender.
+    """The answer to a Question, controller of the fleet -> its sender.
 
     id       id of the question
     fleet    name of the fleet

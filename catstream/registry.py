@@ -6,12 +6,12 @@
         for stream in registry.streams().streams.values():
             print(stream.name, stream.state, stream.node)
 
-The manager of the fleet serves the registry (`RegistryServer`), and knows the state of all streams. A client needs keys
-with the role "watch", or none if the fleet runs on this machine for this user alone. It gets the endpoint and the
+The controller of the fleet serves the registry (`RegistryServer`), and knows the state of all streams. A client needs
+keys with the role "watch", or none if the fleet runs on this machine for this user alone. It gets the endpoint and the
 public key of a stream's pipeline, and connects with its own keys. No secret is transmitted.
 
-The address of a fleet is HOST:PORT of its manager, or the name of a fleet of this user on this machine; it is empty for
-the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet://STREAM` in the only fleet.
+The address of a fleet is HOST:PORT of its registry, or the name of a fleet of this user on this machine; it is empty
+for the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet://STREAM` in the only fleet.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, priva
 from catstream.wire.keys import Keys
 
 __all__ = [
+    "REGISTRY_PORT",
     "FollowedStream",
     "Place",
     "Registry",
@@ -46,6 +47,9 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 Status = TypeVar("Status", StreamStatus, NodeStatus)
+
+#: Port at which the registry of a cluster listens by default.
+REGISTRY_PORT = 5690
 
 _PREFIX = "fleet://"
 _LONGEST_TROUBLE = 1000  # characters
@@ -75,7 +79,7 @@ class Place:
 
 
 class Registry:
-    """Asks the manager of a fleet for its streams and nodes.
+    """Asks the controller of a fleet for its streams and nodes.
 
     Parameters
     ----------
@@ -148,7 +152,7 @@ class Registry:
     def request(self, stream: str) -> None:
         """Ask for one stream without waiting; `receive` returns the answer. A new request replaces the last one."""
         self._question = uuid4().hex
-        self._follow_manager()
+        self._follow_controller()
         self._requester.send(Question(self._question, stream))
 
     def receive(self, stream: str) -> tuple[str, Place | None] | None:
@@ -176,16 +180,16 @@ class Registry:
     def _ask(self, question: Question) -> Listing:
         deadline = monotonic() + self.timeout
         while (left := deadline - monotonic()) > 0:
-            self._follow_manager()
+            self._follow_controller()
             if (answer := self._requester.ask(question, min(left, _TURN_SECONDS))) is not None:
                 return answer
         raise SilenceError(
-            f"no answer from the fleet {self._name} at {self._endpoint} within {self.timeout:g} s: is its manager "
+            f"no answer from the fleet {self._name} at {self._endpoint} within {self.timeout:g} s: is its controller "
             "running there?"
         )
 
-    def _follow_manager(self) -> None:
-        """Connect again if the manager of a fleet on this machine was started again, at another endpoint."""
+    def _follow_controller(self) -> None:
+        """Connect again if the controller of a fleet on this machine was started again, at another endpoint."""
         found = None if self._is_remote else fleets().get(self._name)
         if found is not None and str(found) != str(self._endpoint):
             self._requester.close()
@@ -224,7 +228,7 @@ class FollowedStream:
     """Follows a stream of a fleet from one pipeline to the next, without waiting.
 
     While nothing arrives from the stream's pipeline, the registry is asked once a second where the stream runs. If the
-    manager does not answer, the last answer holds. The end of a pipeline is the end of the stream only if the registry
+    registry does not answer, the last answer holds. The end of a pipeline is the end of the stream only if the registry
     says so: a stream that moves is stopped on one node, and goes on at another one.
 
     Parameters
@@ -248,7 +252,7 @@ class FollowedStream:
     ServiceError
         If the fleet has no such stream, or does not accept the keys.
     SilenceError
-        If the manager does not answer at first.
+        If the controller does not answer at first.
     """
 
     def __init__(self, registry: Registry, stream: str) -> None:
@@ -437,7 +441,7 @@ def locate(endpoint: str | Endpoint, keys: str = "", source: str = "", *, timeou
     ServiceError
         If there is none, or more than one; if the fleet has no such stream, or it does not run.
     SilenceError
-        If the manager of the fleet does not answer.
+        If the controller of the fleet does not answer.
     """
     if isinstance(endpoint, Endpoint):
         return endpoint

@@ -187,7 +187,7 @@ class Control:
         )
 
     def _follow(self) -> None:
-        """Connect to the pipeline that a stream of a fleet has now; if its manager does not answer, to the last one."""
+        """Connect to the pipeline that a stream of a fleet has now; the last one, if the registry does not answer."""
         if not self._stream:
             return
         with suppress(SilenceError):

@@ -130,7 +130,7 @@ class Subscription(Generic[Message]):
     the pipeline. If both run on the same machine as the same user, the pipeline waits for it, so that it receives every
     message.
 
-    The subscription to a stream of a fleet goes on if the stream moves or is started again, and while the manager of
+    The subscription to a stream of a fleet goes on if the stream moves or is started again, and while the registry of
     the fleet cannot be reached. It ends if the stream has ended, or was removed from the fleet. A frame that the stream
     repeats is not returned a second time; the frames that nobody tracked in between are counted in `missed`.
 
@@ -409,7 +409,7 @@ def subscribe(
     endpoint : str
         Endpoint of the pipeline, which may start later; the format is that of the setting `run.endpoint`. Empty for the
         only running pipeline of this user. The address of a stream of a fleet is `fleet://HOST:PORT/STREAM`, with host
-        and port of the manager; `fleet://FLEET/STREAM` for a fleet of this user, and `fleet://STREAM` for the only one.
+        and port of its registry; `fleet://FLEET/STREAM` for a fleet of this user, `fleet://STREAM` for the only one.
     channel : str
         "tracks", "models", "health", "samples", "features" or "previews".
     object : str or None
@@ -428,7 +428,7 @@ def subscribe(
         If there is no such channel, or its messages are not about one object each; if `endpoint` is empty and not
         exactly one pipeline runs; if the fleet has no such stream; or if the keys cannot be read.
     SilenceError
-        If the manager of the fleet does not answer.
+        If the registry of the fleet does not answer.
     """
     return Subscription(endpoint, channel, object=object, timeout=timeout, keys=keys)
 

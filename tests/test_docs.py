@@ -22,6 +22,7 @@ from mypy import api as mypy
 
 import catstream
 from catstream.cli import VERBS, verb
+from catstream.fleet import life
 from catstream.settings import PRESETS, describe
 from catstream.wire.channels import CHANNELS
 
@@ -29,6 +30,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("**/*.md")])
 
+_LIFE = re.compile(r"(<!-- life: .*? -->\n).*?(<!-- /life -->)", re.DOTALL)
 _TABLE = re.compile(r"(<!-- settings: .*? -->\n).*?(<!-- /settings -->)", re.DOTALL)
 
 
@@ -76,6 +78,21 @@ def settings_table() -> str:
         pairs = (f"`{name} = {json.dumps(value)}`" for name, value in values.items())
         lines.append(f"| `{preset}` | {', '.join(pairs)} |")
     return "\n".join(lines) + "\n"
+
+
+def life_of_a_stream() -> str:
+    """The tables and the diagram of the life of a stream, as `docs/how-to/fleet.md` shows them."""
+    lines = ["", "| state | an actor in it |", "| --- | --- |"]
+    lines += [f"| `{state}` | {what} |" for state, what in life.STATES.items()]
+    lines += ["", "| event | what has happened |", "| --- | --- |"]
+    lines += [f"| `{event}` | {what} |" for event, what in life.EVENTS.items()]
+    return "\n".join([*lines, "", "```mermaid", life.diagram(), "```", ""])
+
+
+def test_the_life_of_a_stream_is_shown_as_its_table_says():
+    shown = _LIFE.search(page("docs/how-to/fleet.md"))
+    assert shown, "docs/how-to/fleet.md: the marks around the life of a stream are missing"
+    assert life_of_a_stream() in shown[0], "docs/how-to/fleet.md does not show the table as it is: run `make settings`"
 
 
 def verbs() -> dict[str, click.Command]:
@@ -282,6 +299,8 @@ def test_the_version_is_the_same_everywhere():
 
 if __name__ == "__main__":
     settings = DOCS / "settings.md"
+    fleet = DOCS / "how-to" / "fleet.md"
+    fleet.write_text(_LIFE.sub(lambda found: found[1] + life_of_a_stream() + found[2], fleet.read_text()))
     settings.write_text(_TABLE.sub(lambda found: found[1] + settings_table() + found[2], page("docs/settings.md")))
 
 

@@ -7,12 +7,14 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
@@ -20,10 +22,13 @@ from catstream.messages import FleetStatus, StreamStatus
 from catstream.names import split_name
 from catstream.registry import Registry
 
+if TYPE_CHECKING:
+    from catstream.fleet.fleet import Fleet
+
 __all__ = ["fleet"]
 
 #: Subcommand -> module that holds it, where it is not this one; the module is imported when it is called.
-_ELSEWHERE = {"head": "fleet_nodes", "node": "fleet_nodes", "view": "fleet_view", "merge": "fleet_merge"}
+_ELSEWHERE = {"view": "fleet_view", "merge": "fleet_merge"}
 
 _SUMMARIES = {
     "up": "Start the streams of a file, or apply its changes.",
@@ -32,16 +37,15 @@ _SUMMARIES = {
     "add": "Add a stream.",
     "remove": "Remove streams.",
     "move": "Move a stream to a node.",
-    "drain": "Give all streams of a node away.",
+    "drain": "Move all streams from a node.",
     "logs": "Print what a stream has logged.",
     "merge": "Merge what several streams have learned of an object.",
     "down": "Stop all streams, and end the fleet.",
-    "head": "Keep the head of a cluster running on this machine.",
-    "node": "Keep a node of a cluster running on this machine.",
 }
 
 _STARTED = ("running", "waiting", "paused", "ended", "failed", "unplaced")
 _UP_SECONDS = 120.0  # limit for the streams to start
+_LOOK_SECONDS = 0.5
 
 
 class _Fleet(click.Group):
@@ -65,11 +69,12 @@ def fleet() -> None:
 
     A fleet keeps each stream running on some node, continues it elsewhere from
     its last state if the node dies, and is found by the names of its streams.
-    Ray starts and watches the processes: pip install "catstream[fleet]".
+    Ray places and watches the processes: pip install "catstream[fleet]".
 
     \b
     EXAMPLES
       catstream fleet up examples/fleet.toml
+      catstream fleet up fleet.toml --address 10.0.0.1:6379   # after `ray start`
       catstream fleet status
       catstream watch tracks --endpoint fleet://cam-1
       catstream fleet move cam-1 node-2
@@ -77,19 +82,21 @@ def fleet() -> None:
     """
 
 
-def with_manager(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that select a fleet by its manager; the command gets them as keywords of `Fleet`."""
+def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that select a fleet by its controller; the command gets them as keywords of `Fleet`."""
 
     @click.option(
         "--name", "fleet_name", default="", metavar="NAME", help="Name of the fleet; not needed if only one runs here."
     )
-    @click.option("--address", default="", metavar="HOST:PORT", help="Head of a cluster; default: this machine alone.")
     @click.option(
-        "--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Token of the cluster, with --address."
+        "--address",
+        default="",
+        metavar="HOST:PORT",
+        help="Head of a cluster of Ray, of which this machine is a node; default: RAY_ADDRESS, or this machine alone.",
     )
     @wraps(command)
-    def wrapped(fleet_name: str, address: str, token_file: Path | None, **options: object) -> None:
-        command(of={"name": fleet_name, "address": address, "token_file": token_file}, **options)
+    def wrapped(fleet_name: str, address: str, **options: object) -> None:
+        command(of={"name": fleet_name, "address": address}, **options)
 
     return wrapped
 
@@ -97,36 +104,67 @@ def with_manager(command: Callable[..., None]) -> Callable[..., None]:
 @fleet.command()
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--nodes", type=click.IntRange(1, 64), help="Nodes to start on this machine; default: as the file says.")
-@click.option("--cores", type=click.FloatRange(0, min_open=True), help="Cores of each of them; default: equal shares.")
-@with_manager
-def up(file: Path, nodes: int | None, cores: float | None, of: dict[str, object]) -> None:
+@click.option("--cores", type=click.IntRange(1), help="Cores of each of them; default: equal shares.")
+@click.option("--detach", is_flag=True, help="Return once the streams run; `catstream fleet down` ends them.")
+@click.option("--replace", is_flag=True, help="Replace the streams of another file that run under this name.")
+@click.option("--wait", is_flag=True, help="Let streams that do not fit wait for nodes that join later.")
+@with_fleet
+def up(file: Path, replace: bool, of: dict[str, object], **options: Any) -> None:
     """Start the streams of FILE, or apply its changes to a fleet that runs.
 
-    A stream that runs and is unchanged is not touched. Nothing is changed if a
-    stream fits on no node. The fleet goes on in the background; `catstream
-    fleet down` ends it, and `up` continues it from its last states.
+    On a cluster of Ray (--address), or if the fleet runs already, the command
+    returns once the streams run. Otherwise it starts Ray on this machine, and
+    ends it and the streams on Ctrl-C; with --detach they run on. The next `up`
+    continues from the last states. A stream that runs and is unchanged is not
+    touched. If a stream can run on no node, nothing is changed.
 
     \b
     EXAMPLES
       catstream fleet up examples/fleet.toml
-      catstream fleet up fleet.toml --address 10.0.0.1:6379 --token-file token
+      catstream fleet up examples/fleet.toml --detach
+      catstream fleet up fleet.toml --address 10.0.0.1:6379
     """
+    from catstream.errors import FleetError
     from catstream.fleet.fleet import Fleet
 
     console = Console()
-    with Fleet(file, **of) as running:  # type: ignore[arg-type]  # the options of `with_manager`
-        with Console(stderr=True).status("starting the nodes"):
-            lines = running.up(nodes=nodes, cores=cores)
+    with Fleet(file, **of) as running:  # type: ignore[arg-type]  # the options of `with_fleet`
+        try:
+            lines = _up(running, replace=replace, **options)
+        except FleetError as error:
+            if "(--replace)" not in str(error) or not sys.stdin.isatty():
+                raise
+            click.confirm(f"{str(error).partition(': give')[0]}. Replace them?", abort=True)
+            lines = _up(running, replace=True, **options)
         for line in lines:
             click.echo(line)
-        status = running.status()
-        deadline = time.monotonic() + _UP_SECONDS
+        with suppress(KeyboardInterrupt):
+            _watch(console, running)
+        if running.is_owner:
+            with Console(stderr=True).status("storing the states of all streams"):
+                running.down()
+            click.echo(f"the fleet {running.name} is down")
+
+
+def _up(fleet: Fleet, **options: Any) -> list[str]:
+    with Console(stderr=True).status("starting the fleet"):
+        return fleet.up(**options)
+
+
+def _watch(console: Console, fleet: Fleet) -> None:
+    """Show the streams until all have started; a fleet that ends with this program, until then."""
+    deadline = time.monotonic() + _UP_SECONDS
+    status = fleet.status()
+    try:
         with Live(console=console, transient=True) as live:
-            while not all(each.state in _STARTED for each in status.streams.values()) and time.monotonic() < deadline:
-                live.update(_streams(status))
-                time.sleep(0.5)
-                status = running.status()
-    _show(console, status)
+            while fleet.is_owner or (
+                not all(each.state in _STARTED for each in status.streams.values()) and time.monotonic() < deadline
+            ):
+                live.update(Group(_streams(status), _nodes(status)))
+                time.sleep(_LOOK_SECONDS)
+                status = fleet.status()
+    finally:
+        _show(console, status)
 
 
 @fleet.command()
@@ -138,7 +176,8 @@ def up(file: Path, nodes: int | None, cores: float | None, of: dict[str, object]
 def status(place: str, keys: str, as_json: bool) -> None:
     """Show all streams and nodes of a fleet.
 
-    Exit code 1 if a stream has failed or fits on no node.
+    Exit code 1 if a stream has failed, can run on no node, or skips frames
+    because its node is too slow.
 
     \b
     EXAMPLES
@@ -151,7 +190,8 @@ def status(place: str, keys: str, as_json: bool) -> None:
         click.echo(json.dumps(dataclasses.asdict(found)))
     else:
         _show(Console(), found)
-    if any(each.state in ("failed", "unplaced") for each in found.streams.values()):
+    streams = found.streams.values()
+    if any(each.state in ("failed", "unplaced") or "it skips" in each.trouble for each in streams):
         sys.exit(1)
 
 
@@ -161,10 +201,10 @@ def status(place: str, keys: str, as_json: bool) -> None:
 @click.option("--box", "boxes", multiple=True, metavar="[NAME=]X,Y,W,H", help="Box of an object in the first frame.")
 @click.option("--model", "models", multiple=True, metavar="[NAME=]FILE", help="Saved model of an object to search for.")
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A setting.")
-@click.option("--cores", type=float, metavar="N", help="Processor cores that it needs; default: as measured.")
+@click.option("--cores", type=float, metavar="N", help="Processor cores that Ray reserves for it; default: 1.")
 @click.option("--label", "labels", multiple=True, metavar="NAME=VALUE", help="Label that its node must have.")
 @click.option("--follow", multiple=True, metavar="OBJECT", help="Search for an object by its merged model.")
-@with_manager
+@with_fleet
 def add(
     name: str,
     source: str,
@@ -204,7 +244,7 @@ def add(
 @fleet.command()
 @click.argument("names", nargs=-1, required=True)
 @click.option("--forget", is_flag=True, help="Remove what they have learned, too.")
-@with_manager
+@with_fleet
 def remove(names: tuple[str, ...], forget: bool, of: dict[str, object]) -> None:
     """Remove streams; what they have learned stays in the store.
 
@@ -222,9 +262,9 @@ def remove(names: tuple[str, ...], forget: bool, of: dict[str, object]) -> None:
 @fleet.command()
 @click.argument("name")
 @click.argument("node")
-@with_manager
+@with_fleet
 def move(name: str, node: str, of: dict[str, object]) -> None:
-    """Move the stream NAME to a NODE, where it stays as long as that can have it.
+    """Move the stream NAME to a NODE, where it runs whenever the node lives.
 
     The stream stores its state, ends, and continues on the other node; a live
     stream loses the frames of about three seconds.
@@ -242,9 +282,9 @@ def move(name: str, node: str, of: dict[str, object]) -> None:
 @fleet.command()
 @click.argument("node")
 @click.option("--undo", is_flag=True, help="Let the node take streams again.")
-@with_manager
+@with_fleet
 def drain(node: str, undo: bool, of: dict[str, object]) -> None:
-    """Give all streams of a NODE away and place none there, before it is switched off.
+    """Move all streams from a NODE and place none there, before it is switched off.
 
     \b
     EXAMPLE
@@ -259,7 +299,7 @@ def drain(node: str, undo: bool, of: dict[str, object]) -> None:
 @fleet.command()
 @click.argument("name")
 @click.option("--lines", default=100, show_default=True, help="How many of the last lines.")
-@with_manager
+@with_fleet
 def logs(name: str, lines: int, of: dict[str, object]) -> None:
     """Print what the stream NAME has logged on its node since it started there."""
     from catstream.fleet.fleet import Fleet
@@ -270,11 +310,11 @@ def logs(name: str, lines: int, of: dict[str, object]) -> None:
 
 
 @fleet.command()
-@with_manager
+@with_fleet
 def down(of: dict[str, object]) -> None:
     """Stop all streams after their state was stored, and end the fleet.
 
-    A fleet on this machine ends with its nodes. On a cluster, the nodes stay.
+    On this machine, Ray ends with the fleet. On a cluster, Ray stays.
     `catstream fleet up` continues from the last states.
     """
     from catstream.fleet.fleet import Fleet
@@ -292,7 +332,7 @@ def _show(console: Console, status: FleetStatus) -> None:
 def _streams(status: FleetStatus) -> Table:
     """A row for each stream, those with trouble first."""
     table = Table("stream", "node", "state", box=None, pad_edge=False, header_style="bold")
-    for name in ("frames/s", "model", "restarts"):
+    for name in ("frames/s", "skipped", "cores", "model", "restarts"):
         table.add_column(name, justify="right")
     table.add_column("trouble", overflow="fold")
     for each in sorted(status.streams.values(), key=lambda each: (not each.trouble, each.name)):
@@ -303,6 +343,8 @@ def _streams(status: FleetStatus) -> Table:
             each.node or "-",
             each.state,
             f"{each.rate:.1f}" if each.rate else "-",
+            str(each.skipped or "-"),
+            f"{each.cores:.1f}" if each.cores else "-",
             str(model or "-"),
             restarts,
             _trouble(each),
@@ -317,7 +359,7 @@ def _trouble(stream: StreamStatus) -> str:
 
 def _nodes(status: FleetStatus) -> Table:
     table = Table("\nnode", "\nstate", "\naddress", box=None, pad_edge=False, header_style="bold")
-    for name in ("\ncores used", "\nof", "\nstreams"):
+    for name in ("\nreserved", "\nof cores", "\nstreams"):
         table.add_column(name, justify="right")
     table.add_column("\nlabels")
     for each in status.nodes.values():

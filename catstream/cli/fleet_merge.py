@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from catstream import storage
-from catstream.cli.fleet import with_manager
+from catstream.cli.fleet import with_fleet
 from catstream.errors import ServiceError
 from catstream.names import UNNAMED
 
@@ -20,7 +20,7 @@ __all__ = ["merge"]
     "--object", "object_name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one."
 )
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write the model to a file, too.")
-@with_manager
+@with_fleet
 def merge(names: tuple[str, ...], object_name: str, output: Path | None, of: dict[str, object]) -> None:
     """Merge what the streams NAMES have learned of an object; default: all.
 

@@ -60,14 +60,6 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
     "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
 )
 @click.option("--chaos", is_flag=True, help="Kill a random process every few seconds.")
-@click.option(
-    "--fleet-nodes",
-    "nodes",
-    type=click.IntRange(0, 16),
-    default=0,
-    help="Run the pipelines on a fleet with this number of nodes on this machine.",
-)
-@click.option("--kill-nodes", is_flag=True, help="Kill a random node of the fleet every few seconds, one at a time.")
 @click.option("--find-limit", is_flag=True, help="Search for the highest rate that meets the limits.")
 @click.option(
     "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see below."
@@ -85,8 +77,6 @@ def loadtest(
     duration: float,
     size: tuple[int, int],
     chaos: bool,
-    nodes: int,
-    kill_nodes: bool,
     find_limit: bool,
     limits: tuple[str, ...],
     json_file: Path | None,
@@ -103,12 +93,6 @@ def loadtest(
 
     Slow subscribers read two tracks per second; half of them are frozen
     instead. Chaos kills processes by SIGKILL; --set run.seed=N repeats it.
-
-    With --fleet-nodes, the pipelines are the streams of a fleet that is started
-    for the test, see catstream fleet, and latency counts to the track of a
-    subscriber that follows the stream from node to node. With --kill-nodes, a
-    node is killed with all of its processes, and started again after its
-    streams run on other nodes.
 
     \b
     LIMITS, of the worst stream
@@ -136,7 +120,6 @@ def loadtest(
       catstream loadtest --objects 8 --limit skipped=0.01
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
       catstream loadtest --duration 60 --chaos --limit recovery=5
-      catstream loadtest --streams 6 --fleet-nodes 3 --kill-nodes --duration 60 --rate 5
       catstream loadtest --find-limit --size 320x240
     """
     # Imported here so that --help and the other verbs start faster.
@@ -148,7 +131,7 @@ def loadtest(
     from catstream.loadtest.run import Status
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
-    plan = Plan(streams, objects, subscribers, slow, rate, duration, size, chaos, nodes, kill_nodes, settings)
+    plan = Plan(streams, objects, subscribers, slow, rate, duration, size, chaos, settings)
     _writable(json_file, output)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console(width=None if sys.stdout.isatty() else 140)
@@ -231,17 +214,9 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
             f"subscribers: {plan.subscribers * plan.streams}, {plan.slow * plan.streams} of them slow or frozen; the "
             f"others received {sum(result.received)} tracks and missed {sum(result.missed)}"
         )
-    if plan.chaos or plan.kill_nodes:
+    if plan.chaos:
         rows = [(recovery.kill, *map(_seconds, (recovery.track, recovery.model))) for recovery in result.recoveries]
-        killed = f"{result.killed_nodes} nodes" if plan.kill_nodes else len(rows)
-        console.print(_table((f"{killed} killed", "s to the next track", "s to the next model"), rows))
-    if result.statuses:
-        heads = ("stream", "node at the end", "restarts", "frames lost", "s lost (as its state says)")
-        states = [
-            (number, each.node, each.restarts, each.lost_frames, f"{each.lost_seconds:.1f}")
-            for number, each in enumerate(result.statuses)
-        ]
-        console.print(_table(heads, states))
+        console.print(_table((f"{len(rows)} killed", "s to the next track", "s to the next model"), rows))
     if result.other_load > _QUIET_CORES:
         console.print(
             f"other processes kept {result.other_load:.1f} cores busy: run it on a quiet machine for reliable figures"

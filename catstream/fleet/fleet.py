@@ -6,43 +6,48 @@
         fleet.up()
         print(fleet.status().streams["cam-7"].state)
 
-The fleet goes on after the program ends; `down` ends it. It changes nothing for who only watches: they need neither Ray
-nor the token, see `catstream.subscribe`.
+A fleet runs on a cluster of Ray that its users have started, and goes on after the program. Without one, it runs on
+this machine as long as the program, or until `down`. Programs that only watch need neither Ray nor its token: see
+`catstream.subscribe`.
 """
 
 from __future__ import annotations
 
-import logging
+import math
 import os
+import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 from catstream.errors import CatstreamError, FleetError
 from catstream.extras import require_extra
-from catstream.fleet.cluster import HEAD_RESOURCE, NAMESPACE, connect, disconnect
-from catstream.fleet.local import LocalFleet
-from catstream.fleet.manager import Manager, actor_name
+from catstream.fleet import cluster
+from catstream.fleet.cluster import NAMESPACE
+from catstream.fleet.controller import Controller, actor_name
+from catstream.fleet.local import LocalCluster
 from catstream.fleet.merge import Merged, merge_streams
 from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.fleet.store import Store
 from catstream.learned import Learned
 from catstream.messages import FleetStatus
 from catstream.names import UNNAMED, check_name
+from catstream.registry import REGISTRY_PORT
+from catstream.storage import lock
 
 __all__ = ["Fleet"]
 
-_ANSWER_SECONDS = (20.0, 60.0)  # limits for the manager to answer, and to start before that
+_ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
 _DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
 _TURN_SECONDS = 0.2
-_MANAGER = actor_name("", "manager")  # how the names of the managers end
-
-_log = logging.getLogger(__name__)
+_CONTROLLER = "/controller"  # how the names of the controllers end
 
 
 class Fleet:
-    """Connects to the manager of a fleet; `up` starts it, on this machine or on a cluster of Ray. Use it in a `with`.
+    """Connects to the controller of a fleet, which `up` starts. Use it in a `with`.
 
     Parameters
     ----------
@@ -51,16 +56,18 @@ class Fleet:
     name : str
         Name of the fleet; by default that of the spec, or the only one that runs.
     address : str
-        HOST:PORT of the head of a cluster. Empty for a fleet on this machine alone, which `up` starts.
-    token_file : path
-        File with the token of the cluster, with an address. Whoever has it can run any code on the cluster.
-    folder : path
-        Folder of a fleet on this machine; by default the one of its name in $XDG_STATE_HOME/catstream/fleets.
+        HOST:PORT of the head of a cluster of Ray, of which this machine is a node; by default RAY_ADDRESS. If both are
+        empty, the fleet runs on this machine alone.
+
+    Attributes
+    ----------
+    is_owner : bool
+        Whether the fleet ends with this object, because `up` started Ray for it.
 
     Raises
     ------
     FleetError
-        From the constructor, if the spec is not valid, or there is no such fleet. From each method, if the manager
+        From the constructor, if the spec is not valid, or there is no such fleet. From each method, if the controller
         cannot be reached or does not do it; the message names the stream and the node.
     MissingExtraError
         If Ray is not installed.
@@ -72,58 +79,70 @@ class Fleet:
         *,
         name: str = "",
         address: str = "",
-        token_file: str | os.PathLike[str] | None = None,
-        folder: str | os.PathLike[str] | None = None,
     ) -> None:
         require_extra("fleet")
-        self._spec = spec if isinstance(spec, FleetSpec) or spec is None else FleetSpec.load(Path(spec))
-        self.name = name or (self._spec.name if self._spec is not None else "")
-        self._address, self._token_file = address, Path(token_file) if token_file is not None else None
-        self._local = None if address else LocalFleet(Path(folder)) if folder is not None else self._local_fleet()
-        self._manager: Any = None
+        read = spec if isinstance(spec, FleetSpec) or spec is None else FleetSpec.load(Path(spec))
+        self._spec = replace(read, name=name) if read is not None and name else read
+        self._origin = "" if isinstance(spec, FleetSpec) or spec is None else _origin(Path(spec))
+        self.name = name or (read.name if read is not None else "")
+        self._address = address or os.environ.get("RAY_ADDRESS", "")
+        self._local = None if self._address else self._on_this_machine()
+        self.is_owner = False  # whether the cluster ends with this object
+        self._controller: Any = None
 
-    def up(self, *, nodes: int | None = None, cores: float | None = None) -> list[str]:
+    def up(
+        self,
+        *,
+        nodes: int | None = None,
+        cores: int | None = None,
+        detach: bool = False,
+        replace: bool = False,
+        wait: bool = False,
+    ) -> list[str]:
         """Make the spec the desired state; what runs and is unchanged is not touched.
 
         Parameters
         ----------
         nodes : int
             Number of nodes to start, for a fleet on this machine that does not run yet; by default that of the spec.
-        cores : float
-            Processor cores of each of them; by default an equal share of this machine's.
+        cores : int
+            Processor cores of each of them; by default an equal share of this machine's, rounded up.
+        detach : bool
+            Whether a fleet on this machine runs on after `close`, until `down`. On a cluster it always does.
+        replace : bool
+            Whether streams of another file that run under this name may be replaced.
+        wait : bool
+            Whether streams for which there are not enough nodes may wait for nodes that join later.
 
         Returns
         -------
         what is done, a line for each stream
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be used. Nothing is started or changed then.
         """
         if self._spec is None:
             raise FleetError("there are no streams: give a file, see docs/how-to/fleet.md")
-        if self._local is not None:
-            self._local.start(nodes or self._spec.nodes, cores)
-            if not self._spec.store:
-                self._spec = replace(self._spec, store=str(self._local.folder / "store"))
-        elif not self._spec.store:
-            raise FleetError(f'the fleet {self.name} needs a store that all nodes reach: store = "s3://BUCKET/PREFIX"')
-        self._connect()
-        import ray
-
-        self._manager = (
-            ray.remote(Manager)
-            .options(
-                name=actor_name(self._spec.name, "manager"),
-                namespace=NAMESPACE,
-                get_if_exists=True,
-                lifetime="detached",
-                num_cpus=0,
-                resources={HEAD_RESOURCE: 0.001},
-                max_restarts=-1,
-                max_task_retries=-1,
-                max_concurrency=8,
-            )
-            .remote(self._spec.name, self._spec.store, local=self._local is not None)
-        )
-        lines: list[str] = self._ask("apply", self._spec.to_json(), _models(self._spec.streams.values()))
-        return lines
+        with self._starting():
+            spec = self._with_store(self._spec)
+            began = self._local is not None and not self._local.running
+            try:
+                if self._local is not None and began:
+                    self._local.start(nodes or spec.nodes, cores, detach=detach)
+                    self.is_owner = not detach
+                self._start_controller(spec)
+                models = _models(spec.streams.values())
+                lines: list[str] = self._ask(
+                    "apply", spec.to_json(), models, self._origin, replace_other=replace, may_wait=wait
+                )
+            except BaseException:
+                if self._local is not None and began:
+                    self.close()
+                    self._local.stop()
+                raise
+            return lines
 
     def add(self, spec: StreamSpec) -> list[str]:
         """Add a stream, or change the one of the same name."""
@@ -136,12 +155,12 @@ class Fleet:
         return answer
 
     def move(self, name: str, node: str) -> str:
-        """Move a stream to a node, where it stays as long as the node can have it."""
+        """Move a stream to a node, where it runs whenever the node lives."""
         answer: str = self._ask("move", name, node)
         return answer
 
     def drain(self, node: str, *, undo: bool = False) -> str:
-        """Give all streams of a node away and place none there, for example before it is switched off."""
+        """Move all streams from a node and place none there, for example before it is switched off."""
         answer: str = self._ask("drain", node, undo=undo)
         return answer
 
@@ -172,38 +191,32 @@ class Fleet:
         return merge_streams(spec.store, names or spec.streams, check_name(object), named=bool(names))
 
     def down(self) -> None:
-        """Stop all streams after their state was stored, and the manager; on this machine alone, the nodes too."""
-        if self._local is not None and not (self._local.running or self._local.names):
+        """Stop all streams after their state was stored, and the controller; on this machine alone, Ray too."""
+        if self._local is not None and not self._local.running:
             raise FleetError(f"no fleet {self.name!r} of yours runs on this machine: see catstream fleet status")
-        try:
-            if self._local is None or self._local.running:
-                self._stop_streams()
-        except FleetError as error:
-            if self._local is None:
-                raise
-            _log.warning("%s: the streams end with their last states in the store", error)
+        self.is_owner = False
+        deadline = time.monotonic() + _DOWN_SECONDS
+        while self._ask("close") and time.monotonic() < deadline:
+            time.sleep(_TURN_SECONDS)
+        self.end_controller()
         if self._local is not None:
             self.close()
             self._local.stop()
 
-    def _stop_streams(self) -> None:
-        deadline = time.monotonic() + _DOWN_SECONDS
-        while self._ask("close") and time.monotonic() < deadline:
-            time.sleep(_TURN_SECONDS)
-        self.end_manager()
-
-    def end_manager(self) -> None:
-        """End the manager, and leave streams and nodes as they are; `up` starts another one."""
-        self._ask("spec")  # it is connected then
+    def end_controller(self) -> None:
+        """End the controller, and leave streams and nodes as they are; `up` starts another one."""
+        self._ask("end")
         import ray
 
-        ray.kill(self._manager)
-        self._manager = None
+        ray.kill(self._controller)
+        self._controller = None
 
     def close(self) -> None:
-        """Disconnect; the fleet goes on."""
-        self._manager = None
-        disconnect()
+        """Disconnect. A fleet on a cluster goes on, and a detached one; another one of this program ends."""
+        if self.is_owner:
+            self.down()
+        self._controller = None
+        cluster.disconnect()
 
     def __enter__(self) -> Self:
         return self
@@ -211,76 +224,126 @@ class Fleet:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _local_fleet(self) -> LocalFleet:
-        """The fleet of this machine with the name, or the only one that runs."""
-        home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream" / "fleets"
+    def _with_store(self, spec: FleetSpec) -> FleetSpec:
+        """The spec with its store, which was checked, so that nothing is started for a store that cannot be used."""
+        if not spec.store:
+            if self._local is None:
+                raise FleetError(
+                    f'the fleet {self.name} needs a store that all nodes reach: store = "s3://BUCKET/PREFIX"'
+                )
+            spec = replace(spec, store=str(self._local.folder / "store"))
+        Store(spec.store).check()
+        return spec
+
+    def _start_controller(self, spec: FleetSpec) -> None:
+        """Start the controller, if it does not run, on the node whose address the registry has."""
+        self._connect()
+        import ray
+
+        options: dict[str, Any] = {}
+        listen = ""
+        if not cluster.is_local():
+            head = ray.get_runtime_context().gcs_address.rpartition(":")[0]
+            registry = spec.registry or f"{head}:{REGISTRY_PORT}"
+            listen, options["resources"] = f"tcp://{registry}", {f"node:{registry.rpartition(':')[0]}": 0.001}
+        self._controller = (
+            ray.remote(Controller)
+            .options(
+                name=actor_name(spec.name, "controller"),
+                namespace=NAMESPACE,
+                get_if_exists=True,
+                lifetime="detached",
+                num_cpus=0,
+                max_restarts=-1,
+                max_task_retries=-1,
+                max_concurrency=8,
+                **options,
+            )
+            .remote(spec.name, spec.store, listen, spec.keys or str(_home() / spec.name / "keys"))
+        )
+        try:
+            self._ask("ready")
+        except CatstreamError:
+            ray.kill(self._controller)
+            raise
+
+    @contextmanager
+    def _starting(self) -> Iterator[None]:
+        """Wait while another process starts this fleet on this machine."""
+        if self._local is None:
+            yield
+            return
+        self._local.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with (self._local.folder / "starting").open("w") as file:
+            lock(file.fileno(), math.inf)
+            yield
+
+    def _on_this_machine(self) -> LocalCluster:
+        """The cluster of the fleet with the name, or of the only one that runs on this machine."""
         if self.name:
-            return LocalFleet(home / self.name)
-        running = [each for folder in sorted(home.glob("*")) if (each := LocalFleet(folder)).running]
+            return LocalCluster(_home() / self.name)
+        running = [each for folder in sorted(_home().glob("*")) if (each := LocalCluster(folder)).running]
         if len(running) != 1:
-            known = (
-                f": say which (--name), there are {', '.join(each.folder.name for each in running)}" if running else ""
-            )
-            raise FleetError(
-                f"{len(running)} fleets run on this machine{known or ': start one with catstream fleet up'}"
-            )
+            names = ", ".join(each.folder.name for each in running)
+            help_ = f"say which (--name), there are {names}" if running else "start one with catstream fleet up"
+            raise FleetError(f"{len(running)} fleets run on this machine: {help_}")
         self.name = running[0].folder.name
         return running[0]
 
     def _connect(self) -> None:
-        if self._local is not None:
-            if not self._local.running:
-                raise FleetError(f"the fleet {self.name} does not run: start it with catstream fleet up")
-            connect(self._local.address, self._local.token_file)
-        elif self._token_file is None:
-            raise FleetError(f"the cluster at {self._address} needs its token: give the file (--token-file)")
+        if self._local is None:
+            cluster.connect(self._address)
+        elif address := self._local.address:
+            cluster.connect(address, self._local.variables)
         else:
-            connect(self._address, self._token_file)
+            raise FleetError(f"the fleet {self.name} does not run: start it with catstream fleet up")
 
     def _ask(self, method: str, *arguments: object, **options: object) -> Any:
-        """Call a method of the manager, and wait for its answer; connects again if the head has started again."""
-        self._connect()  # before Ray is imported, which reads its variables then
+        """Call a method of the controller, and wait for its answer."""
+        self._connect()
+        import ray
         from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 
-        why = ""
-        for seconds in _ANSWER_SECONDS:
-            try:
-                return self._call(method, seconds, *arguments, **options)
-            except RayTaskError as error:
-                if isinstance(error.cause, CatstreamError):
-                    raise error.cause from None
-                raise
-            except (RayError, GetTimeoutError) as error:
-                why = str(error).partition("\n")[0] or type(error).__name__
-                self.close()
-        raise FleetError(f"the manager of {self.name} does not answer ({why}): is its head running?")
-
-    def _call(self, method: str, seconds: float, *arguments: object, **options: object) -> Any:
-        import ray
-
-        if self._manager is None:
-            self._connect()
+        if self._controller is None:
             self.name = self.name or self._only_fleet()
             try:
-                self._manager = ray.get_actor(actor_name(self.name, "manager"), namespace=NAMESPACE)
+                self._controller = ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE)
             except ValueError:
                 raise FleetError(
                     f"there is no fleet {self.name!r} on this cluster: start it with catstream fleet up"
                 ) from None
-        return ray.get(getattr(self._manager, method).remote(*arguments, **options), timeout=seconds)
+        try:
+            return ray.get(getattr(self._controller, method).remote(*arguments, **options), timeout=_ANSWER_SECONDS)
+        except RayTaskError as error:
+            if isinstance(error.cause, CatstreamError):
+                raise error.cause from None
+            what = str(error).strip().rpartition("\n")[2]
+        except (RayError, GetTimeoutError) as error:
+            self._controller = None
+            what = str(error).partition("\n")[0] or type(error).__name__
+        raise FleetError(f"the controller of {self.name} did not do it ({what}): see its log in the folder of Ray")
 
     def _only_fleet(self) -> str:
         """The name of the only fleet of the connected cluster."""
         from ray.util import list_named_actors
 
         actors = [each["name"] for each in list_named_actors(all_namespaces=True) if each["namespace"] == NAMESPACE]
-        names: list[str] = sorted(each.removesuffix(_MANAGER) for each in actors if each.endswith(_MANAGER))
+        names: list[str] = sorted(each.removesuffix(_CONTROLLER) for each in actors if each.endswith(_CONTROLLER))
         if len(names) != 1:
-            help_ = (
-                f"say which (--name), there are {', '.join(names)}" if names else "start one with catstream fleet up"
-            )
-            raise FleetError(f"{len(names)} fleets run on the cluster at {self._address}: {help_}")
+            listed = f"say which (--name), there are {', '.join(names)}"
+            known = listed if names else "start one with catstream fleet up"
+            raise FleetError(f"{len(names)} fleets run on the cluster at {self._address}: {known}")
         return names[0]
+
+
+def _home() -> Path:
+    """The folder with one for each fleet of this user."""
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream" / "fleets"
+
+
+def _origin(file: Path) -> str:
+    """Machine and path of a file."""
+    return f"{socket.gethostname()}:{file.resolve()}"
 
 
 def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:

@@ -1,220 +1,191 @@
-"""LocalFleet: a cluster on this machine, as background processes that go on when this process ends."""
+"""A cluster of Ray on this machine alone, on the loopback interface: a background process that keeps its nodes running.
+
+The process is of this file's `main`. It starts Ray as the documentation of Ray does for several nodes on one machine,
+starts a node again that died, and ends the cluster when it is told to, or when the program that started it ends. The
+first node is the head: without it, the cluster ends, and is started again by `catstream fleet up`.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import math
 import os
+import secrets
 import signal
-import socket
+import subprocess
 import sys
-import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterable
+from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from catstream.errors import FleetError
-from catstream.extras import require_extra
-from catstream.fleet.keeper import holder
 from catstream.services import start
-from catstream.storage import write_atomically
+from catstream.storage import is_locked, lock, write_atomically
 
-__all__ = ["LocalFleet"]
+__all__ = ["LocalCluster", "main"]
 
-_HOST = "127.0.0.1"
 _START_SECONDS = 150.0  # on a machine that is busy
-_END_SECONDS = 20.0
-_LOOK_SECONDS = 0.05
-_MAIN = "from catstream.cli import main; main()"
+_END_SECONDS = 30.0
+_LOOK_SECONDS = 0.5  # between two looks at the nodes
+_TURN_SECONDS = 0.05
+_STORE_BYTES = 80 << 20  # of Ray's object store: only models and states that are merged go through it
 
 
-class LocalFleet:
-    """The head and the nodes of a cluster that runs on this machine alone; its ports are on the loopback interface.
-
-    Any process of this user can use it. Each node is a background process (`catstream fleet node`), which starts Ray
-    again after its death.
+class LocalCluster:
+    """The cluster of a folder; any process of this user can use it.
 
     Parameters
     ----------
-    folder : for the token, the state of the cluster, logs and process ids; made if there is none
+    folder : for the token, the log, and the address while it runs; made by `start`
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.absolute()
-
-    @property
-    def token_file(self) -> Path:
-        """File with the token of the fleet."""
-        return self.folder / "token"
+        # Short, because the paths of Unix sockets are.
+        self._process: subprocess.Popen[bytes] | None = None  # if this process has started it
+        self._work = Path("/tmp") / f"catstream-{os.getuid()}-{sha256(bytes(self.folder)).hexdigest()[:8]}"
 
     @property
     def running(self) -> bool:
-        """Whether the head's background process runs."""
-        return holder("head", self.folder) is not None
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the nodes whose background processes run, without the head."""
-        names = (path.stem for path in sorted(self.folder.glob("*.pid")))
-        return [name for name in names if name != "head" and holder(name, self.folder) is not None]
+        """Whether its process runs."""
+        with suppress(OSError), (self.folder / "pid").open() as file:
+            return is_locked(file.fileno())
+        return False
 
     @property
     def address(self) -> str:
-        """HOST:PORT of the head.
+        """HOST:PORT of the head; empty if it does not run, or has not started yet."""
+        with suppress(OSError):
+            return (self.folder / "address").read_text() if self.running else ""
+        return ""
 
-        Raises
-        ------
-        FleetError
-            If it does not run.
-        """
-        with contextlib.suppress(OSError):
-            if self.running:
-                return (self.folder / "address").read_text()
-        raise FleetError(f"no fleet of yours runs in {self.folder}: start one (catstream fleet up)")
+    @property
+    def variables(self) -> dict[str, str]:
+        """The variables of a process that connects, or is a node."""
+        token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(self.folder / "token")}
+        # Ray listens on 127.0.0.1 only if it takes the machine for one that runs no cluster with others.
+        loopback = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_USAGE_STATS_ENABLED": "0"}
+        quiet = {"RAY_TMPDIR": str(self._work), "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+        # A dead node is noticed after two seconds, one that hangs after six.
+        health = {"RAY_health_check_initial_delay_ms": "1000", "RAY_health_check_period_ms": "500"}
+        health |= {"RAY_health_check_timeout_ms": "1500", "RAY_health_check_failure_threshold": "3"}
+        # A worker of Ray has a lower priority by default: other programs would starve the streams.
+        workers = {"RAY_worker_niceness": "0", "RAY_OBJECT_STORE_ALLOW_SLOW_STORAGE": "1"}
+        return token | loopback | quiet | health | workers
 
-    def start(self, nodes: int = 1, cores: float | None = None) -> None:
-        """Start the head and the nodes node-1, node-2 ... that do not run, and wait until all have started.
+    def start(self, nodes: int, cores: int | None = None, *, detach: bool = True) -> None:
+        """Start the nodes node-1, node-2 ... and wait until all have started. Call it with a lock of the folder.
 
         Parameters
         ----------
         nodes : number of nodes
-        cores : of each node, for streams; None divides the cores of this machine among them
-
-        Raises
-        ------
-        FleetError
-            If one of them does not start; those that were started by this call are stopped.
-        """
-        require_extra("fleet")
-        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self.folder.chmod(0o700)
-        (self.folder / "logs").mkdir(exist_ok=True)
-        cores = round(len(os.sched_getaffinity(0)) / nodes, 2) if cores is None and nodes else cores
-        began: dict[str, int] = {}
-        try:
-            if not self.running:
-                address = self._remembered_address()
-                self._keep(began, {"head": ["head", "--listen", address, "--folder", str(self.folder)]})
-            wanted = [f"node-{number}" for number in range(1, nodes + 1)]
-            missing = [name for name in wanted if holder(name, self.folder) is None]
-            self._keep(began, {name: self._node(name, cores or 0.0, {}) for name in missing})
-        except BaseException:
-            self._stop(began)
-            self._end_children(began.values())
-            raise
-
-    def start_node(self, name: str, cores: float, labels: dict[str, str] | None = None) -> None:
-        """Start one more node, and wait until it has joined.
+        cores : of each node, a whole number for Ray; None divides the cores of this machine among them, rounded up
+        detach : whether it runs on when this process ends
 
         Raises
         ------
         FleetError
             If it does not start.
         """
-        self._keep({}, {name: self._node(name, cores, labels or {})})
-
-    def stop_node(self, name: str) -> None:
-        """Stop a node for good."""
-        self._stop([name])
-
-    def _node(self, name: str, cores: float, labels: dict[str, str]) -> list[str]:
-        options = [word for label in labels.items() for word in ("--label", "=".join(label))]
-        place = ["--head", self.address, "--token-file", str(self.token_file), "--folder", str(self.folder)]
-        return ["node", *place, "--name", name, "--cores", f"{cores:g}", *options]
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.folder.chmod(0o700)
+        if not (self.folder / "token").exists():
+            write_atomically(self.folder / "token", secrets.token_hex(32).encode(), 0o600)
+        (self.folder / "address").unlink(missing_ok=True)
+        self._work.mkdir(mode=0o700, exist_ok=True)
+        (self._work / "ray").mkdir(exist_ok=True)
+        cores = math.ceil(len(os.sched_getaffinity(0)) / nodes) if cores is None else cores
+        command = start.python_command(
+            "from catstream.fleet.local import main; main()",
+            *(str(self.folder), str(nodes), str(cores), "detached" if detach else "attached"),
+        )
+        others = {name: value for name, value in start.environment().items() if not name.startswith("RAY_")}
+        with (self.folder / "log").open("wb") as log:
+            process = subprocess.Popen(
+                command,
+                env=others | self.variables,
+                stdin=subprocess.DEVNULL if detach else subprocess.PIPE,  # its end is the end of this process
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+        self._process = process  # with the pipe
+        deadline = time.monotonic() + _START_SECONDS
+        try:
+            while not self.address:
+                if process.poll() is not None or time.monotonic() > deadline:
+                    lines = (self.folder / "log").read_text(errors="replace").strip().splitlines()
+                    raise FleetError(
+                        f"Ray does not start on this machine: {lines[-1] if lines else 'it printed nothing'}\n"
+                        f"See {self.folder / 'log'}"
+                    )
+                time.sleep(_TURN_SECONDS)
+        except BaseException:
+            self.stop()
+            raise
 
     def stop(self) -> None:
-        """Stop all nodes, then the head. The token, the state of the cluster and the logs stay."""
-        self._stop(self.names)
-        self._stop(["head"])
-
-    def _remembered_address(self) -> str:
-        """The address of the last start, so that nodes and drivers find the head again; a free port at first."""
-        path = self.folder / "address"
-        with contextlib.suppress(OSError):
-            return path.read_text()
-        with socket.create_server((_HOST, 0)) as server:
-            address = f"{_HOST}:{server.getsockname()[1]}"
-        write_atomically(path, address.encode())
-        return address
-
-    def _keep(self, began: dict[str, int], commands: dict[str, list[str]]) -> None:
-        """Start background processes by name, and wait until each has reported that Ray runs."""
-        waited = set(commands)
-        with tempfile.TemporaryDirectory(prefix="catstream-") as folder, contextlib.ExitStack() as stack:
-            receivers = {}
-            for name, command in commands.items():
-                receiver = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-                receiver.bind(f"{folder}/{name}")
-                receiver.setblocking(False)
-                receivers[name] = receiver
-                began[name] = self._spawn(name, command, f"{folder}/{name}")
-
-            def settled() -> bool:
-                for name in sorted(waited):
-                    with contextlib.suppress(BlockingIOError):
-                        receivers[name].recv(100)
-                        waited.discard(name)
-                return not waited or any(_has_ended(began[name]) for name in waited)
-
-            if not _wait(settled, _START_SECONDS) or waited:
-                name = min(waited, key=lambda name: not _has_ended(began[name]))
-                raise FleetError(f"{name} does not start: {self._last_line(name)}")
-
-    def _spawn(self, name: str, command: list[str], notified: str) -> int:
-        """Start a background process that reports to the socket `notified`; return its process id."""
-        log = self.folder / "logs" / f"{name}.log"
-        return os.posix_spawn(  # unlike a Popen, it may outlive this process without a warning
-            sys.executable,
-            [sys.executable, "-P", "-c", _MAIN, "fleet", *command, "--ports", "0"],
-            start.environment() | {"NOTIFY_SOCKET": notified},
-            file_actions=[
-                (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
-                (os.POSIX_SPAWN_OPEN, 1, log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600),
-                (os.POSIX_SPAWN_DUP2, 1, 2),
-            ],
-            setsid=True,
-        )
-
-    def _stop(self, names: Iterable[str]) -> None:
-        """End the background processes of these names, and wait for them."""
-        pids = {name: pid for name in names if (pid := holder(name, self.folder)) is not None}
-        for pid in pids.values():
-            _signal(pid, signal.SIGTERM)
-            _signal(pid, signal.SIGCONT)  # one that was frozen ends, too
-        if not _wait(lambda: all(holder(name, self.folder) is None for name in pids), _END_SECONDS):
-            for name, pid in pids.items():
-                if holder(name, self.folder) == pid:
-                    _signal(pid, signal.SIGKILL)  # Ray ends with its keeper
-
-    def _end_children(self, pids: Iterable[int]) -> None:
-        """End background processes that were started just now and do not hold their lock yet, and wait for them."""
-        left = [pid for pid in pids if not _has_ended(pid)]
-        for pid in left:
-            _signal(pid, signal.SIGTERM)
-        _wait(lambda: all(map(_has_ended, left)), _END_SECONDS)
-
-    def _last_line(self, name: str) -> str:
-        lines = (self.folder / "logs" / f"{name}.log").read_text(errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("catstream: ") if lines else "it printed nothing"
+        """End the cluster, and wait until it has ended."""
+        deadline = time.monotonic() + _END_SECONDS
+        while self.running:
+            with suppress(OSError, ValueError):
+                pid = int((self.folder / "pid").read_text())
+                os.kill(pid, signal.SIGTERM if time.monotonic() < deadline else signal.SIGKILL)
+                os.kill(pid, signal.SIGCONT)
+            time.sleep(_TURN_SECONDS)
+        if self._process is not None:
+            self._process.communicate()  # closes the pipe
+            self._process = None
 
 
-def _has_ended(pid: int) -> bool:
-    """Whether a child of this process has ended."""
+def main() -> None:
+    """Run the cluster of a folder until SIGTERM.
+
+    The arguments are the folder, the number of nodes, their cores, and "attached" if it ends with its standard input.
+    """
+    folder, count, cores = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    ends = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda _number, _frame: ends.set())
+    with (folder / "pid").open("a+") as file:
+        if not lock(file.fileno()):
+            sys.exit("the cluster runs already")
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        if sys.argv[4] == "attached":
+            threading.Thread(target=_set_at_the_end_of_input, args=(ends,), daemon=True).start()
+        _keep(folder, count, cores, ends)
+
+
+def _set_at_the_end_of_input(ends: threading.Event) -> None:
+    sys.stdin.buffer.read()
+    ends.set()
+
+
+def _keep(folder: Path, count: int, cores: int, ends: threading.Event) -> None:
+    from ray.cluster_utils import Cluster
+
+    def options(number: int) -> dict[str, Any]:
+        return {"node_name": f"node-{number}", "num_cpus": cores, "object_store_memory": _STORE_BYTES}
+
+    cluster: Any = Cluster(initialize_head=True, head_node_args=options(1) | {"include_dashboard": False})
     try:
-        return os.waitpid(pid, os.WNOHANG) != (0, 0)
-    except ChildProcessError:  # this was known before
-        return True
+        nodes = {number: cluster.add_node(**options(number)) for number in range(2, count + 1)}
+        write_atomically(folder / "address", cluster.address.encode(), 0o600)
+        while not ends.wait(_LOOK_SECONDS) and not _has_died(cluster.head_node):
+            for number, node in nodes.items():
+                if _has_died(node):
+                    print(f"node-{number} has died, and is started again", flush=True)
+                    cluster.remove_node(node, allow_graceful=False)
+                    nodes[number] = cluster.add_node(**options(number))
+    finally:  # Ray ends this process on SIGTERM
+        (folder / "address").unlink(missing_ok=True)
+        cluster.shutdown()
 
 
-def _signal(pid: int, number: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, number)
-
-
-def _wait(condition: Callable[[], bool], seconds: float) -> bool:
-    """Wait until a condition holds; False if it does not within so many seconds."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(_LOOK_SECONDS)
-    return True
+def _has_died(node: Any) -> bool:
+    """Whether a node of Ray, or the state of the cluster on it, has died."""
+    return any(kind in ("raylet", "gcs_server") for kind, _ in node.dead_processes())

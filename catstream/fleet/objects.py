@@ -6,6 +6,7 @@ server in AWS_ENDPOINT_URL. They are not part of the URL, which is shown in mess
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
@@ -82,7 +83,7 @@ class FsspecObjects:
         )
 
     def create(self, name: str, data: bytes) -> None:
-        """Create an object; see `catstream.fleet.log.Objects`."""
+        """Create an object; see `catstream.fleet.states.Objects`."""
 
         def created(path: str) -> None:
             if self._local:
@@ -98,31 +99,33 @@ class FsspecObjects:
         read: Callable[[str], bytes] = lambda path: self._fs.cat_file(path, **self._limit)  # noqa: E731
         return self._call(name, "read", read, passed=FileNotFoundError)
 
-    def exists(self, name: str) -> bool:
-        """Return whether there is such an object."""
-        try:
-            self._call(name, "found", lambda path: self._fs.info(path, **self._limit), passed=FileNotFoundError)
-        except FileNotFoundError:
-            return False
-        return True
-
-    def sizes(self, folder: str) -> dict[str, int]:
-        """Return the sizes of all objects below a folder, by the part of their names below it."""
-        find = self._call(folder, "listed", lambda path: self._fs.find(path, detail=True, **self._limit))
+    def names(self, folder: str) -> list[str]:
+        """Return the names of all objects below a folder, without the name of the folder."""
+        found = self._call(folder, "listed", lambda path: self._fs.find(path, **self._limit))
         start = len(f"{self._root}/{folder}/")
-        return {path[start:]: found["size"] for path, found in find.items()}
+        return [path[start:] for path in found]
 
     def remove(self, name: str) -> None:
-        """Remove an object, if it exists."""
-        try:
-            self._call(name, "removed", lambda path: self._fs.rm_file(path, **self._limit), passed=FileNotFoundError)
-        except FileNotFoundError:
-            return
+        """Remove an object, if it exists, and its folder if that is empty then."""
+
+        def removed(path: str) -> None:
+            self._fs.rm_file(path, **self._limit)
+            if self._local:
+                with contextlib.suppress(OSError):  # it is not empty
+                    Path(path).parent.rmdir()
+
+        with contextlib.suppress(FileNotFoundError):
+            self._call(name, "removed", removed, passed=FileNotFoundError)
 
     def tidy(self, folder: str) -> None:
         """Remove the old parts of files that killed processes left. S3 keeps no part of an object."""
+
+        def tidied(path: str) -> None:
+            for each in {found.parent for found in Path(path).rglob(".*.part")}:
+                storage.remove_parts(each, _ABANDONED_SECONDS)
+
         if self._local:
-            self._call(folder, "tidied", lambda path: storage.remove_parts(Path(path), _ABANDONED_SECONDS))
+            self._call(folder, "tidied", tidied)
 
     def _call(
         self,
@@ -140,7 +143,8 @@ class FsspecObjects:
                 error = FileExistsError()
             if isinstance(error, passed) and code != "NoSuchBucket":
                 raise type(error)(name) from None
-            raise StoreError(f"{name} of the store {self._url} cannot be {what}: {_trouble(error, code)}") from None
+            place = f"{name} of the store" if name else "the store"
+            raise StoreError(f"{place} {self._url} cannot be {what}: {_trouble(error, code)}") from None
 
 
 def _parse(url: str) -> tuple[str, str]:

@@ -4,12 +4,14 @@
     store = "state"                    # a folder, file:///..., or s3://bucket/prefix
     every = 5.0                        # seconds between two states of a stream in the store
     nodes = 3                          # nodes that are started if the fleet runs on this machine alone
+    registry = "10.0.0.1:5690"         # where clients ask for the streams of a cluster; the default is its head
+    keys = "keys"                      # folder of the clients' keys on that machine
 
     [streams.cam-7]
     source = "rtsp://camera/1"
     box = [120, 80, 64, 48]            # or boxes = { anna = [...] }, model = "a.safetensors", models = { anna = "..." }
     settings = { "coreset.size" = 128 }
-    cores = 0.5                        # measured while it runs if this is left out
+    cores = 0.5                        # that Ray reserves for it; the default is 1
     labels = { site = "north" }        # labels that its node must have
     follow = ["anna"]                  # objects whose merged model this stream searches for
 
@@ -41,8 +43,10 @@ from catstream.video.source import is_live
 __all__ = ["FleetSpec", "StreamSpec"]
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
+_REGISTRY = re.compile(r"[A-Za-z0-9_.-]+:[0-9]{1,5}")
 _STREAM_HEADER = re.compile(r"\s*\[\s*streams\s*\.\s*[\"']?([\w.-]+)")
 _MOST_NODES = 64  # on one machine
+_FLEET_KEYS = ("name", "store", "every", "nodes", "registry", "keys")
 _EVERY = 5.0
 _LONGEST_EVERY = 3600.0
 
@@ -59,7 +63,7 @@ class StreamSpec:
     boxes     the objects in the first frame, by name
     models    file of each object that is searched for, by name
     settings  values of settings by full name
-    cores     cores that it needs; None if they are measured while it runs
+    cores     cores that Ray reserves for it
     labels    labels that its node must have
     follow    objects whose merged model it searches for
 
@@ -80,7 +84,7 @@ class StreamSpec:
     boxes: dict[str, Box] = field(default_factory=dict)
     models: dict[str, Path] = field(default_factory=dict)
     settings: dict[str, object] = field(default_factory=dict)
-    cores: float | None = None
+    cores: float = 1.0
     labels: dict[str, str] = field(default_factory=dict)
     follow: tuple[str, ...] = ()
 
@@ -99,9 +103,9 @@ class StreamSpec:
                 if name in self.settings:
                     raise FleetError(f"the fleet sets {name} itself: remove it from the settings")
             Job(self.source, self.boxes, self.models, settings=Settings.from_values(self.settings))
-            if self.cores is not None and not (math.isfinite(self.cores) and self.cores > 0):
+            if not (math.isfinite(self.cores) and self.cores > 0):
                 raise FleetError(
-                    f"cores must be a number above 0, got {self.cores:g}: leave it out, and they are measured"
+                    f"cores must be a number above 0, got {self.cores:g}: catstream fleet status shows what it uses"
                 )
 
     @classmethod
@@ -123,11 +127,11 @@ class StreamSpec:
 
     @property
     def digest(self) -> str:
-        """Text that changes exactly if the stream has to be started anew: with its source, objects or settings.
+        """Text that changes exactly if the stream has to start again: with its source, objects or settings.
 
-        A change of `cores`, `labels` or `follow` does not change it: the stream only moves if its node has not the
-        labels any more, and learns of other objects to search for while it runs. Settings count by their values, so
-        that writing down a default changes nothing. Of a model, its path counts and not its content.
+        A change of `cores`, `labels` or `follow` does not change it: the stream then continues from its state, on a
+        node with the labels, and learns of other objects to search for while it runs. Settings count by their values,
+        so that writing down a default changes nothing. Of a model, its path counts and not its content.
         """
         models = {name: str(file) for name, file in self.models.items()}
         boxes = {name: list(map(float, box)) for name, box in self.boxes.items()}
@@ -150,6 +154,8 @@ class FleetSpec:
     store    folder or URL of the states; "" for a folder that belongs to the fleet
     every    seconds between two states of a stream in the store
     nodes    how many nodes are started for a fleet on one machine alone
+    registry HOST:PORT where clients ask for the streams; "" for the head of the cluster, and the default port
+    keys     folder of the clients' keys on that machine; "" for the one of the fleet's name
     streams  the streams by name
     """
 
@@ -157,12 +163,19 @@ class FleetSpec:
     store: str = ""
     every: float = _EVERY
     nodes: int = 1
+    registry: str = ""
+    keys: str = ""
     streams: dict[str, StreamSpec] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_fleet_name(self.name, "fleet")
         if not 0 < self.every <= _LONGEST_EVERY:
             raise FleetError(f"the fleet {self.name}: every must be above 0 and at most 3600 s, got {self.every:g}")
+        if self.registry and not _REGISTRY.fullmatch(self.registry):
+            raise FleetError(
+                f"the fleet {self.name}: registry must be HOST:PORT of a node, as in 10.0.0.1:5690, got "
+                f"{self.registry!r}"
+            )
         if not 1 <= self.nodes <= _MOST_NODES:
             raise FleetError(f"the fleet {self.name}: nodes must be from 1 to {_MOST_NODES}, got {self.nodes}")
 
@@ -195,7 +208,7 @@ class FleetSpec:
     def to_json(self) -> str:
         """The spec as JSON text with absolute paths. It contains the sources with their passwords."""
         streams = {name: stream.table() for name, stream in self.streams.items()}
-        own = {"name": self.name, "store": self.store, "every": self.every, "nodes": self.nodes}
+        own = {name: getattr(self, name) for name in _FLEET_KEYS}
         return json.dumps(own | {"streams": streams})
 
     def changes(self, new: FleetSpec) -> list[str]:
@@ -224,7 +237,7 @@ class FleetSpec:
 
     @classmethod
     def _of(cls, tables: Mapping[str, Any], folder: Path) -> FleetSpec:
-        _check_keys(tables, ("name", "store", "every", "nodes", "streams"))
+        _check_keys(tables, (*_FLEET_KEYS, "streams"))
         store, streams = _text("store", tables.get("store", ""), folder), tables.get("streams", {})
         if not isinstance(streams, Mapping):
             raise FleetError(f"streams must be tables [streams.NAME], got {reprlib.repr(streams)}")
@@ -233,6 +246,8 @@ class FleetSpec:
             store if not store or "://" in store else str(folder / store),
             _number("every", tables.get("every", _EVERY), folder),
             _count("nodes", tables.get("nodes", 1)),
+            _text("registry", tables.get("registry", ""), folder),
+            _path("keys", tables.get("keys", ""), folder),
             {name: StreamSpec.parse(name, table, folder) for name, table in streams.items()},
         )
 
@@ -244,6 +259,11 @@ def _text(key: str, value: object, _: Path) -> str:
     if not isinstance(value, str):
         raise FleetError(f"{key} must be a text, got {reprlib.repr(value)}")
     return value
+
+
+def _path(key: str, value: object, folder: Path) -> str:
+    text = _text(key, value, folder)
+    return str(folder / text) if text else ""
 
 
 def _number(key: str, value: object, _: Path) -> float:

@@ -1,11 +1,11 @@
 """The store of a fleet: states of streams, the fleet's spec and merged models, in a folder or an S3 bucket.
 
-    streams/NAME/    log of the states of a stream
-    models/OBJECT/   log of the merged models of an object
-    fleet/           log of the spec of the fleet
+    streams/NAME/    states of a stream
+    models/OBJECT/   merged models of an object
+    fleet/           specs of the fleet
 
-The protocol of a log is in `catstream.fleet.log`. A state contains the source of its stream, which may contain a
-password: files are readable by their owner only, and a bucket has to be private.
+Of each, the newest two are kept, as `catstream.fleet.states` describes. A state contains the source of its stream,
+which may contain a password: files are readable by their owner only, and a bucket has to be private.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from catstream.errors import FencedError, FleetError
-from catstream.fleet.log import LARGEST_CLAIM, Claim, Generation, Log
 from catstream.fleet.objects import FsspecObjects
+from catstream.fleet.states import Claim, Generation, Listing, States
 from catstream.names import UNNAMED, check_name
 
 __all__ = ["Claim", "Generation", "Store"]
@@ -33,7 +33,7 @@ class Store:
 
     Parameters
     ----------
-    url : folder, file:///folder or s3://bucket/prefix; the folder has to exist, except for `put_fleet`
+    url : folder, file:///folder or s3://bucket/prefix; the folder has to exist, or is made by `check`
 
     Raises
     ------
@@ -49,6 +49,18 @@ class Store:
 
     def __repr__(self) -> str:
         return repr(self._objects).replace("FsspecObjects", "Store")
+
+    def check(self) -> None:
+        """Check that the store can be used; a folder is created, if it does not exist.
+
+        Raises
+        ------
+        StoreError
+            If it cannot.
+        """
+        self._objects.make()
+        self._objects.check()
+        self._checked = True
 
     def claim(self, stream: str, holder: str) -> Claim:
         """Become the only process that may write the states of a stream.
@@ -66,29 +78,27 @@ class Store:
 
     def newest(self, stream: str) -> Generation | None:
         """Return the newest state of a stream; None if there is none."""
-        return self._log(_streams(stream)).newest()
+        return self._states(_streams(stream)).newest()
 
     def streams(self) -> list[str]:
         """Return the names of all streams that have a state."""
-        newest: dict[str, tuple[str, int]] = {}
-        for path, size in self._objects.sizes("streams").items():
-            stream, _, number = path.partition("/")
-            if number.isdecimal():
-                newest[stream] = max(newest.get(stream, ("", 0)), (number, size))
-        return sorted(name for name, (_, size) in newest.items() if size > LARGEST_CLAIM or self.newest(name))
+        names: dict[str, list[str]] = {}
+        for name in self._objects.names("streams"):
+            stream, _, rest = name.partition("/")
+            names.setdefault(stream, []).append(rest)
+        return sorted(stream for stream, below in names.items() if Listing.of(below).newest())
 
     def remove(self, stream: str) -> None:
         """Remove the states of a stream. A process that still holds it can write no more."""
-        self._log(_streams(stream)).clear(_this_process())
+        self._states(_streams(stream)).clear(_this_process())
 
     def put_fleet(self, text: str) -> None:
-        """Store the spec of the fleet. A folder is created, if it does not exist."""
-        self._objects.make()
+        """Store the spec of the fleet."""
         self._put("fleet", {"fleet": text.encode()}, {})
 
     def get_fleet(self) -> str | None:
         """Return the newest spec of the fleet; None if there is none."""
-        found = self._log("fleet").newest()
+        found = self._states("fleet").newest()
         return found.files["fleet"].decode() if found else None
 
     def put_model(self, name: str, data: bytes, facts: Mapping[str, Any]) -> None:
@@ -106,12 +116,12 @@ class Store:
         Parameters
         ----------
         name : the name of the object
-        after : number of the model that the caller has; None is returned if there is no newer one, which is quick
+        after : token of the model that the caller has; None is returned if there is no newer one, which is quick
         """
-        return self._log(_models(name)).newest(after)
+        return self._states(_models(name)).newest(after)
 
     def _put(self, folder: str, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
-        """Append to a log that has no lasting holder. Of two processes at once, both write, one after the other."""
+        """Write where there is no lasting holder. Of two processes at once, both write, one after the other."""
         for attempt in range(_ATTEMPTS):
             try:
                 self._writable(folder).claim(_this_process()).write(files, facts)
@@ -120,15 +130,15 @@ class Store:
                 if attempt == _ATTEMPTS - 1:
                     raise
 
-    def _log(self, folder: str) -> Log:
-        return Log(self._objects, folder)
+    def _states(self, folder: str) -> States:
+        return States(self._objects, folder)
 
-    def _writable(self, folder: str) -> Log:
-        """A log, in a store that was checked."""
+    def _writable(self, folder: str) -> States:
+        """The states of a folder, in a store that was checked."""
         if not self._checked:
             self._objects.check()
             self._checked = True
-        return self._log(folder)
+        return self._states(folder)
 
 
 def _streams(name: str) -> str:

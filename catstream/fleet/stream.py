@@ -1,7 +1,8 @@
-"""A stream of a fleet: one pipeline on this node, its state in the store, and the figures that the manager asks for.
+"""A stream of a fleet: one pipeline on this node, its state in the store, and the figures that the controller asks for.
 
-A `Stream` has nothing of Ray in it; `catstream.fleet.manager` makes an actor of it. Its pipeline runs in a thread of
-its own, and its state is stored by another one, so that a slow store does not stop the tracks.
+A `Stream` has nothing of Ray in it; `catstream.fleet.controller` makes an actor of it. Its pipeline runs in a thread of
+its own, and is started again after a failure. Its state is stored by another thread, which also looks for merged models
+in the store, so that a slow store does not stop the tracks.
 """
 
 from __future__ import annotations
@@ -10,10 +11,12 @@ import logging
 import math
 import os
 import random
+import shutil
 import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -27,10 +30,11 @@ from catstream.errors import (
     FleetError,
     ServiceError,
     StoreError,
-    VideoError,
 )
+from catstream.fleet.life import Order
 from catstream.fleet.spec import StreamSpec
-from catstream.fleet.store import Claim, Store
+from catstream.fleet.states import Claim, Generation
+from catstream.fleet.store import Store
 from catstream.learned import Learned
 from catstream.messages import StreamState, StreamStatus, Track
 from catstream.pipeline import Pipeline
@@ -45,9 +49,11 @@ from catstream.wire.keys import Client, create, public_key, synchronise
 __all__ = ["Place", "Report", "Stream", "given_model"]
 
 _TURN_SECONDS = 0.1
-_CLAIM_SECONDS = 2.0  # between two attempts to claim a stream in a store that cannot be reached
-_RATE_SECONDS = 5.0  # interval of the rate and of the processor time
+_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 60.0  # before a stream that failed starts again, in seconds; doubled each time
+_FORGOTTEN_SECONDS = 60.0  # of running, after which earlier failures do not count
+_RATE_SECONDS = 5.0  # interval of the rates
 _LATE = 3.0  # a state that is older than so many intervals is a trouble
+_SKIPPED_SHARE = 0.1  # of the frames of a live source, from which its node counts as too slow
 _LOG_LINES = 1000
 _PORTS = range(21000, 32000)  # below those that the kernel gives to connections
 _SPARE_FRAMES = 10  # more than the rate says, so that no number of a live source is used twice
@@ -62,7 +68,7 @@ _log = logging.getLogger(__name__)
 class Place:
     """The place of a stream.
 
-    node     name of the node
+    node     its node, as the status shows it
     address  IP address at which other machines reach its sockets; empty if all clients are on this machine
     clients  the clients that may connect, by name, if there is an address
     """
@@ -73,35 +79,52 @@ class Place:
 
 
 class Report(NamedTuple):
-    """A report of a stream to the manager.
+    """A report of a stream to the controller.
 
-    status         its figures
-    source_failed  whether it failed because this node cannot read its source
-    fenced         whether it ended because another node has claimed it
+    status      its figures
+    order       what it was started for
+    superseded  whether it ended because another process has claimed it
     """
 
     status: StreamStatus
-    source_failed: bool = False
-    fenced: bool = False
+    order: Order
+    superseded: bool = False
 
 
 @dataclass(slots=True)
 class _Rates:
-    """Frames and processor time per second, over the last seconds."""
+    """Frames, processor time and skipped frames over the last seconds.
+
+    rate     tracked frames a second
+    cores    processor cores in use
+    skipping share of the frames that were skipped
+    """
 
     since: float = field(default_factory=time.monotonic)
     frames: int = 0
     processor: float = 0.0  # seconds, at the start of the interval
+    skipped: int = 0  # frames, at the start of the interval
     rate: float = 0.0
     cores: float = 0.0
+    skipping: float = 0.0
 
-    def update(self, processor: float) -> None:
+    def update(self, processor: Callable[[], float], skipped: int) -> None:
         """Compute the rates if the interval is over."""
         passed = time.monotonic() - self.since
-        if passed >= _RATE_SECONDS:
-            self.rate = self.frames / passed
-            self.cores = max(0.0, processor - self.processor) / passed
-            self.since, self.frames, self.processor = time.monotonic(), 0, processor
+        if passed < _RATE_SECONDS:
+            return
+        used, missed = processor(), max(0, skipped - self.skipped)
+        self.rate = self.frames / passed
+        self.cores = max(0.0, used - self.processor) / passed
+        self.skipping = missed / max(1, missed + self.frames)
+        self.since, self.frames, self.processor, self.skipped = time.monotonic(), 0, used, skipped
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong if too many frames are skipped."""
+        if self.skipping <= _SKIPPED_SHARE:
+            return ""
+        return f"it skips {self.skipping:.0%} of its frames with {self.cores:.1f} cores: give it more, or a faster node"
 
 
 def given_model(stream: str, name: str) -> str:
@@ -110,11 +133,12 @@ def given_model(stream: str, name: str) -> str:
 
 
 class Stream:
-    """Runs the pipeline of one stream until it ends, fails, or is stopped, and stores its state again and again.
+    """Runs the pipeline of one stream until it ends or is stopped, and stores its state again and again.
 
     Parameters
     ----------
     spec : the stream
+    order : what it is started for, which its reports contain
     place : where it runs
     store : the store of the fleet
     every : seconds between two states in the store
@@ -125,18 +149,18 @@ class Stream:
         From the constructor, if the store is not a valid one.
     """
 
-    def __init__(self, spec: StreamSpec, place: Place, store: str, every: float) -> None:
-        self._spec, self._place, self._every = spec, place, every
+    def __init__(self, spec: StreamSpec, order: Order, place: Place, store: str, every: float) -> None:
+        self._spec, self._order, self._place, self._every = spec, order, place, every
         self._store = Store(store)
         self._status = StreamStatus(spec.name, "starting", place.node, source=without_password(spec.source))
         self._rates = _Rates()
         self._stop, self._lock = threading.Event(), threading.Lock()
         self._lines: deque[str] = deque(maxlen=_LOG_LINES)
-        self._pipeline: Pipeline | None = None
         self._stored_at = 0.0  # seconds since 1970
-        self._store_trouble = self._failure = ""
-        self._source_failed = self._fenced = False
+        self._failure = self._store_trouble = self._pipeline_trouble = ""
+        self._superseded = False
         self._seq = 0
+        self._follow: tuple[str, ...] = spec.follow
         self._present: set[str] = set()  # objects that the last frame shows
         self._stack = ExitStack()
         self._folder = self._stack.enter_context(private_folder())
@@ -144,41 +168,36 @@ class Stream:
         self._thread = threading.Thread(target=self._run, name=f"stream {spec.name}", daemon=True)
         self._thread.start()
 
-    def report(self) -> Report:
-        """The figures of the stream now."""
+    def report(self, clients: dict[str, Client] | None = None, follow: Iterable[str] | None = None) -> Report:
+        """The figures of the stream now.
+
+        Parameters
+        ----------
+        clients : the only clients that may connect from now on
+        follow : the objects whose newest merged model it searches for from now on
+        """
         with self._lock:
+            if clients is not None and clients != self._place.clients:
+                self._place = replace(self._place, clients=clients)
+                if self._place.address and self._keys.exists():
+                    synchronise(self._keys, clients)
+            self._follow = self._follow if follow is None else tuple(follow)
             age = time.time() - self._stored_at if self._stored_at else 0.0
-            pipeline, status = self._pipeline, self._status
-            troubles = [self._failure, self._store_trouble]
-            if not self._store_trouble and age > _LATE * self._every and status.state == "running":
-                troubles.append(f"its state was stored {age:.0f} s ago")
-            if pipeline is not None:
-                troubles += [f"{process}: {trouble}" for process, trouble in pipeline.trouble.items()]
-                if pipeline.lost_seconds:
-                    troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
+            is_late = not self._store_trouble and age > _LATE * self._every and self._status.state == "running"
+            late = f"its state was stored {age:.0f} s ago" if is_late else ""
+            troubles = (self._failure, self._store_trouble, late, self._rates.trouble, self._pipeline_trouble)
             status = replace(
-                status,
+                self._status,
                 rate=self._rates.rate,
                 cores=self._rates.cores,
                 stored_seconds=age if self._stored_at else None,
                 trouble="; ".join(filter(None, troubles)),
             )
-            return Report(status, self._source_failed, self._fenced)
+            return Report(status, self._order, self._superseded)
 
     def logs(self, lines: int) -> list[str]:
         """The last lines that the stream logged."""
         return list(self._lines)[-lines:]
-
-    def allow(self, clients: dict[str, Client]) -> None:
-        """Let only these clients connect from now on."""
-        with self._lock:
-            self._place = replace(self._place, clients=clients)
-            if self._place.address and self._keys.exists():
-                synchronise(self._keys, clients)
-
-    def search(self, followed: str) -> None:
-        """Search for an object by the newest merged model of it in the store, once it is not present."""
-        threading.Thread(target=self._search_when_absent, args=(followed,), name="search", daemon=True).start()
 
     def stop(self) -> None:
         """End the pipeline, and store its last state; returns when that is done."""
@@ -187,52 +206,56 @@ class Stream:
         self._stack.close()
 
     def _run(self) -> None:
+        """Run the pipeline, again after each failure, until the stream ends, is stopped, or is superseded."""
         handler = _Lines(self._lines)
         logging.getLogger("catstream").addHandler(handler)
+        pause = _FIRST_PAUSE
         try:
-            claim = self._claimed()
-            if claim is not None:
-                self._follow(claim)
-        except VideoError as error:
-            self._fail(str(error), source=True)
-        except CatstreamError as error:
-            self._fail(str(error))
-        except Exception as error:  # the manager has to see it
-            _log.exception("The stream %s failed.", self._spec.name)
-            self._fail(f"{type(error).__name__}: {error}")
+            while not self._stop.is_set():
+                began = time.monotonic()
+                try:
+                    return self._run_once()
+                except StoreError as error:  # the claim: nothing has begun
+                    self._store_trouble = str(error)
+                except CatstreamError as error:
+                    self._fail(str(error))
+                except Exception as error:  # the controller has to see it
+                    _log.exception("The stream %s failed.", self._spec.name)
+                    self._fail(f"{type(error).__name__}: {error}")
+                pause = _FIRST_PAUSE if time.monotonic() - began > _FORGOTTEN_SECONDS else pause
+                self._stop.wait(pause)
+                pause = min(2 * pause, _LONGEST_PAUSE)
         finally:
             logging.getLogger("catstream").removeHandler(handler)
 
-    def _fail(self, why: str, *, source: bool = False) -> None:
+    def _fail(self, why: str) -> None:
         _log.error("%s: %s", self._spec.name, why)
         with self._lock:
-            self._pipeline, self._failure, self._source_failed = None, why, source
-            self._status = replace(self._status, state="failed", endpoint="", rate=0.0)
+            self._failure, self._pipeline_trouble = why, ""
+            self._status = replace(
+                self._status, state="failed", endpoint="", rate=0.0, restarts=self._status.restarts + 1
+            )
 
-    def _claimed(self) -> Claim | None:
-        """The claim of the stream in the store; waits for the store, None if the stream was stopped meanwhile."""
-        while not self._stop.is_set():
-            try:
-                return self._store.claim(self._spec.name, f"{self._place.node} process {os.getpid()}")
-            except StoreError as error:
-                with self._lock:
-                    self._store_trouble = str(error)
-                self._stop.wait(_CLAIM_SECONDS)
-        return None
-
-    def _follow(self, claim: Claim) -> None:
-        """Run the pipeline from the state in the store, or from the start."""
+    def _run_once(self) -> None:
+        """Claim the stream, and run the pipeline from the state in the store, or from the start."""
+        claim = self._store.claim(self._spec.name, f"{self._place.node} process {os.getpid()}")
+        self._store_trouble = ""
+        shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
+        self._seq = 0
         if claim.state is not None and claim.state.facts["ended"]:
-            with self._lock:
-                self._status = replace(self._status, state="ended", frame=int(claim.state.facts["frame"]))
-            return
+            if claim.state.facts["digest"] == self._spec.digest:
+                with self._lock:
+                    self._status = replace(self._status, state="ended", frame=int(claim.state.facts["frame"]))
+                return
+            claim.state = None  # it was changed since: it begins anew
         with ExitStack() as stack:
             pipeline = stack.enter_context(self._made(claim))
             facts = claim.state.facts if claim.state is not None else {}
             with self._lock:
-                self._pipeline, self._store_trouble = pipeline, ""
+                self._failure = ""
                 self._status = replace(
                     self._status,
+                    state="starting",
                     endpoint=pipeline.endpoint,
                     server=public_key(self._keys) if self._place.address else "",
                     token=claim.token,
@@ -242,14 +265,13 @@ class Stream:
                 )
             self._change_objects(pipeline, facts)
             over = threading.Event()
-            storing = threading.Thread(target=self._keep_storing, args=(claim, over), name="store", daemon=True)
+            storing = threading.Thread(target=self._keep_storing, args=(claim, pipeline, over), name="store")
+            storing.daemon = True  # a store that hangs must not keep the process
             storing.start()
             stack.callback(storing.join)
             stack.callback(over.set)
             ended = self._take_all(pipeline)
         self._write_last(claim, ended=ended)
-        with self._lock:
-            self._pipeline = None
 
     def _take_all(self, pipeline: Pipeline) -> bool:
         """Take the tracks until the source ends, or the stream is to stop; returns whether the source has ended."""
@@ -261,7 +283,7 @@ class Stream:
 
     def _write_last(self, claim: Claim, *, ended: bool) -> None:
         """Store the last state. A stream has ended once that is done, so it is tried again until it is."""
-        while not self._fenced:
+        while not self._superseded:
             self._write(claim, ended=ended)
             if not self._store_trouble:
                 with self._lock:
@@ -325,30 +347,36 @@ class Stream:
         for name in sorted(self._spec.models.keys() - before):
             self._search(pipeline, given_model(self._spec.name, name), name)
 
-    def _search_when_absent(self, followed: str) -> None:
-        while not self._stop.wait(_TURN_SECONDS):
-            pipeline = self._pipeline
-            if pipeline is not None and followed not in self._present:
-                try:
-                    self._search(pipeline, followed, followed)
-                except CatstreamError as error:
-                    _log.warning("%s does not search for %s: %s", self._spec.name, followed, error)
-                return
-
     def _search(self, pipeline: Pipeline, stored: str, name: str) -> None:
         """Search for an object by a saved model in the store."""
         if (model := self._store.get_model(stored)) is None:
             raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
+        self._search_by(pipeline, model, name)
+
+    def _search_by(self, pipeline: Pipeline, model: Generation, name: str) -> None:
         learned = Learned.from_bytes(model.files["model"], f"the model of {name!r} in the store")
         with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as steering:
             steering.search(learned, name)
 
+    def _search_merged(self, pipeline: Pipeline, known: dict[str, int]) -> None:
+        """Search for each followed object that is not present by a merged model that is newer than the known one."""
+        for name in self._follow:
+            if name not in self._present and (model := self._store.get_model(name, known.get(name, 0))) is not None:
+                known[name] = model.token
+                self._search_by(pipeline, model, name)
+
     def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
         """Count a frame; an empty mapping means that none has arrived for a while."""
-        self._rates.update(_processor_seconds([os.getpid(), *pipeline.pids.values()]))
+        skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
+        troubles = [f"{process}: {trouble}" for process, trouble in pipeline.trouble.items()]
+        if pipeline.lost_seconds:
+            troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
+        self._rates.update(lambda: _processor_seconds([os.getpid(), *pipeline.pids.values()]), skipped)
         with self._lock:
             status = self._status
             if tracks:
+                if not self._seq:  # the seconds of the start do not count
+                    self._rates = _Rates(skipped=skipped)
                 self._rates.frames += 1
                 newest = next(iter(tracks.values()))
                 models = {name: track.model_version for name, track in tracks.items()}
@@ -356,16 +384,21 @@ class Stream:
                 self._present = {name for name, track in tracks.items() if track.box is not None}
                 status = replace(status, frame=newest.frame, models=models)
             state = _HOLDING.get(pipeline.holding, "running" if self._seq else "starting")
-            skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
             self._status = replace(status, state=state, skipped=skipped)
+            self._pipeline_trouble = "; ".join(troubles)
 
-    def _keep_storing(self, claim: Claim, over: threading.Event) -> None:
-        """Store the state every few seconds until the pipeline is over, or another holder has claimed the stream."""
-        while not over.wait(self._every) and not self._fenced:
+    def _keep_storing(self, claim: Claim, pipeline: Pipeline, over: threading.Event) -> None:
+        """Store the state every few seconds until the pipeline is over, or another process has claimed the stream."""
+        known: dict[str, int] = {}  # token of the merged model of each object that was searched for
+        while not over.wait(self._every) and not self._superseded:
             self._write(claim)
+            try:
+                self._search_merged(pipeline, known)
+            except CatstreamError as error:
+                _log.warning("%s does not search by a merged model: %s", self._spec.name, error)
 
     def _write(self, claim: Claim, *, ended: bool = False) -> None:
-        """Store the newest checkpoint; a store that takes nothing is a trouble, another holder ends the stream."""
+        """Store the newest checkpoint. A failed write is reported in the status; a superseded claim ends the stream."""
         status, seq = self._status, self._seq
         facts: Metadata = {
             "time": time.time(),
@@ -376,6 +409,7 @@ class Stream:
             "lost_frames": status.lost_frames,
             "lost_seconds": status.lost_seconds,
             "objects": sorted(self._spec.boxes.keys() | self._spec.models.keys()),
+            "digest": self._spec.digest,
             "ended": ended,
         }
         trouble = ""
@@ -385,7 +419,7 @@ class Stream:
                 self._stored_at = facts["time"]
         except FencedError as error:
             _log.warning("%s: %s", self._spec.name, error)
-            self._fenced = True
+            self._superseded = True
             self._stop.set()
         except (ServiceError, OSError) as error:
             trouble = f"its state cannot be stored: {error}"

@@ -28,8 +28,6 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
             "duration": plan.duration,
             "size": list(plan.size),
             "chaos": plan.chaos,
-            "fleet_nodes": plan.nodes,
-            "kill_nodes": plan.kill_nodes,
         },
         "seconds": result.seconds,
         "interrupted": load_test.interrupted,
@@ -52,16 +50,6 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
             for recovery in result.recoveries
         ],
         "restarts": result.restarts,
-        "fleet": [
-            {
-                "stream": status.name,
-                "node": status.node,
-                "restarts": status.restarts,
-                "lost_frames": status.lost_frames,
-                "lost_seconds": status.lost_seconds,
-            }
-            for status in result.statuses
-        ],
         "camera_late": round(result.camera_late, 6),
         "limits": {limit.name: {"value": limit.value, "met": limit.is_met(result)} for limit in load_test.limits},
         "violations": load_test.violations,

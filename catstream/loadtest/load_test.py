@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from catstream.loadtest.camera import Camera
-from catstream.loadtest.fleet import run_on_fleet
 from catstream.loadtest.limits import Limit, violations
 from catstream.loadtest.plan import Plan
 from catstream.loadtest.run import Result, Status, run
@@ -87,7 +86,7 @@ def run_load_test(
     pictures = demo.FRAMES if find else min(plan.frames, demo.FRAMES)
 
     def holds(rate: float) -> bool:
-        result = (run_on_fleet if plan.nodes else run)(replace(plan, rate=rate), camera, report_status)
+        result = run(replace(plan, rate=rate), camera, report_status)
         load_test.steps.append(Step(result, violations(limits, result)))
         step_done(load_test.steps[-1])
         if result.interrupted:

@@ -9,10 +9,7 @@ from catstream.names import check_count
 from catstream.settings import Settings
 from catstream.video import demo
 
-__all__ = ["NO_NODE_KILL_SECONDS", "Plan"]
-
-#: No node is killed so long before the last frame, so that its streams can recover.
-NO_NODE_KILL_SECONDS = 15.0
+__all__ = ["Plan"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +24,6 @@ class Plan:
     duration     seconds
     size         (width, height) of a frame in pixels
     chaos        whether random processes are killed during the run
-    nodes        number of nodes of a fleet on this machine that runs the pipelines; 0 if there is no fleet
-    kill_nodes   whether random nodes are killed during the run, one at a time, and started again
     settings     settings of all pipelines; their seed is used for the chaos too
 
     Raises
@@ -47,8 +42,6 @@ class Plan:
     duration: float = 10.0
     size: tuple[int, int] = demo.SIZE
     chaos: bool = False
-    nodes: int = 0
-    kill_nodes: bool = False
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
@@ -65,19 +58,11 @@ class Plan:
             raise SettingsError("the frames of a load test do not wait for models: leave out lockstep")
         if self.settings.run.endpoint:
             raise SettingsError("each stream of a load test has an endpoint of its own: leave out endpoint")
-        if self.nodes and (self.chaos or self.subscribers):
-            raise SettingsError("a fleet is tested without subscribers and chaos: give kill-nodes, or no fleet-nodes")
-        if self.kill_nodes and (self.nodes < 2 or self.duration <= NO_NODE_KILL_SECONDS):
-            raise SettingsError(
-                "the streams of a killed node need another node and time to recover: give 2 fleet-nodes or more, and a "
-                f"duration of more than {NO_NODE_KILL_SECONDS:g} s"
-            )
 
     def __str__(self) -> str:
         streams = f"{self.streams} streams" if self.streams > 1 else "1 stream"
         objects = f", {self.objects} objects" if self.objects > 1 else ""
-        nodes = f", a fleet of {self.nodes} nodes" if self.nodes else ""
-        return f"{streams} of {self.size[0]}x{self.size[1]} pixels{objects}, {self.rate:g} frames/s due in each{nodes}"
+        return f"{streams} of {self.size[0]}x{self.size[1]} pixels{objects}, {self.rate:g} frames/s due in each"
 
     @property
     def frozen(self) -> int:

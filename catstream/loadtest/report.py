@@ -56,7 +56,6 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
             _processes(result),
             _subscribers(result),
             _chaos(result),
-            _fleet(result),
             "<h2>Reliability</h2>",
             '<p class="about">The precision of the latencies is the largest delay that the camera itself caused: '
             f"{_ms(result.camera_late)} ms. Other processes of this machine kept {result.other_load:.2f} cores busy; "
@@ -249,27 +248,12 @@ def _subscribers(result: Result) -> str:
 
 
 def _chaos(result: Result) -> str:
-    if not result.plan.chaos and not result.plan.kill_nodes:
+    if not result.plan.chaos:
         return ""
     rows = [[str(recovery.kill), _seconds(recovery.track), _seconds(recovery.model)] for recovery in result.recoveries]
     heads = ["killed", "s to the next track", "s to the next model"]
-    if result.plan.kill_nodes:
-        title = f"{result.killed_nodes} nodes killed, with the pipelines of {len(rows)} streams"
-    else:
-        title = f"Chaos: {len(rows)} processes killed, {result.restarts} restarted"
+    title = f"Chaos: {len(rows)} processes killed, {result.restarts} restarted"
     return f"<h2>{title}</h2>{table(heads, rows)}"
-
-
-def _fleet(result: Result) -> str:
-    if not result.statuses:
-        return ""
-    rows = [
-        [escape(each.name), escape(each.node), each.restarts, each.lost_frames, f"{each.lost_seconds:.1f}"]
-        for each in result.statuses
-    ]
-    heads = ["stream", "node at the end", "restarts", "frames lost", "s lost"]
-    note = '<p class="about">Lost frames and seconds as the state of the stream says, since its start.</p>'
-    return f"<h2>Fleet</h2>{table(heads, rows, texts=2)}{note}"
 
 
 def _ms(seconds: float) -> str:

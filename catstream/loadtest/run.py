@@ -21,7 +21,6 @@ from catstream.loadtest.plan import Plan
 from catstream.loadtest.stream import Stream
 from catstream.loadtest.subscribers import Subscribers
 from catstream.loadtest.usage import REST, Usage, UsageReading, summary
-from catstream.messages import StreamStatus
 from catstream.video.broadcast import Schedule
 
 __all__ = ["LEAD_SECONDS", "Monitor", "Recovery", "Result", "Status", "recovery", "run", "wait_until"]
@@ -66,7 +65,6 @@ class Result:
     frozen       seconds for which the frozen subscribers were stopped
     camera_late  largest delay in seconds of a frame that the camera itself caused
     errors       errors of failed streams
-    statuses     last state of each stream of a fleet; empty if there is no fleet
     interrupted  whether the run was interrupted
     """
 
@@ -81,7 +79,6 @@ class Result:
     frozen: float
     camera_late: float
     errors: list[str] = field(default_factory=list)
-    statuses: list[StreamStatus] = field(default_factory=list)
     interrupted: bool = False
 
     @property
@@ -98,11 +95,6 @@ class Result:
     def other_load(self) -> float:
         """Mean number of cores that were busy with processes outside the load test."""
         return summary(self.usage[REST])["cores"] if REST in self.usage else 0.0
-
-    @property
-    def killed_nodes(self) -> int:
-        """Number of kills of nodes; the streams that one kill hit have the same moment."""
-        return len({recovery.kill.moment for recovery in self.recoveries}) if self.plan.kill_nodes else 0
 
     @property
     def missed_share(self) -> float:
@@ -248,11 +240,7 @@ class Monitor:
                 observations.tracks[-1][0] - (observations.tracks[-1][1].pts or 0.0) for observations in self._seen
             )
             received = sum(len(observations.tracks) for observations in self._seen)
-            killed = (
-                f", {len({kill.moment for kill in self._kills})} killed"
-                if self._plan.chaos or self._plan.kill_nodes
-                else ""
-            )
+            killed = f", {len(self._kills)} killed" if self._plan.chaos else ""
             figures = f"{received} tracks, the last {1000 * latest:.0f} ms after its frame{killed}"
             report_status(Status(f"{frames * len(self._seen)} frames", passed / self._plan.duration, figures))
             time.sleep(_LOOP_SECONDS)

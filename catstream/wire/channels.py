@@ -14,7 +14,7 @@
     saved-models   the coreset trees of each object as a file, the newest; none is made while nobody subscribes
     training   a copy of the messages of `features`, to any number of subscribers; nothing is sent while there is none
 
-The manager of a fleet has an endpoint of its own, with one channel:
+The controller of a fleet has an endpoint of its own, with one channel:
 
     registry   questions about the streams of the fleet, and their answers
 
@@ -162,7 +162,7 @@ CHANNELS: dict[str, Channel[object]] = {
     for channel in (FEATURES, SAMPLES, MODELS, TRACKS, RESULTS, HEALTH, PREVIEWS, CONTROL, TRAINING, SAVED_MODELS)
 }
 
-#: The only channel of the manager of a fleet, which is no process of a pipeline and has an endpoint of its own.
+#: The only channel of the controller of a fleet, which is no process of a pipeline and has an endpoint of its own.
 REGISTRY: Channel[Question | Listing] = Channel(
-    "registry", (Question, Listing), ("anyone",), "manager", "every", port=0, megabytes=16, role="watch"
+    "registry", (Question, Listing), ("anyone",), "controller", "every", port=0, megabytes=16, role="watch"
 )

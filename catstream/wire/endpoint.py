@@ -42,7 +42,7 @@ _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # file in the private folder of a running pipeline that holds its endpoint
 _SOURCE = "source"  # file beside it that names the source of the pipeline
-_FLEET_NOTE = "fleet-endpoint"  # file in the private folder of the manager of a fleet that holds its endpoint
+_FLEET_NOTE = "fleet-endpoint"  # file in the private folder of the controller of a fleet that holds its endpoint
 _FLEET_NAME = "fleet-name"  # file beside it that names the fleet
 
 
@@ -206,14 +206,14 @@ def _sweep(home: Path) -> None:
 
 @contextlib.contextmanager
 def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fleet: str = "") -> Iterator[Endpoint]:
-    """The endpoint of one pipeline, or of the manager of a fleet, locked for it; removes all socket files afterwards.
+    """The endpoint of one pipeline, or of a fleet's registry, locked for it; removes all socket files afterwards.
 
     Parameters
     ----------
     text, keys : the settings `endpoint` and `keys`
     default : the private folder of the process, used if `text` is empty; `running` and `fleets` find the endpoint by it
     source : of the pipeline's frames, without a password, by which a user tells several pipelines apart
-    fleet : name of the fleet whose manager has this endpoint; empty for a pipeline
+    fleet : name of the fleet whose controller has this endpoint; empty for a pipeline
 
     Raises
     ------
@@ -277,7 +277,7 @@ def running() -> list[Endpoint]:
 
 
 def fleets() -> dict[str, Endpoint]:
-    """Endpoints of the managers of this user's running fleets on this machine, by the names of the fleets."""
+    """Endpoints of the controllers of this user's running fleets on this machine, by the names of the fleets."""
     return {name: endpoint for endpoint, name in _endpoints(_FLEET_NOTE, _FLEET_NAME)}
 
 

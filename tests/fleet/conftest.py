@@ -1,84 +1,42 @@
-"""The Ray cluster that all tests share: starting one takes ten seconds of processor."""
+"""The fleet on a real cluster of Ray that the tests of a process share: Ray uses one cluster in a process."""
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
-from hashlib import sha256
-from pathlib import Path
-
 import pytest
 
-from catstream.errors import MissingExtraError
-from catstream.extras import require_extra
-from catstream.fleet import cluster
-from catstream.fleet.local import LocalFleet
-from catstream.storage import is_locked, lock
+from catstream.fleet.fleet import Fleet
+from catstream.fleet.local import LocalCluster
+from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.video.live_demo import first_box
 
-#: The nodes of the shared fleet, without the head; each has one core.
-NODES = 2
-
-
-@pytest.fixture(scope="session")
-def fleet(tmp_path_factory) -> Iterator[LocalFleet]:
-    """A local fleet with a head and the nodes node-1 and node-2, to which this process is connected.
-
-    All processes that share the tests use the same one. A test that kills a node starts one of its own for this,
-    without cores (`fleet.start_node(NAME, 0)`), and stops it.
-    """
-    try:
-        require_extra("fleet")
-    except MissingExtraError as error:
-        pytest.skip(str(error))
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "fleet"
-    folder.mkdir(exist_ok=True)
-    shared, runtime = LocalFleet(folder), runtime_of(folder)
-    with _user(folder / f"{os.getpid()}.user") as mine:
-        with _locked(folder / "lock"), pytest.MonkeyPatch.context() as patch:
-            runtime.mkdir(mode=0o700, exist_ok=True)
-            patch.setenv("XDG_RUNTIME_DIR", str(runtime))  # that of this process ends with its tests
-            shared.start(NODES, cores=1)
-        cluster.connect(shared.address, shared.token_file)
-        yield shared
-        cluster.disconnect()
-        with _locked(folder / "lock"):
-            if not any(_is_used(path) for path in folder.glob("*.user") if path != mine):
-                shared.stop()
-                shutil.rmtree(runtime)
+FRAMES = 32
+LIVE = "demo:1?rate=10"
 
 
 @pytest.fixture(scope="session")
-def runtime(fleet) -> Path:
-    """The folder in which the processes of the fleet leave the notes by which others find them."""
-    return runtime_of(fleet.folder)
+def home(tmp_path_factory):
+    """The folder of the fleets of these tests."""
+    home = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(home))
+        patch.setenv("XDG_RUNTIME_DIR", "")
+        patch.delenv("RAY_ADDRESS", raising=False)
+        yield home / "catstream" / "fleets"
 
 
-def runtime_of(folder: Path) -> Path:
-    return Path("/tmp") / f"cs-{sha256(bytes(folder)).hexdigest()[:8]}"
+@pytest.fixture(scope="session")
+def streams(demo_video):
+    path, truth = demo_video(FRAMES)
+    film = StreamSpec("film", str(path), {"": truth[0]}, settings={"run.lockstep": True}, cores=0.3)
+    return {"film": film, "gate": StreamSpec("gate", LIVE, {"anna": first_box(LIVE)}, cores=0.3)}
 
 
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with path.open("w") as file:
-        assert lock(file.fileno(), seconds=170), "another process of the tests starts the fleet for too long"
-        yield
-
-
-@contextmanager
-def _user(path: Path) -> Iterator[Path]:
-    """A file that stays locked as long as this process uses the fleet, or lives."""
-    with path.open("w") as file:
-        lock(file.fileno())
-        yield path
-        path.unlink()
-
-
-def _is_used(path: Path) -> bool:
-    try:
-        with path.open() as file:
-            return is_locked(file.fileno())
-    except OSError:
-        return False
+@pytest.fixture(scope="session")
+def site(home, streams, tmp_path_factory):
+    """A fleet of two streams on two nodes, and its spec."""
+    spec = FleetSpec("site", str(tmp_path_factory.mktemp("store") / "new"), every=0.5, nodes=2, streams=streams)
+    with Fleet(spec) as site:
+        site.up(cores=1)
+        yield site, spec
+    assert not LocalCluster(home / "site").running
+    assert sorted(path.name for path in (home / "site").iterdir()) == ["log", "pid", "starting", "token"]

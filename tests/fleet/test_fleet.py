@@ -1,59 +1,90 @@
-"""A fleet on a real cluster: streams that are started, moved, continued after a death, refused and removed."""
+"""A fleet on a real cluster of Ray: streams that are started, moved, continued after a death, refused and removed."""
 
 from __future__ import annotations
 
+import json
 import os
+import signal
+import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib import import_module
 
+import psutil
 import pytest
 
 import catstream
-from catstream.errors import FleetError
+from catstream.errors import FleetError, StoreError
 from catstream.fleet.fleet import Fleet
+from catstream.fleet.local import LocalCluster
+from catstream.fleet.merge import merge_streams
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.loadtest.nodes import kill_node
-from catstream.video.live_demo import first_box
+from catstream.registry import Registry
+from catstream.services.start import environment, python_command
+from catstream.wire.endpoint import fleets
+from tests.fleet.conftest import FRAMES, LIVE
 
 pytestmark = pytest.mark.system
 
-FRAMES = 32
-LIVE = "demo:1?rate=10"
+
+def command(*words):
+    return python_command("from catstream.cli import main; main()", *map(str, words))
 
 
-@pytest.fixture(scope="module")
-def streams(demo_video):
-    path, truth = demo_video(FRAMES)
-    film = StreamSpec("film", str(path), {"": truth[0]}, settings={"run.lockstep": True}, cores=0.3)
-    return {"film": film, "gate": StreamSpec("gate", LIVE, {"anna": first_box(LIVE)}, cores=0.3)}
+def run(*words):
+    """A command from its start to its end."""
+    return subprocess.run(command(*words), env=environment(), capture_output=True, text=True, timeout=300, check=False)
 
 
-@pytest.fixture(scope="module")
-def site(fleet, runtime, streams, tmp_path_factory):
-    """A fleet with two streams on the shared cluster, and its spec."""
-    home = tmp_path_factory.mktemp("home")
-    (home / "catstream" / "fleets").mkdir(parents=True)
-    (home / "catstream" / "fleets" / "site").symlink_to(fleet.folder)
-    spec = FleetSpec("site", str(home / "store"), every=0.5, nodes=2, streams=streams)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(home))
-        patch.setenv("XDG_RUNTIME_DIR", str(runtime))
-        site = Fleet(spec)
-        site.up(cores=1)
-        yield site, spec
-        site.remove(*site.status().streams)
-        while any(node.streams for node in site.status().nodes.values()):
-            pass
-        site.end_manager()
+def raylets(folder):
+    """The processes of Ray on each node of a cluster on this machine, by the name of the node."""
+    (pid,) = [each for each in psutil.process_iter() if str(folder) in each.cmdline() and "-P" in each.cmdline()]
+    found = {}
+    for process in pid.children(recursive=True):
+        names = [word.partition("=")[2] for word in process.cmdline() if word.startswith("--node-name=")]
+        if names and process.name() == "raylet":
+            found[names[0]] = process
+    return found
 
 
 def test_a_film_runs_to_its_end_and_is_not_run_again(site, until):
     fleet, spec = site
     until(lambda: fleet.status().streams["film"].state == "ended")
     assert Store(spec.store).newest("film").facts["seq"] == FRAMES
-    assert "film: is unchanged" in fleet.up(cores=1)
+    assert "film: is unchanged" in fleet.up()
     assert fleet.status().streams["film"].state == "ended"
+
+
+@pytest.mark.usefixtures("site")
+def test_all_ports_of_a_fleet_on_this_machine_are_on_the_loopback_interface(home):
+    token = (home / "site" / "token").stat()
+    assert token.st_mode & 0o077 == 0
+    ray = import_module("ray")
+    assert ray.get_runtime_context().gcs_address.startswith("127.0.0.1:")
+    (keeper,) = {process.parent() for process in raylets(home / "site").values()}
+    others = [
+        connection
+        for process in keeper.children(recursive=True)
+        for connection in process.net_connections(kind="tcp")
+        if connection.status == psutil.CONN_LISTEN
+        and connection.laddr.ip not in ("127.0.0.1", "::1", "::ffff:127.0.0.1")
+    ]
+    assert not others
+
+
+@pytest.mark.usefixtures("site")
+def test_a_stranger_without_the_token_is_refused(home, tmp_path):
+    """A process of its own, because Ray reads the token once."""
+    local = LocalCluster(home / "site")
+    (tmp_path / "token").write_text("0" * 64)
+    variables = local.variables | {"RAY_AUTH_TOKEN_PATH": str(tmp_path / "token")}
+    program = f"import ray; ray.init({local.address!r}); print('let in')"
+    done = subprocess.run(
+        python_command(program), env=environment() | variables, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, "let in" in done.stdout) == (1, False)
+    assert "token" in done.stderr.lower()
 
 
 def test_a_subscriber_stays_attached_to_a_stream_that_moves(site, until):
@@ -68,27 +99,36 @@ def test_a_subscriber_stays_attached_to_a_stream_that_moves(site, until):
         until(lambda: fleet.status().streams["gate"].node == other)
         later = next(track for track in tracks if track.time > first.time + 1)
     assert (later.object, later.seq > first.seq) == ("anna", True)
-    assert "is added" not in " ".join(fleet.logs("gate"))
 
 
-def test_a_stream_of_a_dead_node_continues_elsewhere(site, fleet, until):
-    site, spec = site
-    fleet.start_node("node-9", 1.0)
-    until(lambda: site.status().nodes.get("node-9"))
-    site.move("gate", "node-9")
-    until(lambda: (found := site.status().streams["gate"]).node == "node-9" and found.state == "running")
+def test_a_stream_of_a_dead_node_continues_and_the_node_comes_back(home, site, until):
+    fleet, spec = site
+    fleet.move("gate", "node-2")
+    until(lambda: (found := fleet.status().streams["gate"]).node == "node-2" and found.state == "running")
     until(lambda: Store(spec.store).newest("gate").facts["seq"] > 5)
-    before = site.status().streams["gate"]
-    kill_node(fleet, "node-9")
-    until(lambda: (found := site.status().streams["gate"]).token > before.token and found.state == "running")
-    after = site.status().streams["gate"]
-    assert after.node in ("node-1", "node-2")
-    assert after.frame > before.frame  # numbers go on after what was lost
+    before = fleet.status().streams["gate"]
+    raylets(home / "site")["node-2"].kill()
+    until(lambda: (found := fleet.status().streams["gate"]).token > before.token and found.state == "running")
+    after = fleet.status().streams["gate"]
+    assert after.frame > before.frame, "numbers go on after what was lost"
     assert after.lost_frames > 0
+    until(lambda: fleet.status().nodes["node-2"].state == "alive")
 
 
-@pytest.mark.usefixtures("fleet")
-def test_processes_of_the_nodes_have_the_priority_of_the_process_that_starts_them():
+def test_a_controller_that_dies_is_started_again_and_streams_run_on(site, until):
+    fleet, _ = site
+    until(lambda: fleet.status().streams["gate"].state == "running")
+    before = fleet.status().streams["gate"].token
+    ray = import_module("ray")
+    ray.kill(fleet._controller, no_restart=False)
+    until(lambda: fleet.status().streams["gate"].state == "running")
+    assert fleet.status().streams["gate"].token == before
+    with Registry("site", timeout=60) as registry:
+        until(lambda: registry.streams().streams["gate"].token == before)
+
+
+def test_processes_of_the_nodes_have_the_priority_of_the_process_that_starts_them(site):
+    site[0].status()  # it is connected
     ray = import_module("ray")
     theirs = ray.get(ray.remote(num_cpus=0)(lambda: os.getpriority(os.PRIO_PROCESS, 0)).remote())
     assert theirs == os.getpriority(os.PRIO_PROCESS, 0)
@@ -98,8 +138,6 @@ def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
     fleet, spec = site
     with pytest.raises(FleetError, match="gate needs 4 cores, and the largest node"):
         fleet.add(replace(spec.streams["gate"], cores=4.0))
-    with pytest.raises(FleetError, match=r"cam-8 needs 4 cores, and the largest node"):
-        fleet.add(StreamSpec("cam-8", LIVE, cores=4))
     with pytest.raises(FleetError, match="cam-9 needs a node with site=north"):
         fleet.add(StreamSpec("cam-9", LIVE, labels={"site": "north"}))
     with pytest.raises(FleetError, match="no stream 'cam-8'"):
@@ -107,23 +145,65 @@ def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
     assert set(fleet.status().streams) == {"film", "gate"}
 
 
-def test_a_stream_whose_source_cannot_be_opened_has_failed_until_it_is_changed(site, until):
+def test_a_stream_whose_source_cannot_be_opened_has_failed_until_it_is_changed_and_its_log_is_there(site, until):
     fleet, _ = site
     fleet.add(StreamSpec("cam-8", "missing.mp4", cores=0.1))
     until(lambda: (found := fleet.status().streams["cam-8"]).state == "failed" and "missing.mp4" in found.trouble)
+    assert any("missing.mp4" in line for line in fleet.logs("cam-8"))
     fleet.add(StreamSpec("cam-8", LIVE, cores=0.1))
-    assert fleet.status().streams["cam-8"].state in ("moving", "starting")
+    until(lambda: fleet.status().streams["cam-8"].state in ("waiting", "running"))
     fleet.remove("cam-8", forget=True)
+    until(lambda: "cam-8" not in Store(site[1].store).streams())
 
 
 def test_a_node_that_is_drained_gives_its_streams_away(site, until):
     fleet, _ = site
+    until(lambda: fleet.status().streams["gate"].state == "running")
     node = fleet.status().streams["gate"].node
     fleet.drain(node)
     until(lambda: (found := fleet.status().streams["gate"]).node not in ("", node) and found.state == "running")
     fleet.drain(node, undo=True)
 
 
-def test_a_fleet_that_does_not_run_cannot_be_ended(tmp_path):
+def test_a_merge_runs_on_the_nodes(site):
+    fleet, spec = site
+    merged = fleet.merge("film")
+    assert merged.streams == ("film",)
+    assert Store(spec.store).get_model("").files["model"] == merged.model
+    with pytest.raises(FleetError, match="no stream has learned of 'nobody'"):
+        merge_streams(spec.store, ["film"], "nobody", named=False)
+
+
+@pytest.mark.usefixtures("home")
+def test_a_fleet_that_does_not_run_cannot_be_ended():
     with pytest.raises(FleetError, match="no fleet 'other' of yours runs"):
-        Fleet(name="other", folder=tmp_path / "other").down()
+        Fleet(name="other").down()
+
+
+def test_a_store_that_cannot_be_used_is_said_before_anything_starts(home, tmp_path):
+    (tmp_path / "file").write_text("")
+    spec = FleetSpec("nowhere", str(tmp_path / "file" / "store"), streams={"a": StreamSpec("a", LIVE)})
+    with pytest.raises(StoreError, match="cannot be created"):
+        Fleet(spec).up()
+    assert not LocalCluster(home / "nowhere").running
+
+
+def test_two_ups_at_once_start_one_fleet_under_the_name_of_the_option_and_ctrl_c_ends_it(home, tmp_path, until):
+    file = tmp_path / "fleet.toml"
+    file.write_text(f'[streams.gate]\nsource = "{LIVE}"\nbox = [184, 88, 57, 58]\ncores = 0.2\n')
+    with ThreadPoolExecutor(2) as pool:
+        done = list(pool.map(lambda _: run("fleet", "up", file, "--name", "other", "--detach"), range(2)))
+    assert [each.returncode for each in done] == [0, 0], done
+    assert sorted(each.stdout.splitlines()[0] for each in done) == ["gate: is added", "gate: is unchanged"]
+    assert list(json.loads(run("fleet", "status", "--fleet", "other", "--json").stdout)["streams"]) == ["gate"]
+    assert run("fleet", "down", "--name", "other").stdout == "the fleet other is down\n"
+    assert not LocalCluster(home / "other").running
+    words = command("fleet", "up", file, "--name", "other")
+    with subprocess.Popen(words, env=environment(), stdout=subprocess.PIPE, text=True) as attached:
+        until(lambda: "other" in fleets())
+        with Registry("other", timeout=60) as registry:
+            until(lambda: registry.streams().streams["gate"].state == "running")
+        attached.send_signal(signal.SIGINT)
+        output = attached.communicate(timeout=120)[0]
+    assert (attached.returncode, output.splitlines()[-1]) == (0, "the fleet other is down")
+    assert not LocalCluster(home / "other").running

@@ -172,8 +172,8 @@ def test_the_part_of_a_stream_is_what_its_newest_state_has_learned(store):
 
 
 @pytest.mark.system
-@pytest.mark.usefixtures("fleet")
-def test_the_nodes_merge_the_states_in_the_store_and_only_a_new_model_is_stored(store, tmp_path):
+def test_the_nodes_merge_the_states_in_the_store_and_only_a_new_model_is_stored(store, tmp_path, site):
+    site[0].status()  # this process is connected to the nodes
     streams = ["door", "yard", "hall", "gate"]
     merged = merge_streams(store, streams, "anna", named=False)
     assert set(merged.streams) == {"door", "yard", "hall"}
@@ -183,11 +183,11 @@ def test_the_nodes_merge_the_states_in_the_store_and_only_a_new_model_is_stored(
     again = merge_streams(store, streams, "anna", named=False)
     assert again.model == merged.model
     assert set(again.left) == {"door", "yard", "hall"}
-    assert Store(store).get_model("anna", first.number) is None
+    assert Store(store).get_model("anna", first.token) is None
     for seed, name in enumerate(merged.streams):
         put_state(tmp_path, name, streams.index(name), 14 + seed)
     assert set(merge_streams(store, streams, "anna", named=False).streams) == set(merged.streams)
-    assert Store(store).get_model("anna").number > first.number
+    assert Store(store).get_model("anna").token > first.token
     with pytest.raises(FleetError, match="stream gate: there is no state of it in the store yet"):
         merge_streams(store, ["door", "gate"], "anna", named=True)
     with pytest.raises(FleetError, match="no stream has learned of 'ben' yet"):

@@ -83,7 +83,7 @@ made = st.builds(
     st.dictionaries(names, st.builds(Box, numbers, numbers, numbers, numbers), max_size=2),
     st.dictionaries(names.map("m-{}".format), names.map(lambda name: Path("/", name)), max_size=2),
     st.fixed_dictionaries({}, optional={"coreset.size": st.integers(2, 200), "run.lockstep": st.booleans()}),
-    st.none() | st.floats(0.01, 64),
+    st.floats(0.01, 64),
     st.dictionaries(names, names, max_size=2),
     st.lists(names, max_size=2, unique=True).map(tuple),
 )
@@ -160,7 +160,7 @@ def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
         ("source = '0'\nsettings = { 'coreset.sise' = 1 }", "there is no setting 'coreset.sise', did you mean 'core"),
         ("source = '0'\nsettings = { 'coreset.size' = 0 }", "setting coreset.size cannot be 0: it takes int"),
         ("source = '0'\nsettings = { 'run.keys' = 'k' }", "the fleet sets run.keys itself: remove it from the"),
-        ("source = '0'\ncores = 0", "cores must be a number above 0, got 0: leave it out, and they are measured"),
+        ("source = '0'\ncores = 0", "cores must be a number above 0, got 0: catstream fleet status shows what it uses"),
         ("source = '0'\ncores = nan", "cores must be a number above 0, got nan"),
         ("source = '0'\ncores = true", "cores must be a number, got True"),
         ("source = '0'\nlabels = { site = 1 }", "labels.site must be a text, got 1"),

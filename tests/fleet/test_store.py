@@ -17,8 +17,8 @@ import pytest
 
 from catstream import storage
 from catstream.errors import FencedError, FleetError, StoreError
-from catstream.fleet import log, objects
-from catstream.fleet.log import LARGEST_CLAIM
+from catstream.fleet import objects
+from catstream.fleet.states import Listing
 from catstream.fleet.store import Store
 
 STATE = {"job.safetensors": secrets.token_bytes(300), "trees/12.safetensors": b""}
@@ -60,8 +60,9 @@ def store(url):
     return Store(url)
 
 
-def numbers(store, stream="cam-7"):
-    return sorted(map(int, store._objects.sizes(f"streams/{stream}")))
+def listed(store, stream="cam-7"):
+    found = Listing.of(store._objects.names(f"streams/{stream}"))
+    return sorted(found.claims), sorted(map(tuple, found.states))
 
 
 def test_a_state_is_read_as_it_was_written(store):
@@ -89,49 +90,48 @@ def test_a_fenced_holder_writes_no_more_and_is_told_by_whom(store):
     assert store.newest("cam-7").facts == {"frame": 2}
 
 
-def test_a_holder_is_fenced_although_the_claims_after_its_own_were_removed(store, monkeypatch):
-    monkeypatch.setattr(log, "_CLAIMS", 3)
+def test_a_holder_is_fenced_although_its_claim_and_its_states_were_removed(store):
     paused = store.claim("cam-7", "node-1")
     for turn in range(5):
         newest = store.claim("cam-7", f"node-{turn}")
     newest.write(STATE, {"frame": 1})
+    newest.write(STATE, {"frame": 2})
     with pytest.raises(FencedError):
-        paused.write(STATE, {"frame": 2})
-    assert store.newest("cam-7").facts == {"frame": 1}
-    assert store.claim("cam-7", "node-2").state.facts == {"frame": 1}
-    assert len(numbers(store)) == 4  # three claims, one state
+        paused.write(STATE, {"frame": 3})
+    assert store.newest("cam-7").facts == {"frame": 2}
+    assert store.claim("cam-7", "node-2").state.facts == {"frame": 2}
 
 
 def test_two_states_stay_however_many_are_written(store):
     claim = store.claim("cam-7", "node-1")
     for frame in range(9):
         claim.write(STATE, {"frame": frame})
-    assert numbers(store) == [claim.token, claim.token + 8, claim.token + 9]
+    assert listed(store) == ([claim.token], [(claim.token, 8), (claim.token, 9)])
 
 
-def test_a_later_holder_removes_the_states_of_an_earlier_one(store):
+def test_a_later_holder_removes_the_states_and_the_claim_of_an_earlier_one(store):
     store.claim("cam-7", "node-1").write(STATE, {"frame": 1})
     claim = store.claim("cam-7", "node-2")
     claim.write(STATE, {"frame": 2})
+    assert listed(store) == ([1, 2], [(1, 1), (2, 1)])
     claim.write(STATE, {"frame": 3})
-    assert numbers(store) == [1, claim.token, claim.token + 1, claim.token + 2]
+    assert listed(store) == ([2], [(2, 1), (2, 2)])
 
 
 def test_a_damaged_state_is_passed_over(store):
     claim = store.claim("cam-7", "node-1")
     claim.write(STATE, {"frame": 1})
-    store._objects.create(f"streams/cam-7/{claim.token + 2:012}", b"half of a sta")
+    store._objects.create(f"streams/cam-7/{claim.token:08}/00000002", b"half of a sta")
     assert store.newest("cam-7").facts == {"frame": 1}
     assert store.claim("cam-7", "node-2").state.facts == {"frame": 1}
 
 
 def test_streams_are_those_that_have_a_state(store):
-    large = {"state": bytes(LARGEST_CLAIM)}
-    for stream, files in (("small", STATE), ("large", large), ("gone", STATE)):
-        store.claim(stream, "node-1").write(files, {})
+    for stream in ("one", "two", "gone"):
+        store.claim(stream, "node-1").write(STATE, {})
     store.claim("claimed", "node-1")
     store.remove("gone")
-    assert store.streams() == ["large", "small"]
+    assert store.streams() == ["one", "two"]
 
 
 def test_a_removed_stream_begins_anew_and_its_old_holder_is_fenced(store):
@@ -154,7 +154,7 @@ def test_the_newest_spec_and_model_are_returned(store):
     found = store.get_model("anna")
     assert store.get_fleet() == "spec 2"
     assert (found.files, found.facts) == ({"model": b"model 2"}, {"version": 2})
-    assert store.get_model("anna", after=found.number) is None
+    assert store.get_model("anna", after=found.token) is None
 
 
 def test_of_many_claimants_at_once_only_the_last_one_writes(tmp_path):
@@ -187,13 +187,13 @@ def test_a_folder_that_is_not_there_is_not_created_by_a_claim(tmp_path):
     store = Store(str(tmp_path / "share"))
     with pytest.raises(StoreError, match="is its file system mounted"):
         store.claim("cam-7", "node-1")
-    store.put_fleet("")
+    store.check()
     assert store.claim("cam-7", "node-1").token == 1
 
 
 def test_files_of_a_store_are_readable_by_their_owner_only(tmp_path):
     Store(str(tmp_path)).put_fleet("rtsp://user:password@camera")
-    (path,) = (tmp_path / "fleet").glob("*2")
+    (path,) = (tmp_path / "fleet").glob("*/*1")
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
@@ -203,7 +203,9 @@ def test_a_full_disk_is_a_store_error_and_the_next_write_succeeds(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
-        with pytest.raises(StoreError, match=r"streams/cam-7/0+3 of the store .* cannot be written: .*free some space"):
+        with pytest.raises(
+            StoreError, match=r"streams/cam-7/0+1/0+2 of the store .* cannot be written: .*free some space"
+        ):
             claim.write({"state": bytes(5000)}, {"frame": 2})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -217,10 +219,10 @@ def test_what_a_killed_writer_left_long_ago_is_removed_by_the_next_claim(tmp_pat
     with monkeypatch.context() as killed:
         killed.setattr(Path, "unlink", lambda *_, **__: None)
         store.claim("cam-7", "node-1").write(STATE, {})
-    old, recent = tmp_path.glob("streams/cam-7/.*.part")
+    old, recent = tmp_path.glob("streams/cam-7/*/.*.part")
     os.utime(old, (0, 0))
     store.claim("cam-7", "node-2")
-    assert list(tmp_path.glob("streams/cam-7/.*.part")) == [recent]
+    assert list(tmp_path.glob("streams/cam-7/*/.*.part")) == [recent]
 
 
 def test_a_file_is_created_whole_or_not_at_all(tmp_path):

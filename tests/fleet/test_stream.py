@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 
 from catstream.box import Box
 from catstream.errors import StoreError
+from catstream.fleet import stream as module
+from catstream.fleet.life import Order
 from catstream.fleet.spec import StreamSpec
-from catstream.fleet.store import Claim, Store
+from catstream.fleet.states import Claim
+from catstream.fleet.store import Store
 from catstream.fleet.stream import Place, Stream
 
 FRAMES = 60
@@ -36,7 +41,7 @@ def long_spec(demo_video):
 
 @contextmanager
 def started(spec, store, node="n1", every=0.2):
-    stream = Stream(spec, Place(node), store, every)
+    stream = Stream(spec, Order(spec.digest, 1.0, {}), Place(node), store, every)
     try:
         yield stream
     finally:
@@ -64,12 +69,14 @@ def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
     assert Store(store).newest("cam-7").facts["seq"] == FRAMES
 
 
-def test_a_holder_that_was_replaced_stops_and_stores_nothing(spec, store, until):
+def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(spec, store, until):
     with started(spec, store) as old:
         until(lambda: old.report().status.frame >= 3)
         claim = Store(store).claim("cam-7", "another node")
-        until(lambda: old.report().fenced)
-    assert Store(store).newest("cam-7") == claim.state
+        until(lambda: old.report().superseded)
+    assert Store(store).newest("cam-7").token < claim.token
+    claim.write({"state": b"newer"}, {"ended": False})
+    assert Store(store).newest("cam-7").files == {"state": b"newer"}
 
 
 def test_a_stream_that_has_ended_is_not_run_again(spec, store, until):
@@ -79,12 +86,56 @@ def test_a_stream_that_has_ended_is_not_run_again(spec, store, until):
     assert stream.report().status.endpoint == ""
 
 
-def test_a_source_that_cannot_be_opened_is_named(store, until, tmp_path):
-    with started(StreamSpec("cam-8", str(tmp_path / "none.mp4")), store) as stream:
+def test_a_stream_that_has_ended_and_was_changed_begins_anew(spec, store, until):
+    for each in (spec, replace(spec, settings=spec.settings | {"coreset.size": 32})):
+        with started(each, store) as stream:
+            until(lambda: stream.report().status.state == "ended")
+    assert stream.report().status.frame == FRAMES - 1
+    assert stream.report().status.began > 0
+
+
+def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, until, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_FIRST_PAUSE", 0.1)
+    path = tmp_path / "late.mp4"
+    with started(replace(spec, source=str(path)), store) as stream:
         until(lambda: stream.report().status.state == "failed")
+        assert "late.mp4" in stream.report().status.trouble
+        assert any("late.mp4" in line for line in stream.logs(10)), "the log stays"
+        path.symlink_to(spec.source)
+        until(lambda: stream.report().status.state == "ended")
     report = stream.report()
-    assert report.source_failed
-    assert "none.mp4" in report.status.trouble
+    assert report.status.restarts >= 1
+    assert (report.status.trouble, report.superseded) == ("", False)
+
+
+def test_followed_objects_are_searched_for_by_the_newest_merged_model_once_they_are_absent(
+    long_spec, store, until, monkeypatch
+):
+    """However many models are merged meanwhile, each is searched for once, and without a thread of its own."""
+    searched = []
+    monkeypatch.setattr(Stream, "_search_by", lambda _, __, model, name: searched.append((name, model.files["model"])))
+    threads = threading.active_count()
+    with started(replace(long_spec, follow=("anna",)), store, every=0.05) as stream:
+        until(lambda: stream.report().status.frame >= 3)
+        for number in range(20):
+            Store(store).put_model("anna", b"model %d" % number, {})
+        until(lambda: searched and searched[-1] == ("anna", b"model 19"))
+        assert threading.active_count() < threads + 20
+        found = len(searched)
+        stream.report(follow=())
+        until(lambda: not stream._follow)
+        Store(store).put_model("anna", b"not followed", {})
+    assert [name for name, _ in searched] == ["anna"] * len(searched)
+    assert searched[found:] == []
+
+
+def test_a_slow_stream_says_so():
+    rates = module._Rates(since=0.0, frames=60)
+    rates.update(lambda: 2.0, skipped=40)
+    assert rates.trouble.startswith("it skips 40% of its frames with ")
+    rates = module._Rates(since=0.0, frames=60)
+    rates.update(lambda: 2.0, skipped=2)
+    assert rates.trouble == ""
 
 
 def test_a_stream_goes_on_while_the_store_takes_nothing(long_spec, store, until, monkeypatch):

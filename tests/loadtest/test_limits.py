@@ -60,11 +60,6 @@ def test_a_malformed_limit_is_an_error(text):
     [
         ({"subscribers": 3, "slow": 4}, "4 of 3 subscribers cannot be slow"),
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
-        ({"nodes": 2, "chaos": True}, "without subscribers and chaos"),
-        ({"nodes": 2, "subscribers": 1}, "without subscribers and chaos"),
-        ({"nodes": 1, "kill_nodes": True, "duration": 60}, "2 fleet-nodes or more"),
-        ({"kill_nodes": True, "duration": 60}, "2 fleet-nodes or more"),
-        ({"nodes": 2, "kill_nodes": True, "duration": 10}, "a duration of more than 15 s"),
         ({"settings": Settings(run={"lockstep": True})}, "leave out lockstep"),
         ({"settings": Settings(run={"endpoint": "run"})}, "leave out endpoint"),
     ],

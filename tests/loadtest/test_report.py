@@ -16,7 +16,6 @@ from catstream.loadtest.load_test import LoadTest, Step
 from catstream.loadtest.report import write_report
 from catstream.loadtest.run import Recovery, Result
 from catstream.loadtest.usage import UsageReading
-from catstream.messages import StreamStatus
 
 
 def is_search(*results: Result) -> LoadTest:
@@ -82,20 +81,6 @@ def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
         ElementTree.fromstring(plot)
     processor = next(plot for plot in page.split("<svg")[1:] if 'aria-label="Processor"' in plot)
     assert ">detector<" in processor
-
-
-def test_a_fleet_has_a_row_for_each_stream_that_a_killed_node_ran_and_for_its_loss(result, tmp_path):
-    kills = [Kill(101.0, 0, "node-2"), Kill(101.0, 1, "node-2"), Kill(109.0, 1, "node-1")]
-    status = StreamStatus("stream-1", "running", "node-2", restarts=2, lost_frames=17, lost_seconds=3.5)
-    run = result([0.01] * 5, recoveries=[Recovery(kill, 4.25, 5.0) for kill in kills], statuses=[status])
-    run.plan = replace(run.plan, nodes=2, kill_nodes=True, duration=60.0)
-    load_test = LoadTest([], False, [Step(run, [])])
-    page = write_report(tmp_path / "report.html", load_test).read_text()
-    assert "2 nodes killed, with the pipelines of 3 streams" in page
-    assert '<td class="text">node-2 of stream 1</td><td>4.250</td>' in page
-    assert "<td>2</td><td>17</td><td>3.5</td>" in page
-    (fleet,) = to_json(load_test)["fleet"]
-    assert fleet == {"stream": "stream-1", "node": "node-2", "restarts": 2, "lost_frames": 17, "lost_seconds": 3.5}
 
 
 def test_the_json_report_contains_only_valid_json(result):

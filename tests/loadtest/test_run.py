@@ -6,22 +6,17 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from dataclasses import replace
-from math import inf
 from multiprocessing import resource_tracker
-from pathlib import Path
 
 import psutil
 import pytest
 
-from catstream.loadtest.chaos import Chaos, NodeChaos
+from catstream.loadtest.chaos import Chaos
 from catstream.loadtest.limits import Limit
 from catstream.loadtest.load_test import run_load_test
 from catstream.loadtest.plan import Plan
 from catstream.loadtest.usage import REST, Usage
-from catstream.messages import FleetStatus, StreamStatus
 
 
 class Sleepers:
@@ -52,9 +47,9 @@ def sleepers():
 
 
 def children():
-    """Processes of this one, but for those that stay to its end: two servers, and the fleet that other tests share."""
+    """Processes of this one, but for the two servers that stay to its end."""
     tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
-    own = [child for child in psutil.Process().children() if child.pid != tracker and not keeps_a_fleet(child)]
+    own = [child for child in psutil.Process().children() if child.pid != tracker]
     family = own + [process for child in own for process in child.children(recursive=True)]
     return [process for process in family if not is_start_server(process)]
 
@@ -62,14 +57,6 @@ def children():
 def is_start_server(process):
     try:
         return process.name() == "start server"
-    except psutil.Error:  # it has ended
-        return True
-
-
-def keeps_a_fleet(process):
-    """Whether a process is the keeper of a node, or was one."""
-    try:
-        return process.status() == psutil.STATUS_ZOMBIE or "fleet" in process.cmdline()
     except psutil.Error:  # it has ended
         return True
 
@@ -94,60 +81,6 @@ def test_chaos_does_not_kill_one_process_so_often_that_the_supervisor_gives_up(s
             stream.children[kill.process] = stream.start()
     names = [kill.process for kill in chaos.kills]
     assert {name: names.count(name) for name in names} == {"detector": 4, "compressor": 4, "trainer": 4}
-
-
-class Nodes:
-    """A fleet of two nodes, as its registry sees it."""
-
-    def __init__(self, streams: dict[str, str]) -> None:
-        self.streams = {name: StreamStatus(name, "running", node, token=1) for name, node in streams.items()}
-        self.killed, self.events = "", []
-
-    def kill(self, node: str) -> None:
-        assert not self.killed
-        self.killed = node
-        self.events.append(f"kill {node}")
-
-    def start(self, node: str) -> None:
-        assert all(stream.node != node for stream in self.streams.values())
-        self.killed = ""
-        self.events.append(f"start {node}")
-
-    def move_one(self) -> None:
-        """Start a stream of the killed node on the other one."""
-        other = "node-1" if self.killed == "node-2" else "node-2"
-        stream = next((each for each in self.streams.values() if each.node == self.killed), None)
-        if stream is not None:
-            self.streams[stream.name] = replace(stream, node=other, token=stream.token + 1)
-
-    @property
-    def status(self) -> FleetStatus:
-        return FleetStatus("load", 0.0, self.streams)
-
-
-def test_a_killed_node_is_started_after_all_of_its_streams_run_on_another_one():
-    nodes = Nodes({"stream-0": "node-1", "stream-1": "node-1", "stream-2": "node-1"})
-    chaos = NodeChaos(5, list(nodes.streams), nodes.kill, nodes.start)
-    for _ in range(3):
-        chaos._due = 0.0
-        chaos.step(nodes.status)  # kills
-        chaos._due = inf
-        for _ in range(3):
-            chaos.step(nodes.status)  # waits
-            nodes.move_one()
-        chaos.step(nodes.status)  # starts
-    assert nodes.events == [f"{what} node-{number}" for number in (1, 2, 1) for what in ("kill", "start")]
-    assert [str(kill) for kill in chaos.kills[3:6]] == [f"node-2 of stream {number}" for number in range(3)]
-
-
-def test_no_node_is_killed_at_the_end_of_a_run_or_while_a_stream_does_not_run():
-    nodes = Nodes({"stream-0": "node-1", "stream-1": "node-2"})
-    chaos = NodeChaos(5, list(nodes.streams), nodes.kill, nodes.start)
-    chaos._due = 0.0
-    chaos.step(nodes.status, may_kill=False)
-    nodes.streams["stream-1"] = replace(nodes.streams["stream-1"], state="moving")
-    chaos.step(nodes.status)
-    assert nodes.events == chaos.kills == []
 
 
 def test_no_child_receives_ctrl_c():
@@ -207,25 +140,6 @@ def test_all_killed_processes_recover():
     assert all(recovery.track is not None and recovery.model is not None for recovery in early)
     assert all(stream.sent == stream.stored for stream in load_test.result.streams)
     assert children() == []
-
-
-@pytest.mark.slow
-def test_the_streams_of_killed_nodes_recover_and_the_fleet_leaves_nothing_behind(monkeypatch, request):
-    pytest.importorskip("ray")
-    folder = tempfile.TemporaryDirectory(prefix="cs-")  # not tmp_path: the path of a socket is short
-    request.addfinalizer(folder.cleanup)
-    monkeypatch.setattr(tempfile, "tempdir", folder.name)
-    plan = Plan(streams=2, rate=4.0, duration=45.0, size=(320, 240), nodes=2, kill_nodes=True)
-    load_test = run_load_test(plan, [Limit("recovery", 60.0)], find=False)
-    result = load_test.result
-    assert not load_test.violations
-    assert result.killed_nodes >= 1
-    for recovery in result.recoveries:
-        assert result.streams[recovery.kill.stream].skipped > 0
-        assert result.statuses[recovery.kill.stream].restarts > 0
-        assert result.statuses[recovery.kill.stream].lost_seconds > 0
-    assert [child for child in children() if child.status() != psutil.STATUS_ZOMBIE] == []
-    assert list(Path(folder.name).iterdir()) == []
 
 
 @pytest.mark.slow

@@ -48,10 +48,18 @@ def start(server, folder, tmp_path):  # noqa: ARG001  its processes end before t
         log.close()
 
 
+def opened(pid):
+    """What the descriptors of a process lead to."""
+    places = {}
+    for name in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(FileNotFoundError):  # it opens and closes files meanwhile
+            places[name.name] = str(name.readlink())
+    return places
+
+
 def sockets(pid):
     """The sockets and pipes that a process has open."""
-    opened = [str(name.readlink()) for name in Path(f"/proc/{pid}/fd").iterdir()]
-    return [place for place in opened if place.startswith(("socket:", "pipe:"))]
+    return [place for place in opened(pid).values() if place.startswith(("socket:", "pipe:"))]
 
 
 def prefixed(monkeypatch, statements):
@@ -74,12 +82,9 @@ def test_a_process_is_a_fork_of_the_server_with_a_title_a_session_and_a_folder_o
 def test_a_process_has_its_own_descriptors_and_none_of_the_server(start, until):
     process, watchdog, log = start()
     until(lambda: watchdog.turns > 0)
-    opened = {}
-    for name in Path(f"/proc/{process.pid}/fd").iterdir():
-        with suppress(FileNotFoundError):  # it opens and closes files meanwhile
-            opened[name.name] = str(name.readlink())
-    assert opened["0"] == opened["1"] == "/dev/null"
-    assert opened["2"] == str(Path(f"/proc/self/fd/{log.fileno()}").readlink())
+    found = opened(process.pid)
+    assert found["0"] == found["1"] == "/dev/null"
+    assert found["2"] == str(Path(f"/proc/self/fd/{log.fileno()}").readlink())
     of_the_server = set(sockets(psutil.Process(process.pid).ppid()))
     assert not of_the_server & set(sockets(process.pid))
 

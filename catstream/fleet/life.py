@@ -1,0 +1,251 @@
+"""The life of a stream of a fleet: what its controller does if something happens to it, as a table.
+
+A stream is an actor of Ray, which Ray places, and starts again elsewhere if its process or its node dies. The states
+here are those of the actor, as the controller sees it; what its pipeline does, its own reports say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+__all__ = [
+    "EVENTS",
+    "SILENT_SECONDS",
+    "STATES",
+    "TABLE",
+    "Action",
+    "Event",
+    "Node",
+    "Order",
+    "Seen",
+    "State",
+    "Wanted",
+    "diagram",
+    "event",
+    "objection",
+    "shortage",
+]
+
+State = Literal["absent", "pending", "working", "stopping"]
+Event = Literal["wanted", "reports", "interrupted", "silent", "unwanted", "superseded", "ended", "gone"]
+Action = Literal["", "start", "stop", "restart", "kill"]
+
+#: What each state is, for the documentation.
+STATES: dict[State, str] = {
+    "absent": "there is no actor",
+    "pending": "Ray places it, or it starts",
+    "working": "it reports",
+    "stopping": "it stores its last state and ends, or was killed",
+}
+
+#: What each event is, for the documentation.
+EVENTS: dict[Event, str] = {
+    "wanted": "the stream should run, and has not ended",
+    "reports": "the actor answers",
+    "interrupted": "its process died: Ray starts it again",
+    "silent": "it has not answered for so long that it hangs",
+    "unwanted": "the stream was removed or changed, or has to leave its node",
+    "superseded": "another process has claimed the stream",
+    "ended": "its source has ended, and its last state is stored",
+    "gone": "Ray has no such actor any more",
+}
+
+#: The next state and the action, by state and event; for an event that is not here, nothing changes.
+TABLE: dict[tuple[State, Event], tuple[State, Action]] = {
+    ("absent", "wanted"): ("pending", "start"),
+    ("pending", "reports"): ("working", ""),
+    ("pending", "unwanted"): ("stopping", "kill"),
+    ("pending", "superseded"): ("stopping", "kill"),
+    ("pending", "ended"): ("stopping", "stop"),
+    ("pending", "gone"): ("absent", ""),
+    ("working", "interrupted"): ("pending", ""),
+    ("working", "silent"): ("pending", "restart"),
+    ("working", "unwanted"): ("stopping", "stop"),
+    ("working", "superseded"): ("stopping", "kill"),
+    ("working", "ended"): ("stopping", "stop"),
+    ("working", "gone"): ("absent", ""),
+    ("stopping", "silent"): ("stopping", "kill"),
+    ("stopping", "gone"): ("absent", ""),
+}
+
+#: Seconds after which an actor in a state counts as silent: a busy machine may be slow to answer.
+SILENT_SECONDS: dict[State, float] = {"working": 120.0, "stopping": 30.0}
+_ADOPTED_SECONDS = 30.0  # within which an actor that an earlier controller started says what it was started for
+
+#: Label that Ray gives to each node: its id.
+_NODE_ID = "ray.io/node-id"
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node of the cluster.
+
+    name      as given to `ray start --node-name`, by default its address
+    id        of Ray; a node that was started again has another one
+    address   its IP address
+    cores     for actors
+    labels    as given to `ray start --labels`
+    alive     whether it answers Ray's health checks
+    draining  whether its streams leave it, by `catstream fleet drain`
+    """
+
+    name: str
+    id: str
+    address: str = ""
+    cores: float = 1.0
+    labels: Mapping[str, str] = field(default_factory=dict)
+    alive: bool = True
+    draining: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A stream that should run.
+
+    digest  `StreamSpec.digest`: a stream whose digest changes is started anew
+    cores   that Ray reserves for it
+    labels  that its node must have
+    pinned  name of the node that it was moved to; "" for any
+    """
+
+    digest: str
+    cores: float = 1.0
+    labels: Mapping[str, str] = field(default_factory=dict)
+    pinned: str = ""
+
+    def target(self, nodes: Collection[Node]) -> Node | None:
+        """The node that it was moved to; None if it may run on any, because that one has died or drains since."""
+        return next((node for node in nodes if node.name == self.pinned and node.alive and not node.draining), None)
+
+    def order(self, nodes: Collection[Node]) -> Order:
+        """What Ray is asked for."""
+        pinned = self.target(nodes)
+        leaving = sorted(node.id for node in nodes if node.draining)
+        where = pinned.id if pinned is not None else f"!in({','.join(leaving)})" if leaving else ""
+        return Order(self.digest, self.cores, dict(self.labels) | ({_NODE_ID: where} if where else {}))
+
+    def fits(self, node: Node) -> bool:
+        """Whether it may run on a node."""
+        return not node.draining and self.labels.items() <= node.labels.items()
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What an actor was started for: it is a part of its reports.
+
+    digest    of the stream
+    cores     that Ray reserves
+    selector  labels of its node, as Ray's `label_selector` takes them
+    """
+
+    digest: str
+    cores: float
+    selector: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """An actor, as its controller sees it.
+
+    state       its state
+    since       moment at which the state began
+    answered    moment of its last answer
+    order       what it was started for; None for one that an earlier controller started and that has not reported yet
+    node        id of the node that it reported from; "" if it has not reported since it was placed
+    happened    what has happened to it since the last look; "" for nothing
+    """
+
+    state: State
+    since: float = 0.0
+    answered: float = 0.0
+    order: Order | None = None
+    node: str = ""
+    happened: Event | Literal[""] = ""
+
+
+def event(wanted: Wanted | None, seen: Seen | None, nodes: Collection[Node], now: float) -> Event | None:
+    """What happens to a stream now; None for nothing.
+
+    Parameters
+    ----------
+    wanted : the stream as it should run; None if it should not
+    seen : its actor; None if there is none
+    nodes : of the cluster
+    now : the time, by the clock of `Seen`
+
+    Examples
+    --------
+    >>> anywhere = Wanted("a1")
+    >>> event(anywhere, None, [], 0.0)
+    'wanted'
+    >>> event(anywhere, Seen("working", node="1", order=anywhere.order([])), [Node("n1", "1", draining=True)], 0.0)
+    'unwanted'
+    """
+    if seen is None:
+        return "wanted" if wanted is not None else None
+    if seen.happened == "gone":
+        return "gone"
+    last = seen.since if seen.state == "stopping" else seen.answered
+    is_silent = now - last > SILENT_SECONDS.get(seen.state, float("inf"))
+    if seen.state != "stopping" and (wanted is None or not _is_as_wanted(wanted, seen, nodes, now)):
+        return "unwanted"
+    return seen.happened or ("silent" if is_silent else None)
+
+
+def _is_as_wanted(wanted: Wanted, seen: Seen, nodes: Collection[Node], now: float) -> bool:
+    """Whether an actor was started for what is wanted, and is, or will be placed, where it may be."""
+    if seen.order is None:
+        return now - seen.since < _ADOPTED_SECONDS
+    order = wanted.order(nodes)
+    if (seen.order.digest, seen.order.cores) != (order.digest, order.cores):
+        return False
+    node = next((node for node in nodes if node.id == seen.node and node.alive), None)
+    if node is None:
+        return seen.order.selector == order.selector
+    return wanted.fits(node) and wanted.target(nodes) in (None, node)
+
+
+def objection(name: str, wanted: Wanted, nodes: Collection[Node]) -> str:
+    """Why a stream can run on no node, even if no other stream ran; empty if it can.
+
+    >>> objection("cam-7", Wanted("a1", 4.0), [Node("n1", "1", cores=2.0)])
+    'cam-7 needs 4 cores, and the largest node that it may run on, n1, has 2'
+    >>> objection("cam-7", Wanted("a1", labels={"site": "north"}), [Node("n1", "1")])
+    'cam-7 needs a node with site=north, and there is none: there are n1'
+    """
+    alive = [node for node in nodes if node.alive]
+    fitting = [node for node in alive if wanted.fits(node)]
+    if not fitting:
+        labels = ", ".join(f"{key}={value}" for key, value in wanted.labels.items())
+        needed = f"a node with {labels}" if labels else "a node that is not drained"
+        return f"{name} needs {needed}, and there is none: there are {', '.join(node.name for node in alive) or 'none'}"
+    largest = max(fitting, key=lambda node: node.cores)
+    if largest.cores < wanted.cores:
+        return (
+            f"{name} needs {wanted.cores:g} cores, and the largest node that it may run on, {largest.name}, has "
+            f"{largest.cores:g}"
+        )
+    return ""
+
+
+def shortage(wanted: Collection[Wanted], nodes: Collection[Node]) -> str:
+    """Why streams cannot all run at the same time; empty if they can, as far as the sums of cores say.
+
+    >>> shortage([Wanted("a", 1.0)] * 20, [Node("n1", "1", cores=2.0)])
+    'the 20 streams need 20 cores, and the nodes have 2'
+    """
+    needed = sum(each.cores for each in wanted)
+    there = sum(node.cores for node in nodes if node.alive and not node.draining)
+    if needed <= there + 1e-6:
+        return ""
+    return f"the {len(wanted)} streams need {needed:g} cores, and the nodes have {there:g}"
+
+
+def diagram() -> str:
+    """The table as a diagram in the language of Mermaid, for the documentation."""
+    lines = ["stateDiagram-v2", "    [*] --> absent"]
+    for (state, what), (after, action) in TABLE.items():
+        lines.append(f"    {state} --> {after} : {what}{f' / {action}' if action else ''}")
+    return "\n".join(lines)

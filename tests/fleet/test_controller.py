@@ -1,0 +1,362 @@
+"""The controller of a fleet, with a Ray of this file's own: what it starts, stops, stores and answers."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import types
+from dataclasses import replace
+from importlib.machinery import ModuleSpec
+
+import pytest
+
+from catstream.errors import FleetError, SilenceError, StoreError
+from catstream.fleet import controller as module
+from catstream.fleet.controller import Controller, Record
+from catstream.fleet.life import Node
+from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.fleet.store import Store
+from catstream.fleet.stream import Report
+from catstream.messages import StreamStatus
+from catstream.registry import Registry
+
+GATE, ROOF = StreamSpec("gate", "demo:1"), StreamSpec("roof", "demo:2", cores=0.5)
+SEARCHED = {"anna": "a"}
+
+
+class RayError(Exception):
+    pass
+
+
+class Call:
+    """A call of an actor: its answer is known, or not yet."""
+
+    def __init__(self, answer=None, error=None):
+        self.answer, self.error = answer, error
+
+    @property
+    def is_over(self):
+        return self.answer is not None or self.error is not None
+
+
+class Actor:
+    """The actor of a stream, which the test lets run."""
+
+    def __init__(self, cluster, options, spec, order):
+        self.cluster, self.options, self.spec, self.order = cluster, options, spec, order
+        self.status, self.superseded, self.asked, self.restarted = None, False, [], 0
+        for name in ("report", "stop", "logs"):
+            setattr(self, name, types.SimpleNamespace(remote=lambda *given, name=name: self._called(name, given)))
+
+    def runs(self, node, state="running", **facts):
+        """Let it run on a node."""
+        self.status = StreamStatus(self.spec.name, state, node, **facts)
+
+    def _called(self, name, given):
+        self.asked.append((name, *given))
+        if name == "stop":
+            return Call("stopped")
+        if name == "logs":
+            return Call(["a line"])
+        return Call(Report(self.status, self.order, self.superseded) if self.status else None)
+
+
+class Ray(types.ModuleType):
+    """As much of Ray as a controller uses."""
+
+    def __init__(self):
+        super().__init__("ray")
+        self.__spec__ = ModuleSpec("ray", None)
+        self.actors, self.started = {}, []
+        self.util = types.ModuleType("ray.util")
+        self.util.list_named_actors = lambda **_: [{"name": name, "namespace": "catstream"} for name in self.actors]
+        self.exceptions = types.ModuleType("ray.exceptions")
+        self.exceptions.RayError = RayError
+
+    def remote(self, _):
+        return types.SimpleNamespace(
+            options=lambda **options: types.SimpleNamespace(remote=lambda *given: self._start(options, *given))
+        )
+
+    def _start(self, options, spec, order, *_):
+        if options["name"] in self.actors:
+            raise ValueError("the name is taken")
+        actor = self.actors[options["name"]] = Actor(self, options, spec, order)
+        self.started.append(spec.name)
+        return actor
+
+    def get_actor(self, name, **_):
+        return self.actors[name]
+
+    def wait(self, calls, **_):
+        return [call for call in calls if call.is_over], []
+
+    def get(self, call, **_):
+        if call.error is not None:
+            raise call.error
+        return call.answer
+
+    def kill(self, actor, no_restart=True):
+        if no_restart:
+            self.actors.pop(actor.options["name"], None)
+        else:
+            actor.restarted += 1
+
+
+@pytest.fixture
+def ray(monkeypatch):
+    fake = Ray()
+    for name, part in (("ray", fake), ("ray.util", fake.util), ("ray.exceptions", fake.exceptions)):
+        monkeypatch.setitem(sys.modules, name, part)
+    fake.nodes = [Node("n1", "1", "127.0.0.1", 2.0), Node("n2", "2", "127.0.0.1", 2.0)]
+    monkeypatch.setattr(module, "nodes", lambda: list(fake.nodes))
+    monkeypatch.setattr(module, "is_local", lambda: True)
+    monkeypatch.setattr(Controller, "_run", lambda _: None)  # a test calls each turn
+    return fake
+
+
+@pytest.fixture
+def spec(tmp_path):
+    (tmp_path / "store").mkdir()
+    return FleetSpec("site", str(tmp_path / "store"), streams={"gate": GATE, "roof": ROOF})
+
+
+@pytest.fixture
+def made(ray, spec, monkeypatch, tmp_path):  # noqa: ARG001  the module finds it as Ray
+    """Starts a controller."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(module, "_FIRST_PAUSE", 0.0)
+    controllers = []
+
+    def make():
+        controllers.append(Controller("site", spec.store, "", ""))
+        return controllers[-1]
+
+    yield make
+    for each in controllers:
+        each.end()
+
+
+@pytest.fixture
+def site(made, spec):
+    site = made()
+    site.apply(spec.to_json(), origin="vm:/a/fleet.toml")
+    site._turn()
+    return site
+
+
+def running(site, ray, name, node="1", **facts):
+    ray.actors[f"site/stream/{name}"].runs(node, **facts)
+    for _ in range(2):
+        site._turn()
+
+
+def states(site):
+    return {name: each.state for name, each in site.status().streams.items()}
+
+
+def test_streams_are_detached_actors_that_ray_places_and_restarts(site, ray):
+    options = ray.actors["site/stream/roof"].options
+    assert options["num_cpus"] == 0.5
+    assert (options["lifetime"], options["max_restarts"]) == ("detached", -1)
+    assert states(site) == {"gate": "starting", "roof": "starting"}
+    running(site, ray, "gate")
+    assert (states(site)["gate"], site.status().streams["gate"].node) == ("running", "n1")
+    assert site.status().nodes["n1"].used == 1.0
+
+
+def test_a_controller_that_starts_again_touches_no_stream_that_runs(site, ray, made, spec):
+    running(site, ray, "gate")
+    running(site, ray, "roof")
+    actors = dict(ray.actors)
+    again = made()
+    again._turn()
+    assert (ray.actors, ray.started) == (actors, ["gate", "roof"])
+    assert again.apply(spec.to_json()) == ["gate: is unchanged", "roof: is unchanged"]
+    assert states(again) == {"gate": "running", "roof": "running"}
+
+
+def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
+    running(site, ray, "gate")
+    assert site.move("gate", "n2") == "gate moves from n1 to n2"
+    site._turn()
+    assert states(site)["gate"] == "moving"
+    assert ray.actors["site/stream/gate"].asked[-1] == ("stop",)
+    for _ in range(3):
+        site._turn()
+    assert ray.actors["site/stream/gate"].options["label_selector"] == {"ray.io/node-id": "2"}
+    running(site, ray, "gate", "2")
+    assert site.move("gate", "n2") == "gate stays on n2"
+
+
+def test_a_drained_node_loses_its_streams_and_gets_them_back_only_if_it_takes_streams_again(site, ray):
+    running(site, ray, "gate")
+    assert site.drain("n1", undo=False) == "n1 is draining: its 1 streams move to other nodes"
+    for _ in range(4):
+        site._turn()
+    assert ray.actors["site/stream/gate"].options["label_selector"] == {"ray.io/node-id": "!in(1)"}
+    assert site.status().nodes["n1"].state == "draining"
+    running(site, ray, "gate", "2")
+    site.drain("n1", undo=True)
+    site._turn()
+    assert states(site)["gate"] == "running", "it stays where it is"
+
+
+def test_a_stream_that_was_moved_to_a_node_that_died_runs_elsewhere(site, ray):
+    site.move("gate", "n2")
+    for _ in range(4):
+        site._turn()
+    running(site, ray, "gate", "2")
+    ray.nodes[1] = replace(ray.nodes[1], alive=False)
+    actor = ray.actors["site/stream/gate"]
+    actor._called = lambda *_: Call(error=RayError("unavailable"))
+    for _ in range(5):
+        site._turn()
+    assert ray.actors["site/stream/gate"] is not actor
+    assert "label_selector" not in ray.actors["site/stream/gate"].options
+
+
+def test_a_stream_that_has_ended_is_stopped_and_runs_again_only_if_it_is_changed(site, ray):
+    running(site, ray, "gate", state="ended", frame=31)
+    for _ in range(3):
+        site._turn()
+    assert (states(site)["gate"], ray.started.count("gate")) == ("ended", 1)
+    site.add(replace(GATE, source="demo:3"))
+    for _ in range(2):
+        site._turn()
+    assert (states(site)["gate"], ray.started.count("gate")) == ("starting", 2)
+
+
+def test_one_that_another_process_has_claimed_is_killed_and_claims_again(site, ray):
+    actor = ray.actors["site/stream/gate"]
+    actor.superseded = True
+    running(site, ray, "gate", state="failed")
+    for _ in range(3):
+        site._turn()
+    assert ray.actors["site/stream/gate"] is not actor
+    assert site.status().streams["gate"].restarts == 1
+
+
+def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, spec):
+    store = Store(spec.store)
+    store.claim("gate", "n1").write({"a": b""}, {"ended": False})
+    site.move("gate", "n2")
+    assert site.remove(["gate"], forget=True) == ["gate: is removed"]
+    for _ in range(4):
+        site._turn()
+    assert store.newest("gate") is None
+    assert Record.from_json(store.get_fleet()).pins == {}
+    assert not any("gate" in str(known) for known in (site._last, site._restarts, site._pauses, site._actors))
+    site.add(GATE)
+    site._turn()
+    assert "label_selector" not in ray.actors["site/stream/gate"].options
+
+
+def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, monkeypatch):
+    def fails(*_):
+        raise StoreError("the store cannot be reached")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "put_fleet", fails)
+        for change in (
+            lambda: site.add(replace(GATE, name="new")),
+            lambda: site.move("gate", "n2"),
+            lambda: site.drain("n1", undo=False),
+            lambda: site.remove(["gate"], forget=False),
+        ):
+            with pytest.raises(StoreError, match="cannot be reached"):
+                change()
+    assert sorted(site.status().streams) == ["gate", "roof"]
+    assert site.status().nodes["n1"].state == "alive"
+
+
+def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site, ray, monkeypatch, until):
+    hangs, goes_on = threading.Event(), threading.Event()
+
+    def put(*_):
+        hangs.set()
+        goes_on.wait(60)
+
+    monkeypatch.setattr(Store, "put_fleet", put)
+    change = threading.Thread(target=site.drain, args=("n1",), kwargs={"undo": False})
+    change.start()
+    try:
+        assert hangs.wait(60)
+        running(site, ray, "gate")
+        with Registry("site", timeout=30) as registry:
+            until(lambda: registry.streams().streams["gate"].state == "running")
+            assert registry.place("gate").status.node == "n1"
+    finally:
+        goes_on.set()
+        change.join()
+    site._turn()
+    assert site.status().nodes["n1"].state == "draining"
+
+
+def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_is_back(made, spec, monkeypatch):
+    before = made()
+    before.apply(spec.to_json())
+    before.end()
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "get_fleet", lambda _: (_ for _ in ()).throw(StoreError("the store cannot be reached")))
+        again = made()
+        with pytest.raises(StoreError, match="cannot be reached"):
+            again.ready()
+        with pytest.raises(StoreError, match="cannot be reached"):
+            again.apply(spec.to_json())
+    with Registry("site", timeout=0.5) as registry, pytest.raises(SilenceError):
+        registry.streams()  # an empty answer would be the end of each stream for those who follow it
+    again._begin()
+    again.ready()
+    assert sorted(again.status().streams) == ["gate", "roof"]
+
+
+def test_streams_of_another_file_are_replaced_only_if_that_is_said(site, spec):
+    other = replace(spec, streams={"lake": StreamSpec("lake", "demo:3")}).to_json()
+    with pytest.raises(FleetError, match=r"runs the streams of vm:/a/fleet.toml, not of vm:/b/fleet.toml.*--replace"):
+        site.apply(other, origin="vm:/b/fleet.toml")
+    assert sorted(site.status().streams) == ["gate", "roof"]
+    site.apply(other, origin="vm:/b/fleet.toml", replace_other=True)
+    assert sorted(site.status().streams) == ["lake"]
+
+
+def test_too_many_streams_are_refused_before_they_start_unless_they_may_wait(site, spec):
+    many = replace(spec, streams={f"cam-{n}": StreamSpec(f"cam-{n}", "demo:1") for n in range(20)}).to_json()
+    with pytest.raises(FleetError, match="the 20 streams need 20 cores, and the nodes have 4"):
+        site.apply(many)
+    with pytest.raises(FleetError, match="lake needs 4 cores, and the largest node that it may run on, n1, has 2"):
+        site.add(StreamSpec("lake", "demo:3", cores=4.0))
+    assert sorted(site.status().streams) == ["gate", "roof"]
+    site.apply(many, may_wait=True)
+    assert len(site.status().streams) == 20
+
+
+def test_what_a_stream_waits_for_is_said(site, ray):
+    ray.nodes[:] = [Node("n1", "1", "127.0.0.1", 1.0)]
+    running(site, ray, "roof")
+    site._turn()
+    waiting = site.status().streams["gate"]
+    assert waiting.state == "unplaced"
+    assert waiting.trouble == "gate waits for 1 free cores: no node that it may run on has more than 0.5"
+
+
+def test_followed_objects_and_clients_reach_a_stream_with_each_question(site, ray):
+    site.add(replace(GATE, follow=("anna",)))
+    running(site, ray, "gate")
+    assert ray.actors["site/stream/gate"].asked[-1] == ("report", None, ("anna",))
+
+
+def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):
+    running(site, ray, "gate")
+    running(site, ray, "roof")
+    assert site.close() == 2
+    for _ in range(4):
+        site._turn()
+    assert (site.close(), ray.actors) == (0, {})
+
+
+@pytest.mark.parametrize("text", ["{", "{}", '{"spec": "{}", "origin": "", "pins": {}, "draining": []}'])
+def test_a_damaged_desired_state_is_an_error(text):
+    with pytest.raises(FleetError, match="damaged"):
+        Record.from_json(text)
