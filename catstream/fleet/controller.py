@@ -359,13 +359,14 @@ class Controller:
         self._turn()
         self._trouble = None
         self._begun.set()
-        self._start_thread(self._serve)  # not before: a client would take an empty answer for the end of its stream
+        if (registry := self._registry) is not None:
+            # Not before: a client would take an empty answer for the end of its stream.
+            self._start_thread(lambda: self._serve(registry))
 
-    def _serve(self) -> None:
+    def _serve(self, registry: RegistryServer) -> None:
         """Answer the registry, without the store."""
-        assert self._registry is not None
         while not self._over.is_set():
-            self._registry.turn(_QUESTION_SECONDS)
+            registry.turn(_QUESTION_SECONDS)
 
     def _run(self) -> None:
         while not self._over.wait(_TURN_SECONDS):
@@ -465,13 +466,12 @@ class Controller:
             del self._actors[name]
             if state != "stopping":
                 self._pause(name, now)
-        elif actor is None:
-            assert wanted is not None
-            self._start(name, wanted, now)
-        else:
+        elif actor is not None:
             self._act(actor, action)
             changed = now if after != state or action == "kill" else actor.seen.since
             actor.seen = replace(actor.seen, state=after, since=changed, answered=max(actor.seen.answered, changed))
+        elif wanted is not None:
+            self._start(name, wanted, now)
         if happened == "superseded":
             self._pause(name, now)
         if happened in ("interrupted", "silent", "superseded") and state != "stopping":

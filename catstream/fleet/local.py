@@ -16,13 +16,13 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from catstream.errors import FleetError
 from catstream.services import start
 from catstream.storage import is_locked, lock, write_atomically
+from catstream.wire.endpoint import private_folder
 
 __all__ = ["LocalCluster", "main"]
 
@@ -43,9 +43,7 @@ class LocalCluster:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.absolute()
-        # Short, because the paths of Unix sockets are.
         self._process: subprocess.Popen[bytes] | None = None  # if this process has started it
-        self._work = Path("/tmp") / f"catstream-{os.getuid()}-{sha256(bytes(self.folder)).hexdigest()[:8]}"
 
     @property
     def running(self) -> bool:
@@ -67,7 +65,7 @@ class LocalCluster:
         token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(self.folder / "token")}
         # Ray listens on 127.0.0.1 only if it takes the machine for one that runs no cluster with others.
         loopback = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_USAGE_STATS_ENABLED": "0"}
-        quiet = {"RAY_TMPDIR": str(self._work), "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+        quiet = {"RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
         # A dead node is noticed after two seconds, one that hangs after six.
         health = {"RAY_health_check_initial_delay_ms": "1000", "RAY_health_check_period_ms": "500"}
         health |= {"RAY_health_check_timeout_ms": "1500", "RAY_health_check_failure_threshold": "3"}
@@ -94,8 +92,6 @@ class LocalCluster:
         if not (self.folder / "token").exists():
             write_atomically(self.folder / "token", secrets.token_hex(32).encode(), 0o600)
         (self.folder / "address").unlink(missing_ok=True)
-        self._work.mkdir(mode=0o700, exist_ok=True)
-        (self._work / "ray").mkdir(exist_ok=True)
         cores = math.ceil(len(os.sched_getaffinity(0)) / nodes) if cores is None else cores
         command = start.python_command(
             "from catstream.fleet.local import main; main()",
@@ -157,7 +153,10 @@ def main() -> None:
         file.flush()
         if sys.argv[4] == "attached":
             threading.Thread(target=_set_at_the_end_of_input, args=(ends,), daemon=True).start()
-        _keep(folder, count, cores, ends)
+        with private_folder() as work:
+            (work / "ray").mkdir()
+            os.environ["RAY_TMPDIR"] = str(work)
+            _keep(folder, count, cores, ends)
 
 
 def _set_at_the_end_of_input(ends: threading.Event) -> None:
