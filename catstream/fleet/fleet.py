@@ -139,6 +139,7 @@ class Fleet:
                 )
             except BaseException:
                 if self._local is not None and began:
+                    self.is_owner = False  # there is nothing to be stored
                     self.close()
                     self._local.stop()
                 raise
