@@ -1,4 +1,4 @@
-"""What the tests of the registry share: a manager of a fleet in a thread, with a state that the test decides."""
+"""What the tests of the registry share: a controller of a fleet in a thread, with a state that the test decides."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from catstream.wire.keys import allow, create
 
 @contextmanager
 def _managing(status: FleetStatus, text: str = "", keys: str = "") -> Iterator[Endpoint]:
-    """A manager that answers with this state of the fleet, which may change meanwhile."""
+    """A controller that answers with this state of the fleet, which may change meanwhile."""
     over = Event()
 
     def serve() -> None:
@@ -35,7 +35,7 @@ def _managing(status: FleetStatus, text: str = "", keys: str = "") -> Iterator[E
 
 @pytest.fixture
 def managing():
-    """Starts a manager of a fleet."""
+    """Starts a controller of a fleet."""
     return _managing
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextcontroller
 from dataclasses import replace
 
 import pytest
@@ -93,14 +93,14 @@ def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, m
             assert tracks.missed == 6
 
 
-def test_a_subscription_goes_on_without_the_manager_and_follows_the_stream_once_there_is_one_again(stream, managing):
-    with ExitStack() as manager:
-        manager.enter_context(managing(stream.status))
+def test_a_subscription_goes_on_without_the_controller_and_follows_the_stream_once_there_is_one_again(stream, managing):
+    with ExitStack() as controller:
+        controller.enter_context(managing(stream.status))
         first = stream.runs()
         with catstream.subscribe("fleet://site/cam-7", "tracks", timeout=60) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, track(1))
-            manager.close()
+            controller.close()
             stream.send(first, track(2), STOPPED)
             second = stream.runs()
             with managing(stream.status):
@@ -225,7 +225,7 @@ def test_a_client_of_the_fleet_may_do_at_each_stream_what_its_role_says_until_it
 
 
 class _Script:
-    """A registry whose answers a test decides; None if its manager is down."""
+    """A registry whose answers a test decides; None if its controller is down."""
 
     def __init__(self):
         self.answer = self._status(0, "running")
@@ -249,7 +249,7 @@ STEPS = st.lists(st.sampled_from(["move", "stop", "down", "end of the pipeline"]
 
 
 @given(STEPS, st.sampled_from(["ended", "removed"]))
-def test_only_the_registry_ends_a_stream_whatever_its_pipelines_and_its_manager_do(steps, last):
+def test_only_the_registry_ends_a_stream_whatever_its_pipelines_and_its_controller_do(steps, last):
     registry, token = _Script(), 0
     followed = FollowedStream(registry, "cam-7")
     for step in steps:

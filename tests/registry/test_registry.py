@@ -68,8 +68,8 @@ def test_a_stream_that_does_not_run_has_no_endpoint(managing):
 
 
 def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder, managing):
-    with managing(SITE) as manager, meeting_place("", folder, source="walk.mp4") as pipeline:
-        assert fleets() == {"site": manager}
+    with managing(SITE) as controller, meeting_place("", folder, source="walk.mp4") as pipeline:
+        assert fleets() == {"site": controller}
         assert running() == [pipeline]
         assert find() == pipeline
         assert str(locate("fleet://cam-7")) == str(locate("fleet://site/cam-7")) == "run"
@@ -91,7 +91,7 @@ def test_without_a_fleet_the_error_says_how_to_get_one(managing):
         Registry("yard")
 
 
-def test_a_manager_that_was_started_again_elsewhere_is_found(managing):
+def test_a_controller_that_was_started_again_elsewhere_is_found(managing):
     with managing(SITE):
         registry = Registry()
     with registry:
