@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextcontroller
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import pytest
