@@ -284,9 +284,10 @@ _ACROSS = """
     camera without the object in which a box is reported. See [The same object at several
     cameras](how-to/fleet.md#the-same-object-at-several-cameras)."""
 _FLEET = """
-    Three nodes and six streams on one machine, with a real S3 server as the store. Three streams are live; three are
-    short films in lockstep, whose trees are compared, bit for bit, with those of a run without faults whenever a film
-    ends. `wrong` counts streams that were started again or stood still when they should not, other trees, and what did
+    Three nodes and six streams on one machine with two cores, with a real S3 server as the store; other programs ran
+    beside it. Three streams are live; three are short films in lockstep, whose trees are compared, bit for bit, with
+    those of a run without faults whenever a film ends. The second table begins when Ray has noticed the fault. `wrong`
+    counts streams that were started again or stood still when they should not, other trees, and what did
     not happen in three minutes. Frames and seconds lost are those of the live streams. See [Run a fleet of
     streams](how-to/fleet.md#what-is-kept-and-what-is-lost)."""
 _SCALE_HEAD = """
