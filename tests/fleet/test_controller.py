@@ -122,10 +122,9 @@ def spec(tmp_path):
 
 
 @pytest.fixture
-def made(ray, spec, monkeypatch, tmp_path):  # noqa: ARG001  the module finds it as Ray
+def made(ray, spec, monkeypatch, folder):  # noqa: ARG001  the module finds it as Ray
     """Starts a controller."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))  # no other fleet is found
     monkeypatch.setattr(module, "_FIRST_PAUSE", 0.0)
     controllers = []
 
