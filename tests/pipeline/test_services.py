@@ -31,19 +31,15 @@ from catstream.wire.newest import Subscriber
 @pytest.mark.parametrize(
     "order", [("detector", "trainer", "compressor"), ("trainer", "compressor", "detector")], ids=" ".join
 )
-def test_processes_started_manually_in_any_order_complete_a_run(video, folder, tcp, service, order, until):
+def test_processes_started_manually_in_any_order_complete_a_run(video, folder, tcp, service, order):
     path, boxes = video
     arguments = {
         "compressor": ["--state", folder],
         "trainer": [],
         "detector": ["--resume", path, "--box", ",".join(map(str, boxes[0]))],
     }
-    with Subscriber(TRACKS, Endpoint.parse(tcp)) as tracks:
-        processes = [service(name, "--set", f"run.endpoint={tcp}", *arguments[name]) for name in order]
-        end = until(lambda: next((m for m in iter(lambda: tracks.receive(0.1), None) if isinstance(m, End)), None))
-    assert (end.totals["sent"], end.totals["stored"]) == (len(boxes), len(boxes))
-    assert not end.failed
-    assert [process.wait(30) for process in processes] == [0, 0, 0]
+    processes = [service(name, "--set", f"run.endpoint={tcp}", *arguments[name]) for name in order]
+    assert [process.wait(120) for process in processes] == [0, 0, 0]
     assert CheckpointStore(folder / TREES).load(Settings()).seq == len(boxes)
 
 
