@@ -107,5 +107,6 @@ def _strongest(
     # The rows of A are weighted by row i of `strongest`, and their sum is s_i v_i.
     strongest = vectors.T[: -keep - 1 : -1].copy()
     target = (rows.sum(axis=0) if towards is None else towards).astype(np.float32)
-    strongest[strongest @ (rows @ target) < 0] *= -1
+    with np.errstate(invalid="ignore"):  # OpenBLAS may set the flag for what lies beside the rows
+        strongest[strongest @ (rows @ target) < 0] *= -1
     return energies[: -keep - 1 : -1].clip(min=0), strongest @ rows
