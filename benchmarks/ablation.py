@@ -13,7 +13,7 @@ from typing import Any
 from accuracy import MEANS, accuracy_command, changed, compared, described, difference, means, spread, videos
 from table import Table, publish
 
-from catstream.evaluation.runs import EvaluationRun
+from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
 COLUMNS = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error", "runs changed")

@@ -14,13 +14,13 @@ import numpy as np
 from sequences import sequences
 from table import command
 
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.onepass import evaluate
+from catstream.applications.evaluation.peers import PEERS, Peer
+from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.evaluation.starts import Starts, choose_starts
+from catstream.applications.evaluation.summary import rows_of
 from catstream.errors import SettingsError, VideoError
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import evaluate
-from catstream.evaluation.peers import PEERS, Peer
-from catstream.evaluation.runs import EvaluationRun
-from catstream.evaluation.starts import Starts, choose_starts
-from catstream.evaluation.summary import rows_of
 from catstream.settings import Settings
 
 __all__ = [

@@ -22,14 +22,14 @@ from time import monotonic
 from typing import Self
 
 from catstream.box import Box
+from catstream.client.control import Control, control
 from catstream.errors import ServiceError
-from catstream.job import Job
-from catstream.messages import Answer, End, ObjectPosition, Position, Track, Tracks
+from catstream.messages.kinds import Answer, End, ObjectPosition, Position, Track, Tracks
+from catstream.run.job import Job
 from catstream.services.child import Child
 from catstream.services.loop import PERMANENT_FAILURE
 from catstream.services.start_server import NAMES, start_server
 from catstream.settings import Settings
-from catstream.steering import Control, control
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import CHANNELS, MODELS, RESULTS
 from catstream.wire.endpoint import Endpoint

@@ -26,12 +26,12 @@ from arena import LINKS, Arena, small_disk
 from sequences import FIRST, named, objects, scratch
 from table import Table, command, publish
 
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.metrics import score
 from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.errors import ServiceError
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.metrics import score
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.multi import MultiTracker
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings

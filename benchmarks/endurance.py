@@ -15,8 +15,8 @@ from journey import Journey, draw, travel
 from sequences import named, scratch
 from table import Table, command, publish
 
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.metrics import score
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.metrics import score
 from catstream.settings import Settings
 from catstream.video.writer import VideoWriter
 

@@ -18,25 +18,25 @@ import numpy as np
 from accuracy import many_sequences, videos
 from table import Cell, Table, command, publish
 
+from catstream.applications.evaluation.metrics import overlaps
+from catstream.applications.evaluation.onepass import evaluate
+from catstream.applications.evaluation.report import write_strips
+from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.evaluation.starts import jittered
+from catstream.applications.evaluation.summary import FLIP
 from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.detection.detector import Detector
 from catstream.detection.search import Detection, non_maximum_suppression
 from catstream.errors import CatstreamError
-from catstream.evaluation.metrics import overlaps
-from catstream.evaluation.onepass import evaluate
-from catstream.evaluation.report import write_strips
-from catstream.evaluation.runs import EvaluationRun
-from catstream.evaluation.starts import jittered
-from catstream.evaluation.summary import FLIP
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.heads import APPEARANCE
-from catstream.image import as_bgr
-from catstream.messages import Features, Level
-from catstream.names import UNNAMED
+from catstream.messages.heads import APPEARANCE
+from catstream.messages.kinds import Features, Level
+from catstream.messages.names import UNNAMED
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
+from catstream.video.image import as_bgr
 
 LOST = 0.5  #: success of the best run, below which the sequence counts as lost
 APART, TOGETHER = 0.3, 5  #: overlap at most, and number of successive frames in which two runs have parted

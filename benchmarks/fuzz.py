@@ -26,25 +26,16 @@ from table import Table, command, publish
 COMPILED = [f"catstream.features.{name}" for name in ("cells", "colours", "compiled", "hog")]  # by numba: no bytecode
 
 with atheris.instrument_imports(include=["catstream"], exclude=COMPILED):
-    from catstream import storage
     from catstream.box import Box, Window
     from catstream.compression.forest import Forest
     from catstream.errors import CatstreamError, ProtocolError, RecordingError, ServiceError, SettingsError
-    from catstream.heads import GROUPS
-    from catstream.learned import Learned
-    from catstream.messages import (
-        DetectorState,
-        End,
-        Features,
-        Model,
-        ObjectFeatures,
-        Run,
-        Track,
-        TrainingRows,
-    )
-    from catstream.recording.file import Recording, RecordingWriter
-    from catstream.schema import Array, ByObject, Bytes, Field, Name, Named, OnlyWith, fields
+    from catstream.messages import storage
+    from catstream.messages.heads import GROUPS
+    from catstream.messages.kinds import DetectorState, End, Features, Model, ObjectFeatures, Run, Track, TrainingRows
+    from catstream.messages.schema import Array, ByObject, Bytes, Field, Name, Named, OnlyWith, fields
+    from catstream.run.learned import Learned
     from catstream.settings import Settings
+    from catstream.sinks.recording.file import Recording, RecordingWriter
     from catstream.wire.codec import KINDS, decode, encode, topic_of
     from catstream.wire.keys import Keys, create
 
@@ -181,7 +172,7 @@ def grown() -> Forest:
 
 def narrow(path: Path) -> Learned:
     """Return a saved model whose rows have `WIDTH` columns."""
-    with patch("catstream.learned.row_length", lambda: WIDTH):
+    with patch("catstream.run.learned.row_length", lambda: WIDTH):
         return Learned.load(path)
 
 

@@ -11,15 +11,15 @@ import numpy as np
 from sequences import rendered
 from table import Table, command, publish
 
+from catstream.applications.evaluation.datasets import Sequence
 from catstream.compression.reduce import reduce
-from catstream.evaluation.datasets import Sequence
 from catstream.features.cells import Cells
 from catstream.features.colours import shades
 from catstream.features.hog import grid
 from catstream.features.pyramid import planes_of
-from catstream.messages import Sample
+from catstream.messages.kinds import Sample
+from catstream.messages.names import UNNAMED
 from catstream.multi import MultiTracker
-from catstream.names import UNNAMED
 from catstream.settings import Settings
 from catstream.training.motion_em import learn_motion
 from catstream.training.trainer import Trainer

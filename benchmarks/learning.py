@@ -14,16 +14,16 @@ from groups import CHECK
 from sequences import sequences
 from table import command
 
+from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
-from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
-from catstream.learned import Learned
-from catstream.messages import ObjectFeatures, Track
+from catstream.messages.kinds import ObjectFeatures, Track
+from catstream.numerics.threads import one_thread
+from catstream.run.learned import Learned
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
-from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 
 __all__ = ["chosen", "each", "features", "hits", "learning_command", "model_of", "tracked", "training_frames"]

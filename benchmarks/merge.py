@@ -16,12 +16,12 @@ import numpy as np
 from learning import chosen, each, features, hits, learning_command, model_of, tracked
 from table import Table, publish
 
+from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Box, Window
 from catstream.compression.reduce import energy
 from catstream.detection.search import ScoreMap
-from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
-from catstream.learned import Learned, merge
+from catstream.run.learned import Learned, merge
 from catstream.settings import Settings
 
 _EVERY = 5  # frames from one to the next in which the best window is looked up

@@ -17,14 +17,14 @@ from groups import TUNED
 from sequences import named
 from table import Cell, Table, publish
 
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.compression.tree import REDUCTIONS
 from catstream.detection.objects import Detectors
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.runs import EvaluationRun
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Features, Model
+from catstream.messages.kinds import Features, Model
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 

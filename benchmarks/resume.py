@@ -21,8 +21,8 @@ from table import Table, command, publish
 
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
+from catstream.run.state import TREES
 from catstream.settings import Settings
-from catstream.state import TREES
 from catstream.video.demo import write
 from catstream.video.results import read_tracks
 

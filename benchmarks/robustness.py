@@ -19,12 +19,12 @@ import numpy as np
 from accuracy import available, check_names, many_sequences, videos
 from table import Cell, Table, command, publish
 
-from catstream.evaluation.attributes import attributes_of, read_attributes
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import TRACKERS, evaluate
-from catstream.evaluation.runs import EvaluationRun
-from catstream.evaluation.starts import Start, Starts, jittered, one_pass, spatial, temporal
-from catstream.evaluation.summary import Row, rows_of
+from catstream.applications.evaluation.attributes import attributes_of, read_attributes
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.onepass import TRACKERS, evaluate
+from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.evaluation.starts import Start, Starts, jittered, one_pass, spatial, temporal
+from catstream.applications.evaluation.summary import Row, rows_of
 from catstream.settings import Settings
 
 PARTS = ("ope", "tre", "sre", "jitter")

@@ -8,10 +8,10 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+from catstream.applications.evaluation.datasets import Sequence, find_sequences
+from catstream.applications.loadtest.objects import several
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.evaluation.datasets import Sequence, find_sequences
-from catstream.loadtest.objects import several
 from catstream.video import demo
 from catstream.video.source import open_source
 

@@ -22,16 +22,16 @@ import psutil
 from sequences import named, scratch
 from table import Table, command, publish
 
+from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.compression.tree import CoresetTree
 from catstream.detection.objects import Detectors
 from catstream.errors import ServiceError
-from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
-from catstream.heads import APPEARANCE, GROUPS
-from catstream.messages import End, Features, ObjectFeatures, TrainingRows
-from catstream.names import UNNAMED
+from catstream.messages.heads import APPEARANCE, GROUPS
+from catstream.messages.kinds import End, Features, ObjectFeatures, TrainingRows
+from catstream.messages.names import UNNAMED
 from catstream.services.start import service_command
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer

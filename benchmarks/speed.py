@@ -22,10 +22,10 @@ from sequences import named, rendered, video
 from table import Table, command, publish
 from throughput import MODES, steps
 
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.onepass import evaluate, follow
+from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.box import Box
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import evaluate, follow
-from catstream.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
 TRACKERS = ("catstream", "csrt", "kcf")

@@ -19,8 +19,8 @@ from sequences import rendered, video
 from table import Table, command, publish
 
 import catstream
+from catstream.applications.loadtest.subscribers import Subscribers
 from catstream.errors import SilenceError
-from catstream.loadtest.subscribers import Subscribers
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.wire.endpoint import private_folder

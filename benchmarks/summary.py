@@ -16,10 +16,10 @@ import numpy as np
 from sequences import sequences
 from table import Table, command, publish
 
-from catstream.evaluation.datasets import Sequence
-from catstream.summaries.images import describe
-from catstream.summaries.selection import RowSelection
-from catstream.summaries.subset import choose
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.summaries.images import describe
+from catstream.applications.summaries.selection import RowSelection
+from catstream.applications.summaries.subset import choose
 
 COLUMNS = (
     "collection",

@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from catstream.applications.evaluation.provenance import provenance
 from catstream.errors import CatstreamError
-from catstream.evaluation.provenance import provenance
+from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
-from catstream.threads import one_thread
 
 __all__ = ["Cell", "Table", "command", "publish", "text"]
 

@@ -16,13 +16,13 @@ from journey import travel
 from sequences import named, rendered, video
 from table import Table, command, publish
 
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.metrics import score
 from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.metrics import score
 from catstream.features.pyramid import Pyramid
-from catstream.names import UNNAMED
+from catstream.messages.names import UNNAMED
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 

@@ -15,8 +15,8 @@ from table import Table, command, publish
 from catstream.box import Box
 from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
-from catstream.messages import End, Features, Position
-from catstream.names import UNNAMED
+from catstream.messages.kinds import End, Features, Position
+from catstream.messages.names import UNNAMED
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.wire.acknowledged import Receiver, Sender

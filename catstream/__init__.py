@@ -17,20 +17,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from catstream.adapters import to_supervision
+    from catstream.applications.finding.search import find
+    from catstream.applications.finding.sightings import Sighting
+    from catstream.applications.summaries.images import ImageSummary, summarize
     from catstream.box import Box
+    from catstream.client.control import Control, control
+    from catstream.client.subscription import Subscription, subscribe
     from catstream.errors import CatstreamError
-    from catstream.finding.search import find
-    from catstream.finding.sightings import Sighting
     from catstream.fleet.fleet import Fleet
-    from catstream.learned import Learned, merge
-    from catstream.messages import Track
+    from catstream.messages.kinds import Track
     from catstream.multi import MultiTracker
     from catstream.pipeline import Pipeline
+    from catstream.run.learned import Learned, merge
     from catstream.settings import Settings
-    from catstream.steering import Control, control
-    from catstream.subscription import Subscription, subscribe
-    from catstream.summaries.images import ImageSummary, summarize
+    from catstream.sinks.adapters import to_supervision
     from catstream.tracker import Tracker
 
 __all__ = [
@@ -61,23 +61,23 @@ __version__ = "0.1.0"
 _HOMES = {
     "Box": "box",
     "CatstreamError": "errors",
-    "Control": "steering",
+    "Control": "client.control",
     "Fleet": "fleet.fleet",
-    "ImageSummary": "summaries.images",
-    "Learned": "learned",
+    "ImageSummary": "applications.summaries.images",
+    "Learned": "run.learned",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "settings",
-    "Sighting": "finding.sightings",
-    "Subscription": "subscription",
-    "Track": "messages",
+    "Sighting": "applications.finding.sightings",
+    "Subscription": "client.subscription",
+    "Track": "messages.kinds",
     "Tracker": "tracker",
-    "control": "steering",
-    "find": "finding.search",
-    "merge": "learned",
-    "subscribe": "subscription",
-    "summarize": "summaries.images",
-    "to_supervision": "adapters",
+    "control": "client.control",
+    "find": "applications.finding.search",
+    "merge": "run.learned",
+    "subscribe": "client.subscription",
+    "summarize": "applications.summaries.images",
+    "to_supervision": "sinks.adapters",
 }
 
 

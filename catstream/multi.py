@@ -18,7 +18,6 @@ from typing import Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
-from catstream import storage
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
@@ -28,16 +27,17 @@ from catstream.detection.objects import Detectors, prepare
 from catstream.errors import BoxError, FrameError, MissingFileError, ObjectError, ProtocolError, ServiceError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
-from catstream.image import as_bgr
-from catstream.learned import Learned
-from catstream.messages import Features, Model, Track, Tracks
-from catstream.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
-from catstream.packing import pack, unpack
+from catstream.messages import storage
+from catstream.messages.checks import check_message
+from catstream.messages.kinds import Features, Model, Track, Tracks
+from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
+from catstream.messages.packing import pack, unpack
+from catstream.messages.storage import Arrays, Metadata, with_prefix
+from catstream.numerics.threads import one_thread
+from catstream.run.learned import Learned
 from catstream.settings import Settings
-from catstream.storage import Arrays, Metadata, with_prefix
-from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
-from catstream.wire.checks import check_message
+from catstream.video.image import as_bgr
 
 __all__ = ["MultiTracker"]
 

@@ -22,14 +22,14 @@ from pathlib import Path
 from typing import Self
 
 from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
-from catstream.job import Job, Results
-from catstream.learned import Learned, check_sizes
-from catstream.messages import End, Health, ObjectPosition, Position, Track, Tracks
-from catstream.names import UNNAMED, Boxes, boxes_by_name, check_boxes, check_name
+from catstream.messages.kinds import End, Health, ObjectPosition, Position, Track, Tracks
+from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_boxes, check_name
+from catstream.run.job import Job, Results
+from catstream.run.learned import Learned, check_sizes
+from catstream.run.state import began, learned, locked, position
 from catstream.services.start_server import start_server, start_server_lines
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.state import began, learned, locked, position
 from catstream.video.frames import without_password
 from catstream.video.source import ALL_FRAMES, is_live, open_source, without_scheme
 from catstream.wire.acknowledged import Receiver

@@ -10,10 +10,10 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.errors import ObjectError
-from catstream.learned import Learned
-from catstream.messages import Track
+from catstream.messages.kinds import Track
+from catstream.messages.names import UNNAMED
 from catstream.multi import MultiTracker
-from catstream.names import UNNAMED
+from catstream.run.learned import Learned
 from catstream.settings import Settings
 
 __all__ = ["Tracker"]

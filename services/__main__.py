@@ -1,12 +1,12 @@
 """`python -P -m catstream.services NAME`: runs one process of a pipeline.
 
 Each process can be started by hand, in any order; `catstream track` starts them all. A process works on a
-`catstream.job.Job`: the options of a command define it, or the parent process passes a file that contains it.
+`catstream.run.job.Job`: the options of a command define it, or the parent process passes a file that contains it.
 """
 
 from __future__ import annotations
 
-from catstream.threads import limit_process
+from catstream.numerics.threads import limit_process
 
 limit_process()  # before anything imports numpy
 
@@ -17,7 +17,7 @@ from typing import Any
 import click
 
 from catstream.errors import CatstreamError
-from catstream.job import Job
+from catstream.run.job import Job
 from catstream.services.loop import Parent, log_as, run, run_child
 from catstream.services.options import with_model, with_object, with_part, with_settings
 

@@ -14,9 +14,9 @@ from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, ObjectError
 from catstream.features.pyramid import Pyramid
-from catstream.learned import Learned, check_sizes
-from catstream.messages import Answer, Command
-from catstream.names import UNNAMED, check_count, check_name, listed
+from catstream.messages.kinds import Answer, Command
+from catstream.messages.names import UNNAMED, check_count, check_name, listed
+from catstream.run.learned import Learned, check_sizes
 from catstream.services.desired import DesiredState
 from catstream.services.model_files import ModelFiles
 

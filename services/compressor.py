@@ -6,19 +6,19 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from catstream import storage
 from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
-from catstream.job import Job
-from catstream.learned import begun
-from catstream.messages import End, Features
-from catstream.recording.file import RecordingWriter
+from catstream.messages import storage
+from catstream.messages.kinds import End, Features
+from catstream.run.job import Job
+from catstream.run.learned import begun
+from catstream.run.state import TREES, locked
 from catstream.services.loop import Process
 from catstream.services.progress import Progress
 from catstream.services.recorder import Recorder
 from catstream.services.saved_models import SavedModels
-from catstream.state import TREES, locked
+from catstream.sinks.recording.file import RecordingWriter
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import FEATURES, SAMPLES
 from catstream.wire.newest import Publisher

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from catstream.detection.detector import Result
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Answer, Command
+from catstream.messages.kinds import Answer, Command
 from catstream.services.commands import CommandHandler
 from catstream.services.desired import DesiredState
 from catstream.wire.channels import CONTROL

@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
-from catstream import storage
 from catstream.box import Box
 from catstream.errors import ProtocolError
-from catstream.names import check_name
+from catstream.messages import storage
+from catstream.messages.names import check_name
 
 __all__ = ["DesiredObject", "DesiredState", "PastObject"]
 

@@ -16,14 +16,16 @@ from typing import TypeVar
 
 import cv2
 
-from catstream import ridge, storage
 from catstream.detection import objects
 from catstream.detection.detector import Detector, Result
 from catstream.detection.objects import Detectors
 from catstream.errors import ProtocolError, VideoError
 from catstream.features.pyramid import Pyramid
-from catstream.learned import Learned
-from catstream.messages import End, Features, Model, Position, Tracks
+from catstream.messages import storage
+from catstream.messages.kinds import End, Features, Model, Position, Tracks
+from catstream.numerics import ridge
+from catstream.run.learned import Learned
+from catstream.run.state import SEARCHED
 from catstream.services.commands import CommandHandler
 from catstream.services.control import CommandChannel
 from catstream.services.delivery import Step, next_step
@@ -33,7 +35,6 @@ from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import DataSender, Outputs
 from catstream.services.pacing import Awaited, awaited
 from catstream.services.resume import agree, start
-from catstream.state import SEARCHED
 from catstream.video import source
 from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password

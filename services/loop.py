@@ -15,8 +15,8 @@ from secrets import token_hex
 from typing import NamedTuple
 
 from catstream.errors import CatstreamError, StreamRewoundError
-from catstream.job import Job
-from catstream.messages import Health, Run
+from catstream.messages.kinds import Health, Run
+from catstream.run.job import Job
 from catstream.services.process_title import set_process_title
 from catstream.services.watchdog import PATIENCE, Watchdog
 from catstream.wire.channels import HEALTH

@@ -6,9 +6,9 @@ import logging
 from hashlib import blake2b
 from pathlib import Path
 
-from catstream import storage
 from catstream.errors import CatstreamError
-from catstream.learned import Learned
+from catstream.messages import storage
+from catstream.run.learned import Learned
 
 __all__ = ["ModelFiles"]
 

@@ -13,7 +13,7 @@ from typing import TypeVar, cast
 import click
 
 from catstream.errors import ObjectError
-from catstream.names import boxes_by_name, split_name
+from catstream.messages.names import boxes_by_name, split_name
 from catstream.settings import PRESETS, Settings
 
 __all__ = ["named", "with_given", "with_model", "with_object", "with_part", "with_reading", "with_settings"]

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from catstream.messages import End, Features, Run, Track, Tracks
+from catstream.messages.kinds import End, Features, Run, Track, Tracks
 from catstream.services.loop import Process
 from catstream.services.previews import Previews
 from catstream.wire.acknowledged import Sender

@@ -7,7 +7,7 @@ from time import monotonic
 import numpy as np
 
 from catstream.box import Box
-from catstream.messages import Preview
+from catstream.messages.kinds import Preview
 from catstream.video.preview import jpeg
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.endpoint import Endpoint

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from catstream.messages import End, Position
+from catstream.messages.kinds import End, Position
 
 __all__ = ["Progress"]
 

@@ -6,8 +6,8 @@ from contextlib import ExitStack
 from typing import Self
 
 from catstream.errors import RecordingError
-from catstream.messages import End
-from catstream.recording.file import Recorded, RecordingWriter
+from catstream.messages.kinds import End
+from catstream.sinks.recording.file import Recorded, RecordingWriter
 from catstream.wire.channels import HEALTH, MODELS, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from catstream.box import Box
-from catstream.messages import DetectorState, Model, ObjectPosition, Position
+from catstream.messages.kinds import DetectorState, Model, ObjectPosition, Position
 from catstream.services.desired import DesiredObject, DesiredState
 
 __all__ = ["Start", "agree", "start"]

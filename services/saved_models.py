@@ -7,8 +7,8 @@ from time import monotonic
 
 from catstream.compression.compressor import Compressor
 from catstream.errors import ServiceError
-from catstream.learned import Learned
-from catstream.messages import SavedModel
+from catstream.messages.kinds import SavedModel
+from catstream.run.learned import Learned
 from catstream.settings import Settings
 from catstream.wire.channels import SAVED_MODELS
 from catstream.wire.endpoint import Endpoint

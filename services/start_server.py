@@ -42,10 +42,10 @@ from typing import BinaryIO, cast
 from weakref import WeakSet
 
 from catstream.errors import ServiceError
+from catstream.numerics.threads import limit_process
 from catstream.services.process_log import ProcessLog
 from catstream.services.process_title import set_process_title
 from catstream.services.start import environment, import_path, python_command, service_command
-from catstream.threads import limit_process
 
 __all__ = ["NAMES", "Request", "StartServer", "StartedProcess", "main", "start_server", "start_server_lines"]
 

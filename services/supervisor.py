@@ -13,7 +13,7 @@ from pathlib import Path
 from secrets import token_hex
 
 from catstream.errors import ServiceError
-from catstream.job import Job
+from catstream.run.job import Job
 from catstream.services.child import Child
 from catstream.services.loop import PERMANENT_FAILURE, SOURCE_FAILED
 from catstream.services.start_server import NAMES

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from catstream import ridge
-from catstream.messages import End
+from catstream.messages.kinds import End
+from catstream.numerics import ridge
 from catstream.services.loop import Process
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES

@@ -23,7 +23,7 @@ import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
 
 from catstream.box import Box
-from catstream.threads import one_thread
+from catstream.numerics.threads import one_thread
 from catstream.video.demo import write
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder

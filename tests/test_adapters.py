@@ -10,7 +10,7 @@ import pytest
 
 import catstream
 from catstream.box import Box
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 
 needs_supervision = pytest.mark.skipif(
     importlib.util.find_spec("supervision") is None,

@@ -11,26 +11,22 @@ from pathlib import Path
 
 import pytest
 
-from catstream.extras import EXTRAS
+from catstream.errors import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 
 #: From the lowest. A module imports only from lower levels than its own, and from its own folder.
 LEVELS = [
-    {"arrays", "errors", "threads"},
-    {"box", "heads", "colours", "image", "parallel", "schema", "storage", "extras"},
-    {"messages", "names", "packing", "settings", "ridge", "kalman", "html"},
-    {"features"},
+    {"errors", "numerics"},
+    {"box", "settings"},
+    {"messages", "features"},
     {"paper"},
-    {"detection", "compression", "training", "wire", "video", "adapters", "job"},
-    {"learned", "registry"},
-    {"multi", "subscription", "steering", "recording", "sinks", "state", "finding"},
-    {"tracker", "summaries"},
-    {"services", "web"},
+    {"detection", "compression", "training", "wire", "video"},
+    {"run"},
+    {"multi", "client", "sinks"},
+    {"tracker", "services", "web"},
     {"pipeline"},
-    {"fleet"},
-    {"evaluation"},
-    {"loadtest"},
+    {"applications", "fleet"},
     {"cli"},
 ]
 
@@ -38,31 +34,35 @@ LEVELS = [
 IMPORTERS = {
     "numpy": ["catstream", "services"],
     "scipy": [
-        *("catstream/ridge.py", "catstream/compression/reduce.py", "catstream/evaluation/multiple.py"),
-        "catstream/threads.py",  # its BLAS is limited, too
+        *(
+            "catstream/numerics/ridge.py",
+            "catstream/compression/reduce.py",
+            "catstream/applications/evaluation/multiple.py",
+        ),
+        "catstream/numerics/threads.py",  # its BLAS is limited, too
     ],
     "cv2": [
         "catstream/features",
         "catstream/detection",
         "catstream/paper",
         "catstream/video",
-        "catstream/summaries/images.py",
-        "catstream/threads.py",
-        "catstream/evaluation/peers.py",
+        "catstream/applications/summaries/images.py",
+        "catstream/numerics/threads.py",
+        "catstream/applications/evaluation/peers.py",
         "services/detector.py",
     ],
-    "filterpy": ["catstream/kalman.py"],
+    "filterpy": ["catstream/numerics/kalman.py"],
     "numba": ["catstream/features/compiler.py"],
     "llvmlite": ["catstream/features/compiled.py", "catstream/features/compiler.py"],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
-    "filelock": ["catstream/storage.py"],
-    "safetensors": ["catstream/storage.py"],
+    "filelock": ["catstream/messages/storage.py"],
+    "safetensors": ["catstream/messages/storage.py"],
     "fsspec": ["catstream/fleet/objects.py"],
     "s3fs": ["catstream/fleet/objects.py"],  # fsspec imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/parquet.py"],
-    "supervision": ["catstream/adapters.py"],
-    "motmetrics": ["catstream/evaluation/multiple.py"],
+    "supervision": ["catstream/sinks/adapters.py"],
+    "motmetrics": ["catstream/applications/evaluation/multiple.py"],
     "av": ["catstream/video"],
     "zmq": [
         "catstream/wire/context.py",
@@ -74,12 +74,12 @@ IMPORTERS = {
         "catstream/wire/zap.py",
         "catstream/wire/keys.py",
     ],
-    "mcap": ["catstream/recording/container.py"],
+    "mcap": ["catstream/sinks/recording/container.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream/wire/codec.py", "catstream/settings.py"],
-    "threadpoolctl": ["catstream/threads.py", "catstream/evaluation/provenance.py"],
-    "psutil": ["catstream/loadtest/usage.py"],
-    "hdrh": ["catstream/loadtest/latencies.py"],
+    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/provenance.py"],
+    "psutil": ["catstream/applications/loadtest/usage.py"],
+    "hdrh": ["catstream/applications/loadtest/latencies.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],
     "uvicorn": ["catstream/web/server.py", "catstream/web/connections.py"],

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from catstream.colours import PALETTE, Colours, rgb
+from catstream.video.palette import PALETTE, Colours, rgb
 
 #: Linear red, green, blue as people of each kind of vision see them (Machado and others, 2009, severity 1).
 VISIONS = {

@@ -16,12 +16,12 @@ import yaml
 
 from catstream.box import Box
 from catstream.cli import group
-from catstream.messages import Health
+from catstream.client.subscription import subscribe
+from catstream.messages.kinds import Health
 from catstream.services.__main__ import main
 from catstream.services.start import environment, service_command
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
-from catstream.subscription import subscribe
 from catstream.web.app import pipeline_site
 from catstream.web.server import Server
 from catstream.wire import keys

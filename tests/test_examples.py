@@ -17,7 +17,7 @@ import pytest
 
 import catstream
 from catstream.errors import SilenceError
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.wire.keys import create

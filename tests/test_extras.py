@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.errors import MissingExtraError
-from catstream.extras import EXTRAS, install_command, require_extra
+from catstream.errors import EXTRAS, MissingExtraError, install_command, require_extra
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 OPTIONAL = PROJECT["optional-dependencies"]
@@ -25,7 +24,7 @@ import catstream
 catstream.Tracker, catstream.Pipeline, catstream.subscribe, catstream.control
 from catstream.cli import VERBS, verb
 from catstream.services.__main__ import main
-import catstream.evaluation.runs, catstream.evaluation.report
+import catstream.applications.evaluation.runs, catstream.applications.evaluation.report
 for name in VERBS:
     verb(name)
 """
@@ -35,7 +34,9 @@ def test_tracking_and_the_help_of_every_command_need_no_extra():
     subprocess.run([sys.executable, "-P", "-c", BASE], check=True)
 
 
-@pytest.mark.parametrize(("package", "extra"), [("catstream.web", "view"), ("catstream.loadtest", "loadtest")])
+@pytest.mark.parametrize(
+    ("package", "extra"), [("catstream.web", "view"), ("catstream.applications.loadtest", "loadtest")]
+)
 def test_a_missing_extra_is_an_error_with_the_install_command(monkeypatch, package, extra):
     monkeypatch.setitem(sys.modules, EXTRAS[extra][1][0], None)
     for name in [name for name in sys.modules if name == package or name.startswith(f"{package}.")]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catstream.errors import FrameError
-from catstream.image import as_bgr
+from catstream.video.image import as_bgr
 
 
 @pytest.fixture

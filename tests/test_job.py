@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from catstream.box import Box
 from catstream.errors import ObjectError, ProtocolError, ServiceError, SettingsError
-from catstream.job import Job, Results
+from catstream.run.job import Job, Results
 from catstream.settings import Settings
 
 JOB = Job(

@@ -9,7 +9,7 @@ FILTERED = """
 import sys
 import numpy as np
 {first}
-from catstream.kalman import constant_velocity
+from catstream.numerics.kalman import constant_velocity
 
 kalman = constant_velocity(np.array([1.0, 2, 3, 4]), np.eye(4), np.eye(4), np.eye(2))
 kalman.predict()

@@ -10,15 +10,15 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from catstream import storage
 from catstream.box import Box, Window
 from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import energy
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
-from catstream.heads import APPEARANCE, EXTENT, TREES
-from catstream.learned import Learned, check_sizes, merge
-from catstream.messages import DetectorState, ObjectFeatures, TrainingRows
+from catstream.messages import storage
+from catstream.messages.heads import APPEARANCE, EXTENT, TREES
+from catstream.messages.kinds import DetectorState, ObjectFeatures, TrainingRows
+from catstream.run.learned import Learned, check_sizes, merge
 from catstream.settings import Settings
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
@@ -141,7 +141,7 @@ def test_a_file_of_another_kind_is_an_error(messages, tmp_path):
 
 def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
     learned.save(tmp_path / "one")
-    monkeypatch.setattr("catstream.learned.row_length", lambda: WIDTH + 1)
+    monkeypatch.setattr("catstream.run.learned.row_length", lambda: WIDTH + 1)
     with pytest.raises(ProtocolError, match=f"{WIDTH} features of a window, this catstream has {WIDTH + 1}"):
         Learned.load(tmp_path / "one")
 

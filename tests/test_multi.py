@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catstream import parallel, storage
 from catstream.box import Box
 from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, SettingsError
+from catstream.messages import storage
 from catstream.multi import MultiTracker
+from catstream.numerics import parallel
 from catstream.settings import Settings
 from catstream.tracker import Tracker
 

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from catstream import parallel
-from catstream.parallel import Scratch, in_parallel
+from catstream.numerics import parallel
+from catstream.numerics.parallel import Scratch, in_parallel
 
 
 @pytest.fixture(params=[1, 3], ids="{} cores".format)

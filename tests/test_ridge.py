@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from catstream import ridge
+from catstream.numerics import ridge
 
 
 def test_between_is_the_solution_of_the_large_system(rng):

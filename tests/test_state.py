@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from catstream import storage
 from catstream.errors import ServiceError
-from catstream.state import files, locked, restore
+from catstream.messages import storage
+from catstream.run.state import files, locked, restore
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_arrays_of_each_type_are_read_as_they_were_written(tmp_path, rng):
 
 def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path):
     script = (
-        "import pathlib, time\nfrom catstream.state import locked\n"
+        "import pathlib, time\nfrom catstream.run.state import locked\n"
         f"with locked(pathlib.Path({str(tmp_path)!r})):\n    print(flush=True)\n    time.sleep(600)"
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as owner:

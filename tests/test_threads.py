@@ -13,7 +13,7 @@ import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from catstream.threads import _VARIABLES, _Libraries, one_thread
+from catstream.numerics.threads import _VARIABLES, _Libraries, one_thread
 
 
 def counts():
@@ -25,7 +25,7 @@ def counts():
 def libraries(monkeypatch):
     """As in a user's program with two threads: nobody else in this process holds it at one."""
     own = _Libraries()
-    monkeypatch.setattr("catstream.threads._libraries", own)
+    monkeypatch.setattr("catstream.numerics.threads._libraries", own)
     with threadpool_limits(2):
         if set(counts().values()) != {2}:
             pytest.skip("this machine has one core, or BLAS without threads")
@@ -34,7 +34,7 @@ def libraries(monkeypatch):
 
 FIRST_USE = """
 from threadpoolctl import threadpool_info
-from catstream.threads import one_thread
+from catstream.numerics.threads import one_thread
 with one_thread():
     import numpy, scipy.linalg
     print({library["num_threads"] for library in threadpool_info()})

@@ -10,9 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from catstream import storage
 from catstream.box import Box
 from catstream.errors import BoxError, FrameError, ProtocolError, ServiceError, SettingsError
+from catstream.messages import storage
 from catstream.settings import PRESETS, Settings
 from catstream.tracker import Tracker
 

@@ -28,9 +28,9 @@ from learning import each, features, hits, learning_command, model_of, tracked
 from sequences import rendered, scratch, sequences
 from table import Table, publish
 
-from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.applications.evaluation.datasets import Sequence, find_sequences
 from catstream.fleet.merge import merge_models
-from catstream.learned import Learned
+from catstream.run.learned import Learned
 from catstream.settings import Settings
 from catstream.video.sprite import cut_out_dahlia, load_photograph
 from catstream.video.writer import VideoWriter

@@ -32,16 +32,16 @@ from chaos import fingerprint, quantiles, undisturbed
 from table import Table, command, publish
 
 from catstream.box import Box
+from catstream.client.registry import Registry
 from catstream.compression.forest import Forest
 from catstream.errors import CatstreamError
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.local import LocalCluster
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.messages import FleetStatus, StreamStatus
-from catstream.registry import Registry
+from catstream.messages.kinds import FleetStatus, StreamStatus
+from catstream.run.state import restore
 from catstream.settings import Settings
-from catstream.state import restore
 from catstream.video import demo
 from catstream.video.live_demo import first_box
 

@@ -22,11 +22,11 @@ from learning import features, model_of
 from sequences import rendered
 from table import Table, command, publish
 
+from catstream.client.registry import Registry, RegistryServer
 from catstream.fleet.life import Node, Seen, Wanted, event
 from catstream.fleet.store import Store
-from catstream.learned import merge
-from catstream.messages import FleetStatus, StreamStatus
-from catstream.registry import Registry, RegistryServer
+from catstream.messages.kinds import FleetStatus, StreamStatus
+from catstream.run.learned import merge
 from catstream.settings import Settings
 
 STREAMS = (10, 100, 1000, 10_000)

@@ -12,19 +12,19 @@ from unittest.mock import patch
 import numpy as np
 from accuracy import starts_of
 
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.evaluation.starts import Start
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.detection.objects import Detectors
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.runs import EvaluationRun
-from catstream.evaluation.starts import Start
 from catstream.features.pyramid import Pyramid
-from catstream.names import UNNAMED
+from catstream.messages.names import UNNAMED
+from catstream.numerics.threads import one_thread
 from catstream.paper.scm import SparseCollaborativeModel
 from catstream.services.start import SPAWN
 from catstream.settings import Settings
-from catstream.threads import one_thread
 from catstream.training.trainer import Trainer
 
 __all__ = ["Recipe", "follow_all"]

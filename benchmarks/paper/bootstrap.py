@@ -19,8 +19,8 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 from accuracy import MEANS, accuracy_command, compared, difference, means, starts_of, videos
 from table import Table, publish
 
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.starts import Start
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.starts import Start
 from catstream.settings import Settings
 
 #: Bootstrap -> its settings. SCM follows all n frames where each gives one row: no copies.

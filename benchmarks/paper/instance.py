@@ -34,17 +34,17 @@ from groups import CHECK
 from sequences import scratch, sequences
 from table import Table, command, publish
 
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.finding.files import File
+from catstream.applications.finding.scan import Scan, Seen
+from catstream.applications.finding.search import Search
 from catstream.box import Box
 from catstream.detection.search import non_maximum_suppression
-from catstream.evaluation.datasets import Sequence
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
-from catstream.finding.files import File
-from catstream.finding.scan import Scan, Seen
-from catstream.finding.search import Search
-from catstream.learned import Learned
+from catstream.numerics.threads import one_thread
+from catstream.run.learned import Learned
 from catstream.services.start import SPAWN
-from catstream.threads import one_thread
 from catstream.tracker import Tracker
 from catstream.video import demo
 from catstream.video.source import open_source

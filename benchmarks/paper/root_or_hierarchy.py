@@ -19,7 +19,7 @@ from table import Table, publish
 
 from catstream.compression import sampling
 from catstream.compression.tree import CoresetTree
-from catstream.messages import Summary
+from catstream.messages.kinds import Summary
 from catstream.settings import PRESETS, Settings
 
 #: Training set -> success and precision in the paper.

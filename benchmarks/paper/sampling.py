@@ -23,7 +23,7 @@ from assembled import Recipe, follow_all
 from table import Table, publish
 
 from catstream.compression.tree import CoresetTree
-from catstream.messages import Summary
+from catstream.messages.kinds import Summary
 from catstream.settings import PRESETS, Settings
 
 SHARES = (0.25, 0.375, 0.5, 0.625, 0.75)

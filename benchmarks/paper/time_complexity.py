@@ -20,10 +20,10 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 from sequences import named
 from table import Table, command, publish
 
+from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Window
 from catstream.compression.tree import CoresetTree
 from catstream.detection.teacher import affine_copies
-from catstream.evaluation.datasets import Sequence
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.paper.one_class import one_class

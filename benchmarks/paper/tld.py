@@ -19,9 +19,9 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 from accuracy import accuracy_command, compared, videos
 from table import Table, publish
 
-from catstream.evaluation.metrics import score
-from catstream.evaluation.runs import EvaluationRun
-from catstream.evaluation.summary import rows_of
+from catstream.applications.evaluation.metrics import score
+from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.evaluation.summary import rows_of
 from catstream.settings import PRESETS, Settings
 
 #: Tracker -> success in the paper: mean of ten videos, and Panda.

@@ -8,8 +8,8 @@ from functools import wraps
 import click
 from rich.console import Console
 
-from catstream.registry import address_of
-from catstream.subscription import wait_until_running
+from catstream.client.registry import address_of
+from catstream.client.subscription import wait_until_running
 from catstream.wire.endpoint import Endpoint
 
 __all__ = ["wait_for_pipeline", "with_endpoint", "with_wait"]

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from catstream.box import Box
 from catstream.cli.track import track
-from catstream.extras import require_extra
+from catstream.errors import require_extra
 
 __all__ = ["demo"]
 
@@ -68,7 +68,7 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool, live
 
 def _one(output: Path, frames: int | None, render_only: bool) -> None:
     """The demo with one object."""
-    from catstream.evaluation.metrics import score
+    from catstream.applications.evaluation.metrics import score
     from catstream.video.demo import FRAMES, write
 
     console, frames = Console(), frames or FRAMES
@@ -88,7 +88,7 @@ def _one(output: Path, frames: int | None, render_only: bool) -> None:
 
 def _several(output: Path, objects: int, frames: int | None, render_only: bool) -> None:
     """The demo with several objects."""
-    from catstream.evaluation.multiple import score_multiple
+    from catstream.applications.evaluation.multiple import score_multiple
     from catstream.video.crowd import FRAMES, write
     from catstream.video.results import read_tracks
 

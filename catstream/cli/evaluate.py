@@ -21,8 +21,8 @@ from catstream.services.options import with_settings
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
-    from catstream.evaluation.runs import EvaluationRun
-    from catstream.evaluation.summary import Row
+    from catstream.applications.evaluation.runs import EvaluationRun
+    from catstream.applications.evaluation.summary import Row
 
 __all__ = ["evaluate"]
 
@@ -103,12 +103,12 @@ def evaluate(
     """
     # Imported here so that --help and the other commands start faster.
     with interruptible():
-        from catstream.evaluation.attributes import attributes_of, read_attributes
-        from catstream.evaluation.datasets import find_sequences
-        from catstream.evaluation.onepass import evaluate as run_all
-        from catstream.evaluation.report import write_report
-        from catstream.evaluation.starts import choose_starts
-        from catstream.evaluation.summary import describe_flips, mean_of, rows_of, to_json
+        from catstream.applications.evaluation.attributes import attributes_of, read_attributes
+        from catstream.applications.evaluation.datasets import find_sequences
+        from catstream.applications.evaluation.onepass import evaluate as run_all
+        from catstream.applications.evaluation.report import write_report
+        from catstream.applications.evaluation.starts import choose_starts
+        from catstream.applications.evaluation.summary import describe_flips, mean_of, rows_of, to_json
 
     if (starts is not None) + shifts + (jitter is not None) > 1:
         raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")

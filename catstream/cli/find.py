@@ -17,13 +17,13 @@ from rich.text import Text
 from catstream.cli import INTERRUPTED, interruptible
 from catstream.cli.interrupts import Interrupts
 from catstream.errors import CatstreamError, VideoError
+from catstream.numerics.threads import one_thread
 from catstream.settings import RunSettings
-from catstream.threads import one_thread
 
 if TYPE_CHECKING:
-    from catstream.finding.files import File
-    from catstream.finding.log import FileResult, SearchLog
-    from catstream.finding.search import Search
+    from catstream.applications.finding.files import File
+    from catstream.applications.finding.log import FileResult, SearchLog
+    from catstream.applications.finding.search import Search
 
 __all__ = ["find"]
 
@@ -137,11 +137,11 @@ def find(
     """
     # Imported here so that --help and the other commands start faster.
     with interruptible():
-        from catstream.finding.files import find_files
-        from catstream.finding.log import SearchLog
-        from catstream.finding.report import write_report
-        from catstream.finding.search import Search, load_models
-        from catstream.finding.tables import write_tables
+        from catstream.applications.finding.files import find_files
+        from catstream.applications.finding.log import SearchLog
+        from catstream.applications.finding.report import write_report
+        from catstream.applications.finding.search import Search, load_models
+        from catstream.applications.finding.tables import write_tables
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
     search = Search(load_models(models), reading, threshold, every, sizes)
@@ -250,7 +250,7 @@ class _Line(ProgressColumn):
 
 def _print(results: list[FileResult], report: Path) -> None:
     """Print the best intervals, and the path of the report."""
-    from catstream.html.timeline import clock
+    from catstream.applications.html.timeline import clock
 
     console = Console(width=None if sys.stdout.isatty() else 120)
     intervals = sorted((each for result in results for each in result.intervals), key=lambda each: -each.best.score)

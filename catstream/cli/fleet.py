@@ -18,9 +18,9 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
-from catstream.messages import FleetStatus, StreamStatus
-from catstream.names import split_name
-from catstream.registry import Registry
+from catstream.client.registry import Registry
+from catstream.messages.kinds import FleetStatus, StreamStatus
+from catstream.messages.names import split_name
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from catstream import storage
 from catstream.cli.fleet import with_fleet
 from catstream.errors import ServiceError
-from catstream.names import UNNAMED
+from catstream.messages import storage
+from catstream.messages.names import UNNAMED
 
 __all__ = ["merge"]
 

@@ -21,9 +21,9 @@ from catstream.services.options import with_settings
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
-    from catstream.loadtest.limits import Limit
-    from catstream.loadtest.load_test import Step
-    from catstream.loadtest.run import Result
+    from catstream.applications.loadtest.limits import Limit
+    from catstream.applications.loadtest.load_test import Step
+    from catstream.applications.loadtest.run import Result
 
 __all__ = ["loadtest"]
 
@@ -123,12 +123,12 @@ def loadtest(
       catstream loadtest --find-limit --size 320x240
     """
     # Imported here so that --help and the other verbs start faster.
-    from catstream.loadtest.figures import to_json
-    from catstream.loadtest.limits import Limit
-    from catstream.loadtest.load_test import run_load_test
-    from catstream.loadtest.plan import Plan
-    from catstream.loadtest.report import write_report
-    from catstream.loadtest.run import Status
+    from catstream.applications.loadtest.figures import to_json
+    from catstream.applications.loadtest.limits import Limit
+    from catstream.applications.loadtest.load_test import run_load_test
+    from catstream.applications.loadtest.plan import Plan
+    from catstream.applications.loadtest.report import write_report
+    from catstream.applications.loadtest.run import Status
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     plan = Plan(streams, objects, subscribers, slow, rate, duration, size, chaos, settings)
@@ -188,7 +188,7 @@ def _step(step: Step) -> str:
 
 
 def _print(console: Console, result: Result, limits: list[Limit]) -> None:
-    from catstream.loadtest.usage import summary
+    from catstream.applications.loadtest.usage import summary
 
     plan = result.plan
     console.print(
@@ -227,7 +227,7 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
 
 
 def _streams(result: Result) -> Table:
-    from catstream.loadtest.latencies import PERCENTILES
+    from catstream.applications.loadtest.latencies import PERCENTILES
 
     heads = ("stream", "frames/s", "skipped", *PERCENTILES, "model p50", "p99", "lag", "not stored", "success")
     rows: list[tuple[object, ...]] = []

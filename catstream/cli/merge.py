@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from catstream.errors import ServiceError
-from catstream.learned import Learned
-from catstream.learned import merge as merged
+from catstream.run.learned import Learned
+from catstream.run.learned import merge as merged
 
 __all__ = ["merge"]
 

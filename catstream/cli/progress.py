@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
-from catstream.messages import Track
-from catstream.names import UNNAMED, counted
+from catstream.messages.kinds import Track
+from catstream.messages.names import UNNAMED, counted
 from catstream.pipeline import Pipeline
 from catstream.sinks.sink import STDOUT
 

@@ -11,11 +11,11 @@ import click
 from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
+from catstream.client.registry import locate
 from catstream.errors import RecordingError
-from catstream.messages import End, Features, Run
-from catstream.recording.file import Recording, RecordingWriter
-from catstream.registry import locate
+from catstream.messages.kinds import End, Features, Run
 from catstream.services.recorder import Recorder
+from catstream.sinks.recording.file import Recording, RecordingWriter
 from catstream.wire.announced import Announcement
 from catstream.wire.channels import TRAINING
 from catstream.wire.endpoint import Endpoint

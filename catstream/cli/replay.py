@@ -13,10 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Column, Table
 
 from catstream.errors import RecordingError
-from catstream.messages import Features, Model, Run, Track
-from catstream.recording.file import Recording, RecordingWriter
-from catstream.recording.learning import Prequential, Retraining, learn, prequential_of_recorded, require_features
-from catstream.recording.player import Player
+from catstream.messages.kinds import Features, Model, Run, Track
+from catstream.sinks.recording.file import Recording, RecordingWriter
+from catstream.sinks.recording.learning import Prequential, Retraining, learn, prequential_of_recorded, require_features
+from catstream.sinks.recording.player import Player
 from catstream.wire.endpoint import Endpoint, meeting_place, private_folder
 
 __all__ = ["replay"]

@@ -10,12 +10,12 @@ from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.interrupts import Interrupts
-from catstream.messages import Run
-from catstream.names import counted, listed
+from catstream.client.subscription import subscribe
+from catstream.messages.kinds import Run
+from catstream.messages.names import counted, listed
 from catstream.services.options import with_part
 from catstream.settings import Settings
 from catstream.sinks.sink import check_writable, open_sink
-from catstream.subscription import subscribe
 from catstream.wire.channels import TRAINING
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber

@@ -10,9 +10,9 @@ from typing import Any
 import click
 
 from catstream.cli.attach import with_endpoint
+from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
-from catstream.messages import Health
-from catstream.subscription import subscribe
+from catstream.messages.kinds import Health
 from catstream.wire.channels import CHANNELS
 
 __all__ = ["status"]

@@ -12,11 +12,11 @@ import click
 
 from catstream.box import Box
 from catstream.cli.attach import with_endpoint
+from catstream.client.control import Control, control
 from catstream.errors import ServiceError
-from catstream.job import Job
-from catstream.names import UNNAMED, check_name, split_name
-from catstream.state import learned
-from catstream.steering import Control, control
+from catstream.messages.names import UNNAMED, check_name, split_name
+from catstream.run.job import Job
+from catstream.run.state import learned
 
 __all__ = ["forget", "pause", "resume", "save", "search", "set_box", "stop"]
 

@@ -13,14 +13,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from catstream.cli import interruptible
 from catstream.cli.interrupts import Interrupts
 from catstream.errors import ObjectError, SettingsError, VideoError
-from catstream.names import boxes_by_name, listed, split_name
+from catstream.messages.names import boxes_by_name, listed, split_name
 from catstream.services.options import with_settings
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
-    from catstream.job import Job
-    from catstream.recording.file import Recording
-    from catstream.summaries.sheet import Sheet
+    from catstream.applications.summaries.sheet import Sheet
+    from catstream.run.job import Job
+    from catstream.sinks.recording.file import Recording
 
 __all__ = ["summary"]
 
@@ -84,10 +84,10 @@ def summary(
     """
     # Imported here so that --help and the other commands start faster.
     with interruptible():
-        from catstream.job import Job
-        from catstream.recording.file import Recording
-        from catstream.summaries.images import describe  # noqa: F401  this import compiles the kernels
-        from catstream.summaries.sheet import json_beside
+        from catstream.applications.summaries.images import describe  # noqa: F401  this import compiles the kernels
+        from catstream.applications.summaries.sheet import json_beside
+        from catstream.run.job import Job
+        from catstream.sinks.recording.file import Recording
 
     _check_output(output, json_beside(output), overwrite)
     interrupts, console = Interrupts(), Console(stderr=True, soft_wrap=True, highlight=False)
@@ -106,7 +106,7 @@ def summary(
 
 
 def _is_recording(path: Path) -> bool:
-    from catstream.recording.container import MAGIC
+    from catstream.sinks.recording.container import MAGIC
 
     if not path.is_file():
         return False
@@ -115,7 +115,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _job(path: Path, box: str, settings: Settings) -> Job:
-    from catstream.job import Job
+    from catstream.run.job import Job
 
     return Job(str(path), boxes_by_name(dict([split_name(box)])), settings=settings)
 
@@ -138,12 +138,12 @@ def _progress(doing: str, things: str, console: Console) -> Progress:
 
 
 def _of_images(path: Path, count: int, console: Console) -> Sheet:
-    from catstream.summaries.collection import Collection, Origin
-    from catstream.summaries.images import describe
-    from catstream.summaries.pictures import WIDTH
-    from catstream.summaries.selection import RowSelection
-    from catstream.summaries.sheet import sheet_of_images
-    from catstream.threads import one_thread
+    from catstream.applications.summaries.collection import Collection, Origin
+    from catstream.applications.summaries.images import describe
+    from catstream.applications.summaries.pictures import WIDTH
+    from catstream.applications.summaries.selection import RowSelection
+    from catstream.applications.summaries.sheet import sheet_of_images
+    from catstream.numerics.threads import one_thread
     from catstream.video.preview import jpeg
 
     collection, selection = Collection(path), RowSelection[tuple[Origin, bytes]](count)
@@ -165,7 +165,7 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
 def _tracked(job: Job, folder: Path, console: Console) -> Recording:
     """Track the source of a job, and record it."""
     from catstream.pipeline import Pipeline
-    from catstream.recording.file import Recording
+    from catstream.sinks.recording.file import Recording
     from catstream.video.source import is_live
 
     if is_live(job.source):
@@ -184,12 +184,12 @@ def _tracked(job: Job, folder: Path, console: Console) -> Recording:
 
 
 def _of_recording(recording: Recording, count: int, name: str | None, source: str | None, console: Console) -> Sheet:
-    from catstream.messages import Features
-    from catstream.recording.learning import require_features
-    from catstream.summaries.pictures import pictures_of, source_of
-    from catstream.summaries.sheet import sheet_of_frames
-    from catstream.summaries.taught import most_taught, taught_frames
-    from catstream.threads import one_thread
+    from catstream.applications.summaries.pictures import pictures_of, source_of
+    from catstream.applications.summaries.sheet import sheet_of_frames
+    from catstream.applications.summaries.taught import most_taught, taught_frames
+    from catstream.messages.kinds import Features
+    from catstream.numerics.threads import one_thread
+    from catstream.sinks.recording.learning import require_features
 
     require_features(recording, incomplete=True)
     settings, source = recording.settings, source or source_of(recording)

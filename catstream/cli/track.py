@@ -17,17 +17,16 @@ from catstream.cli import INTERRUPTED
 from catstream.cli.interrupts import Interrupts
 from catstream.cli.progress import RunProgress
 from catstream.cli.serving import PORT, Address, AddressType, with_token
-from catstream.errors import RecordingError, ServiceError
-from catstream.extras import require_extra
-from catstream.job import Job, Results
-from catstream.messages import Track
-from catstream.names import UNNAMED, doubtful, listed
+from catstream.errors import RecordingError, ServiceError, require_extra
+from catstream.messages.kinds import Track
+from catstream.messages.names import UNNAMED, doubtful, listed
+from catstream.messages.storage import why_not_writable
 from catstream.pipeline import Pipeline
-from catstream.recording.file import Recording
+from catstream.run.job import Job, Results
 from catstream.services.options import named, with_given, with_object, with_part, with_reading
+from catstream.sinks.recording.file import Recording
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT
-from catstream.storage import why_not_writable
 
 __all__ = ["track"]
 

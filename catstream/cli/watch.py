@@ -20,9 +20,9 @@ from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
-from catstream.heads import APPEARANCE, GROUPS, TREES
-from catstream.messages import Features, Health, Model, Preview, Sample, Track
-from catstream.subscription import AnyMessage, Subscription
+from catstream.client.subscription import AnyMessage, Subscription
+from catstream.messages.heads import APPEARANCE, GROUPS, TREES
+from catstream.messages.kinds import Features, Health, Model, Preview, Sample, Track
 
 __all__ = ["watch"]
 

@@ -1,6 +1,6 @@
 """The compressor of one object: takes its features of every frame, and returns a training sample now and then.
 
-It is the only owner of the object's coreset trees, those of `catstream.heads.TREES`.
+It is the only owner of the object's coreset trees, those of `catstream.messages.heads.TREES`.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from hashlib import blake2b
 
 import numpy as np
 
-from catstream.arrays import Bool, Float32
 from catstream.box import Box
 from catstream.compression.tree import REDUCTIONS, CoresetTree, pack_trees, unpack_trees
 from catstream.errors import SettingsError
-from catstream.heads import APPEARANCE, TREES, Tree
-from catstream.messages import DetectorState, ObjectFeatures, ObjectPosition, Sample, TrainingRows
-from catstream.packing import pack, unpack
+from catstream.messages.heads import APPEARANCE, TREES, Tree
+from catstream.messages.kinds import DetectorState, ObjectFeatures, ObjectPosition, Sample, TrainingRows
+from catstream.messages.packing import pack, unpack
+from catstream.messages.storage import Arrays, Metadata
+from catstream.numerics.arrays import Bool, Float32
 from catstream.settings import Settings
-from catstream.storage import Arrays, Metadata
 
 __all__ = ["Compressor", "sample_of"]
 

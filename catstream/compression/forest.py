@@ -6,12 +6,12 @@ import os
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from catstream import storage
 from catstream.compression.compressor import Compressor
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.messages import Features, Position, Sample
+from catstream.messages import storage
+from catstream.messages.kinds import Features, Position, Sample
+from catstream.messages.storage import Arrays, Metadata, with_prefix
 from catstream.settings import Settings
-from catstream.storage import Arrays, Metadata, with_prefix
 
 __all__ = ["Forest"]
 
@@ -61,7 +61,7 @@ class Forest:
 
         Parameters
         ----------
-        learned : compressors of `catstream.learned.begun` for the objects that begin in this message with a saved model
+        learned : compressors of the objects that begin in this message with a saved model
 
         Raises
         ------

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from catstream.arrays import Float32
+from catstream.numerics.arrays import Float32
 
 __all__ = ["energy", "prepare", "products", "reduce", "shrink"]
 

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
-from catstream import storage
-from catstream.arrays import Float64, is_finite
 from catstream.compression import sampling
 from catstream.compression.node import Node
 from catstream.compression.reduce import shrink
 from catstream.errors import ProtocolError
-from catstream.messages import Summary
-from catstream.storage import Arrays, Metadata
+from catstream.messages import storage
+from catstream.messages.kinds import Summary
+from catstream.messages.storage import Arrays, Metadata
+from catstream.numerics.arrays import Float64, is_finite
 
 if TYPE_CHECKING:
     import os

@@ -9,7 +9,7 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.detection.search import Detection
-from catstream.messages import DetectorState
+from catstream.messages.kinds import DetectorState
 
 __all__ = ["assigned"]
 

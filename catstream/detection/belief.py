@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
 
-from catstream.messages import DetectorState, Level
+from catstream.messages.kinds import DetectorState, Level
 from catstream.settings import BeliefSettings
 
 __all__ = ["Policy", "is_redetection", "level_of", "policies", "updated"]

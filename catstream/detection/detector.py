@@ -16,9 +16,9 @@ from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
-from catstream.messages import DetectorState, Model, ObjectFeatures, Track
+from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, Track
+from catstream.messages.storage import Arrays, Metadata
 from catstream.settings import Settings
-from catstream.storage import Arrays, Metadata
 
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel

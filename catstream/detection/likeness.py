@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from catstream.storage import Arrays
+from catstream.messages.storage import Arrays
 
 __all__ = ["Likeness"]
 

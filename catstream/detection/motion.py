@@ -20,9 +20,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from catstream import kalman
-from catstream.kalman import TRANSITION
-from catstream.messages import DetectorState, Motion
+from catstream.messages.kinds import DetectorState, Motion
+from catstream.numerics import kalman
+from catstream.numerics.kalman import TRANSITION
 
 __all__ = ["at_rest", "expected", "measured", "observed", "predicted"]
 

@@ -12,9 +12,9 @@ from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.errors import ObjectError
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Features, Model, Track, Tracks
-from catstream.names import check_count, check_name, listed
-from catstream.parallel import in_parallel
+from catstream.messages.kinds import Features, Model, Track, Tracks
+from catstream.messages.names import check_count, check_name, listed
+from catstream.numerics.parallel import in_parallel
 from catstream.settings import Settings
 
 __all__ = ["Detectors", "prepare"]

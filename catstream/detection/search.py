@@ -18,8 +18,8 @@ from catstream.detection.likeness import Likeness
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
-from catstream.heads import ASPECT, EXTENT, SIZE
-from catstream.messages import DetectorState, Model
+from catstream.messages.heads import ASPECT, EXTENT, SIZE
+from catstream.messages.kinds import DetectorState, Model
 from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 
 __all__ = [

@@ -13,7 +13,7 @@ from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
 from catstream.features.layout import COLOURS
 from catstream.features.pyramid import Pyramid
-from catstream.messages import DetectorState, Model, State, Track
+from catstream.messages.kinds import DetectorState, Model, State, Track
 from catstream.settings import Settings
 
 __all__ = ["looked", "replaced", "settled", "taught", "track_of"]

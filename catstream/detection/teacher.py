@@ -15,7 +15,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from catstream import ridge
 from catstream.box import Box, Window
 from catstream.detection import extent
 from catstream.detection.likeness import Likeness
@@ -24,8 +23,9 @@ from catstream.errors import BoxError
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW, row_length
 from catstream.features.pyramid import Pyramid
-from catstream.heads import APPEARANCE, BETWEEN_RIDGE, EXTENT
-from catstream.messages import Model, TrainingRows
+from catstream.messages.heads import APPEARANCE, BETWEEN_RIDGE, EXTENT
+from catstream.messages.kinds import Model, TrainingRows
+from catstream.numerics import ridge
 from catstream.settings import Settings, TeachingSettings
 
 __all__ = [

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from catstream.arrays import Float32, Int64, UInt16, writable
 from catstream.features import colours
 from catstream.features.colours import count
 from catstream.features.compiled import kernel
 from catstream.features.hog import grid
 from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, WINDOW, row_length
 from catstream.features.pyramid import planes_of
+from catstream.numerics.arrays import Float32, Int64, UInt16, writable
 
 __all__ = ["Cells"]
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from catstream.arrays import Float32, UInt8, UInt16, writable
 from catstream.features import lab
 from catstream.features.compiled import kernel
 from catstream.features.layout import CHROMA, LIGHT, SHADES, SIDE, WINDOW
+from catstream.numerics.arrays import Float32, UInt8, UInt16, writable
 
 __all__ = ["add_scores", "count", "highest_score", "shades"]
 

@@ -15,11 +15,11 @@ from __future__ import annotations
 import numpy as np
 from numpy import float32
 
-from catstream.arrays import Float32, UInt8
 from catstream.features.compiled import kernel
 from catstream.features.lab import of_colour
 from catstream.features.layout import CELL, CHANNELS
-from catstream.parallel import Scratch
+from catstream.numerics.arrays import Float32, UInt8
+from catstream.numerics.parallel import Scratch
 
 __all__ = ["grid"]
 

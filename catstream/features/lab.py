@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from catstream.arrays import UInt8
 from catstream.features.compiled import kernel
+from catstream.numerics.arrays import UInt8
 
 __all__ = ["converted", "of_colour"]
 

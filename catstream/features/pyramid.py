@@ -8,11 +8,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from catstream.arrays import Float32, UInt8, UInt32
 from catstream.box import Window
 from catstream.features.compiled import kernel
 from catstream.features.layout import CELL, MARGIN, WINDOW
-from catstream.parallel import Scratch
+from catstream.numerics.arrays import Float32, UInt8, UInt32
+from catstream.numerics.parallel import Scratch
 
 __all__ = ["Pyramid", "Region", "planes_of"]
 

@@ -13,8 +13,7 @@ import sys
 import warnings
 from collections.abc import Mapping
 
-from catstream.errors import FleetError
-from catstream.extras import require_extra
+from catstream.errors import FleetError, require_extra
 from catstream.fleet.life import Node
 
 __all__ = ["NAMESPACE", "connect", "disconnect", "is_local", "nodes"]

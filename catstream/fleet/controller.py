@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from catstream.client.registry import RegistryServer
 from catstream.errors import CatstreamError, FleetError
 from catstream.fleet import life
 from catstream.fleet.cluster import NAMESPACE, is_local, nodes
@@ -26,8 +27,7 @@ from catstream.fleet.life import Node, Order, Seen, Wanted
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
 from catstream.fleet.stream import Place, Report, Stream, given_model
-from catstream.messages import FleetStatus, NodeState, NodeStatus, StreamStatus
-from catstream.registry import RegistryServer
+from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
 from catstream.video.frames import without_password
 from catstream.wire.keys import Client, allowed, create
 

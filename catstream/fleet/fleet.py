@@ -23,8 +23,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
-from catstream.errors import CatstreamError, FleetError
-from catstream.extras import require_extra
+from catstream.client.registry import REGISTRY_PORT
+from catstream.errors import CatstreamError, FleetError, require_extra
 from catstream.fleet import cluster
 from catstream.fleet.cluster import NAMESPACE
 from catstream.fleet.controller import Controller, actor_name
@@ -32,11 +32,10 @@ from catstream.fleet.local import LocalCluster
 from catstream.fleet.merge import Merged, merge_streams
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.learned import Learned
-from catstream.messages import FleetStatus
-from catstream.names import UNNAMED, check_name
-from catstream.registry import REGISTRY_PORT
-from catstream.storage import lock
+from catstream.messages.kinds import FleetStatus
+from catstream.messages.names import UNNAMED, check_name
+from catstream.messages.storage import lock
+from catstream.run.learned import Learned
 
 __all__ = ["Fleet"]
 

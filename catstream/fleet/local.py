@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from catstream.errors import FleetError
+from catstream.messages.storage import is_locked, lock, write_atomically
 from catstream.services import start
-from catstream.storage import is_locked, lock, write_atomically
 from catstream.wire.endpoint import private_folder
 
 __all__ = ["LocalCluster", "main"]

@@ -3,7 +3,7 @@
 Frames are counted once. A saved model contains the origins of its trees, one for each stream of frames; a model that
 shares an origin with another one has learned from the same frames, so only one of them is merged. Merging again, or in
 another order, therefore changes nothing. The order of the pairs changes the merged trees only within the bound of the
-coreset: see `catstream.learned.merge`.
+coreset: see `catstream.run.learned.merge`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from catstream import state
 from catstream.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError
 from catstream.fleet.store import Store
-from catstream.job import Job
-from catstream.learned import Learned, merge
+from catstream.run import state
+from catstream.run.job import Job
+from catstream.run.learned import Learned, merge
 
 __all__ = ["Merged", "Part", "apart", "merge_in_pairs", "merge_models", "merge_streams", "saved_part"]
 

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from catstream import storage
-from catstream.errors import FleetError, StoreError
-from catstream.extras import require_extra
+from catstream.errors import FleetError, StoreError, require_extra
+from catstream.messages import storage
 
 __all__ = ["FsspecObjects"]
 

@@ -35,8 +35,8 @@ from typing import Any
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, FleetError
-from catstream.job import Job
-from catstream.names import UNNAMED, boxes_by_name, check_name, listed
+from catstream.messages.names import UNNAMED, boxes_by_name, check_name, listed
+from catstream.run.job import Job
 from catstream.settings import Settings
 from catstream.video.source import is_live
 

@@ -31,8 +31,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from catstream import storage
 from catstream.errors import FencedError, ProtocolError, StoreError
+from catstream.messages import storage
 
 __all__ = ["Claim", "Generation", "Listing", "Objects", "States"]
 

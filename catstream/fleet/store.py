@@ -19,7 +19,7 @@ from typing import Any
 from catstream.errors import FencedError, FleetError
 from catstream.fleet.objects import FsspecObjects
 from catstream.fleet.states import Claim, Generation, Listing, States
-from catstream.names import UNNAMED, check_name
+from catstream.messages.names import UNNAMED, check_name
 
 __all__ = ["Claim", "Generation", "Store"]
 

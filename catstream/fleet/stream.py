@@ -23,6 +23,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
+from catstream.client.control import control
 from catstream.errors import (
     CatstreamError,
     CommandRejectedError,
@@ -35,12 +36,11 @@ from catstream.fleet.life import Order
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.states import Claim, Generation
 from catstream.fleet.store import Store
-from catstream.learned import Learned
-from catstream.messages import StreamState, StreamStatus, Track
+from catstream.messages.kinds import StreamState, StreamStatus, Track
+from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
-from catstream.state import files, restore, skip
-from catstream.steering import control
-from catstream.storage import Metadata
+from catstream.run.learned import Learned
+from catstream.run.state import files, restore, skip
 from catstream.video.frames import without_password
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder

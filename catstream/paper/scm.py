@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from catstream.arrays import Float32, Float64, Int64
 from catstream.box import Box
 from catstream.features.compiled import kernel
 from catstream.features.pyramid import Pyramid
-from catstream.storage import Arrays, Metadata
+from catstream.messages.storage import Arrays, Metadata
+from catstream.numerics.arrays import Float32, Float64, Int64
 
 __all__ = ["SparseCollaborativeModel", "prepare"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.sinks.lines import LineSink
 from catstream.video.results import COLUMNS, format_row, parse_row
 

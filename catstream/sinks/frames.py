@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Iterator, Mapping
 from itertools import groupby
 
-from catstream.messages import Track
-from catstream.names import UNNAMED
+from catstream.messages.kinds import Track
+from catstream.messages.names import UNNAMED
 
 __all__ = ["FIRST", "by_frame", "in_order", "objects_of", "whole_frames"]
 

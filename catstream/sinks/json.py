@@ -15,7 +15,7 @@ from typing import IO
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.sinks.lines import LineSink
 
 __all__ = ["JsonSink", "NdjsonSink", "StdoutSink"]

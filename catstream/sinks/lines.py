@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from catstream.errors import VideoError
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 
 __all__ = ["LineSink"]
 

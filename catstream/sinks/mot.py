@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.sinks.lines import LineSink
 
 __all__ = ["MotSink"]

@@ -11,9 +11,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
-from catstream.errors import VideoError
-from catstream.extras import require_extra
-from catstream.messages import Track
+from catstream.errors import VideoError, require_extra
+from catstream.messages.kinds import Track
 from catstream.sinks.frames import by_frame
 from catstream.sinks.sqlite import SqliteSink, track_of
 

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import ObjectPosition, Position, Track
-from catstream.names import UNNAMED
+from catstream.messages.kinds import ObjectPosition, Position, Track
+from catstream.messages.names import UNNAMED
+from catstream.messages.storage import is_writable, name_fits
 from catstream.sinks.frames import FIRST, by_frame, in_order, objects_of, whole_frames
 from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, file_exists, is_closed, open_sink, reader
-from catstream.storage import is_writable, name_fits
 from catstream.video import results
 from catstream.video.frames import RATE
 from catstream.video.results import ResultsWriter

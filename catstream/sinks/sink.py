@@ -15,16 +15,15 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from catstream.errors import VideoError
-from catstream.extras import require_extra
-from catstream.messages import Track
+from catstream.errors import VideoError, require_extra
+from catstream.messages.kinds import Track
+from catstream.messages.storage import why_not_writable
 from catstream.sinks import parquet
 from catstream.sinks.csv import CsvSink
 from catstream.sinks.json import JsonSink, NdjsonSink, StdoutSink
 from catstream.sinks.mot import MotSink
 from catstream.sinks.sqlite import SqliteSink
 from catstream.sinks.video import VideoSink
-from catstream.storage import why_not_writable
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 
 __all__ = ["SqliteSink", "track_of"]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from catstream.errors import VideoError
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.video.annotate import AnnotatedVideo
 from catstream.video.frames import RATE, Frame
 from catstream.video.source import is_live, open_source

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from catstream.arrays import Bool, Float64
-from catstream.kalman import OBSERVED, TRANSITION, constant_velocity
-from catstream.messages import Motion
+from catstream.messages.kinds import Motion
+from catstream.numerics.arrays import Bool, Float64
+from catstream.numerics.kalman import OBSERVED, TRANSITION, constant_velocity
 
 __all__ = ["FEWEST", "OBSERVATION_FLOOR", "PROCESS_FLOOR", "learn_motion"]
 

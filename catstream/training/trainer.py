@@ -15,10 +15,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from catstream import ridge
 from catstream.errors import ProtocolError
-from catstream.heads import BETWEEN_RIDGE, TREES, Head, Tree
-from catstream.messages import Model, Motion, Sample
+from catstream.messages.heads import BETWEEN_RIDGE, TREES, Head, Tree
+from catstream.messages.kinds import Model, Motion, Sample
+from catstream.numerics import ridge
 from catstream.paper.one_class import one_class
 from catstream.settings import Settings
 from catstream.training.motion_em import learn_motion

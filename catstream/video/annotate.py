@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from catstream.box import Box
-from catstream.colours import Colours, rgb
-from catstream.messages import Preview, Track
-from catstream.names import UNNAMED
+from catstream.messages.kinds import Preview, Track
+from catstream.messages.names import UNNAMED
+from catstream.video.palette import Colours, rgb
 from catstream.video.writer import VideoWriter
 
 __all__ = ["AnnotatedVideo", "draw", "draw_boxes", "draw_preview", "thumbnail"]

@@ -24,9 +24,9 @@ from typing import IO, Self, get_args
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import State, Track
-from catstream.names import UNNAMED, check_name, is_name
-from catstream.storage import name_fits
+from catstream.messages.kinds import State, Track
+from catstream.messages.names import UNNAMED, check_name, is_name
+from catstream.messages.storage import name_fits
 
 __all__ = [
     "COLUMNS",

@@ -1,5 +1,5 @@
 """The web page of a running pipeline: live view, control and metrics."""
 
-from catstream.extras import require_extra
+from catstream.errors import require_extra
 
 require_extra("view")

@@ -29,8 +29,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import Lifespan
 
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
-from catstream.messages import Answer
-from catstream.names import check_name
+from catstream.messages.kinds import Answer
+from catstream.messages.names import check_name
 from catstream.video.annotate import draw_preview
 from catstream.web import metrics
 from catstream.web.feed import Feed

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter, OrderedDict, deque
 from typing import Literal
 
-from catstream.heads import TREES
-from catstream.messages import End, Features, Health, Model, Preview, Track
+from catstream.messages.heads import TREES
+from catstream.messages.kinds import End, Features, Health, Model, Preview, Track
 from catstream.web.objects import Objects
 from catstream.web.surprising import SurprisingFrames
 

@@ -8,11 +8,11 @@ import logging
 from collections.abc import AsyncIterator
 from time import monotonic
 
+from catstream.client.control import Control
+from catstream.client.registry import locate
+from catstream.client.subscription import AnyMessage, Subscription
 from catstream.errors import CatstreamError
-from catstream.messages import End
-from catstream.registry import locate
-from catstream.steering import Control
-from catstream.subscription import AnyMessage, Subscription
+from catstream.messages.kinds import End
 from catstream.web.dashboard import SILENCE_SECONDS, Dashboard
 from catstream.web.viewers import Viewers
 from catstream.wire.endpoint import Endpoint

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
-from catstream.messages import FleetStatus, NodeStatus, StreamStatus
+from catstream.messages.kinds import FleetStatus, NodeStatus, StreamStatus
 
 __all__ = ["FleetDashboard", "in_order", "node_row", "stream_card"]
 

@@ -9,9 +9,9 @@ from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from time import monotonic
 
+from catstream.client.registry import Registry, address_of
 from catstream.errors import CatstreamError
-from catstream.messages import FleetStatus, StreamStatus
-from catstream.registry import Registry, address_of
+from catstream.messages.kinds import FleetStatus, StreamStatus
 from catstream.web.feed import Feed
 from catstream.web.fleet_dashboard import FleetDashboard
 from catstream.web.viewers import Viewers

@@ -8,7 +8,7 @@ from typing import get_args
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from catstream.messages import FleetStatus, NodeState, NodeStatus, StreamState, StreamStatus
+from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamState, StreamStatus
 from catstream.web.fleet_feed import FleetFeed
 
 __all__ = ["text"]

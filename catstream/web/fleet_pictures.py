@@ -9,9 +9,9 @@ from time import monotonic
 
 from starlette.concurrency import run_in_threadpool
 
-from catstream.colours import Colours
-from catstream.messages import Preview, StreamStatus
+from catstream.messages.kinds import Preview, StreamStatus
 from catstream.video.annotate import draw_boxes
+from catstream.video.palette import Colours
 from catstream.web.guard import TokenBucket
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.endpoint import Endpoint

@@ -8,7 +8,7 @@ from time import monotonic, time
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from catstream.heads import TREES
+from catstream.messages.heads import TREES
 from catstream.web.feed import Feed
 from catstream.wire.channels import CHANNELS
 

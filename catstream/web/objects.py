@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from catstream.colours import Colours
-from catstream.messages import Health, Model, State, Track
+from catstream.messages.kinds import Health, Model, State, Track
+from catstream.video.palette import Colours
 
 __all__ = ["Objects", "ShownObject"]
 

@@ -9,8 +9,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from catstream.heads import APPEARANCE
-from catstream.messages import Features, Model, Preview, TrainingRows
+from catstream.messages.heads import APPEARANCE
+from catstream.messages.kinds import Features, Model, Preview, TrainingRows
 
 __all__ = ["SurprisingFrame", "SurprisingFrames", "surprise"]
 

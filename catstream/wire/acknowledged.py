@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 
 import zmq
 
-from catstream.messages import End, Position, Stored
+from catstream.messages.kinds import End, Position, Stored
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow

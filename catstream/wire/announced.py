@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Self
 
-from catstream.storage import lock
+from catstream.messages.storage import lock
 from catstream.wire.endpoint import Endpoint, homes, notes
 
 __all__ = ["Announcement", "readers_of"]

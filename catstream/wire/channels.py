@@ -7,7 +7,7 @@
     tracks     every message, one for each object and frame, to any number of subscribers; a slow one misses some, and
                sees by `seq` how many
     results    the tracks again, one message a frame, acknowledged, for the process that started the pipeline, its
-               owner; the files that it writes are `catstream.job.Results`
+               owner; the files that it writes are `catstream.run.job.Results`
     health     the newest of each process
     previews   small pictures of the newest frame; none is made while nobody subscribes
     control    commands and their answers; a command without an answer is sent again, and carried out once
@@ -28,7 +28,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
-from catstream.messages import (
+from catstream.messages.kinds import (
     Answer,
     Command,
     End,

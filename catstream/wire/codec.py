@@ -7,7 +7,7 @@ A message is one frame of msgpack, `[version, kind, object, run, fields]`:
     object    name of the object that the message is about, "" if it is about none or about all
     run       id of the run that it is from: of one start of one pipeline, kept by processes that are restarted; "" if
               the sender knows none
-    fields    map from each field's name to its value, see `catstream.messages`
+    fields    map from each field's name to its value, see `catstream.messages.kinds`
     a box     [x, y, w, h]
     an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
 
@@ -15,7 +15,7 @@ Version, kind and object are the first bytes of a message, and thus its topic: a
 message, or that of one object.
 
 Every size has a limit before memory is taken for it. Then the message is checked against its
-schema (`catstream.wire.checks`). A field that this version does not know is ignored.
+schema (`catstream.messages.checks`). A field that this version does not know is ignored.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ import msgspec
 import numpy as np
 
 from catstream.errors import ProtocolError
-from catstream.messages import (
+from catstream.messages.checks import check_message
+from catstream.messages.kinds import (
     Answer,
     Command,
     End,
@@ -46,8 +47,7 @@ from catstream.messages import (
     Track,
     Tracks,
 )
-from catstream.schema import LONGEST_LIST, LONGEST_TEXT
-from catstream.wire.checks import check_message
+from catstream.messages.schema import LONGEST_LIST, LONGEST_TEXT
 
 __all__ = [
     "KINDS",

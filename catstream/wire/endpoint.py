@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from catstream.errors import ServiceError
-from catstream.storage import is_locked, lock
+from catstream.messages.storage import is_locked, lock
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 

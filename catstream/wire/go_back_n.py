@@ -26,7 +26,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from catstream.errors import ProtocolError, StreamRewoundError
-from catstream.messages import Position, Stored
+from catstream.messages.kinds import Position, Stored
 
 __all__ = ["HELLO", "PATIENCE", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
 

@@ -26,7 +26,7 @@ from typing import get_args
 import zmq
 
 from catstream.errors import ServiceError
-from catstream.storage import write_atomically
+from catstream.messages.storage import write_atomically
 from catstream.wire.channels import Role
 
 __all__ = ["ROLES", "Client", "Keys", "allow", "allowed", "clients", "create", "public_key", "revoke", "synchronise"]

@@ -23,7 +23,7 @@ from typing import TypeVar
 
 import zmq
 
-from catstream.messages import End, Health
+from catstream.messages.kinds import End, Health
 from catstream.wire.channels import Channel
 from catstream.wire.codec import opening, topic_of
 from catstream.wire.endpoint import Endpoint

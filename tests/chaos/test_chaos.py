@@ -8,8 +8,8 @@ import pytest
 import sequences
 import table
 
+from catstream.applications.evaluation.metrics import score
 from catstream.box import Box
-from catstream.evaluation.metrics import score
 from catstream.settings import Settings
 
 pytestmark = pytest.mark.system

@@ -7,7 +7,7 @@ from itertools import islice
 import pytest
 
 from catstream.box import Box
-from catstream.learned import Learned
+from catstream.run.learned import Learned
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 
@@ -78,7 +78,7 @@ def test_models_of_different_objects_are_merged_only_with_force(said, models, tm
 
 
 def test_a_doubt_is_one_line_and_the_models_are_merged(said, models, tmp_path, monkeypatch):
-    monkeypatch.setattr("catstream.learned._UNLIKE", 0.0)
+    monkeypatch.setattr("catstream.run.learned._UNLIKE", 0.0)
     door, _, lake = models
     code, output, errors = said("merge", door, lake, "-o", tmp_path / "both")
     assert (code, errors.count("\n")) == (0, 1)

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from catstream.box import Box
 from catstream.cli.progress import RunProgress
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 
 
 @pytest.mark.parametrize("live", [False, True], ids=["file", "live"])

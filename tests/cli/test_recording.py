@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import pytest
 
-from catstream.messages import Features, Model, Track
+from catstream.messages.kinds import Features, Model, Track
 from catstream.pipeline import Pipeline
-from catstream.recording.file import Recording, RecordingWriter
-from catstream.recording.learning import learn
 from catstream.settings import Settings
+from catstream.sinks.recording.file import Recording, RecordingWriter
+from catstream.sinks.recording.learning import learn
 
 
 @pytest.fixture

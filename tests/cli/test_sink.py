@@ -9,7 +9,7 @@ import sqlite3
 import time
 from contextlib import closing
 
-from catstream.messages import Health, Run, Track
+from catstream.messages.kinds import Health, Run, Track
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.source import open_source

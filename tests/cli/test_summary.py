@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.job import Job
-from catstream.summaries import images
+from catstream.applications.summaries import images
+from catstream.run.job import Job
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ import psutil
 import pytest
 
 from catstream.errors import VideoError
-from catstream.learned import Learned
-from catstream.messages import Features
-from catstream.recording.file import Recording
+from catstream.messages.kinds import Features
+from catstream.run.learned import Learned
 from catstream.sinks.parquet import ParquetSink
+from catstream.sinks.recording.file import Recording
 from catstream.video.source import open_source
 
 FILES = ["demo.csv", "demo.mp4", "demo.txt", "demo_confidence.value", "demo_time.txt"]

@@ -14,8 +14,8 @@ import psutil
 import pytest
 
 from catstream.box import Box
+from catstream.client.subscription import subscribe
 from catstream.pipeline import Pipeline
-from catstream.subscription import subscribe
 from catstream.video.demo import render
 
 PYTHON = Path("/usr/bin/python3")  # the one that Debian's packages are for

@@ -14,11 +14,11 @@ import psutil
 import pytest
 
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.job import Job
-from catstream.learned import Learned
 from catstream.pipeline import Pipeline
+from catstream.run.job import Job
+from catstream.run.learned import Learned
+from catstream.run.state import TREES
 from catstream.settings import Settings
-from catstream.state import TREES
 from catstream.video.source import open_source
 
 OFTEN = ["--set", "run.checkpoint_seconds=0.05", "--lockstep"]

@@ -14,7 +14,7 @@ import time
 import pytest
 
 from catstream.features.layout import row_length
-from catstream.messages import End, Health, Track
+from catstream.messages.kinds import End, Health, Track
 from catstream.pipeline import Pipeline
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings

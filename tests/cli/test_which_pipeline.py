@@ -11,8 +11,8 @@ import pytest
 from click.testing import CliRunner, _NamedTextIOWrapper
 
 from catstream.cli import group
-from catstream.messages import Answer, FleetStatus, StreamStatus
-from catstream.registry import RegistryServer
+from catstream.client.registry import RegistryServer
+from catstream.messages.kinds import Answer, FleetStatus, StreamStatus
 from catstream.wire.channels import CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import meeting_place, private_folder

@@ -11,8 +11,8 @@ import pytest
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
 from catstream.errors import SettingsError
-from catstream.heads import GROUPS
-from catstream.messages import Features, ObjectFeatures, TrainingRows
+from catstream.messages.heads import GROUPS
+from catstream.messages.kinds import Features, ObjectFeatures, TrainingRows
 from catstream.settings import Settings
 
 SETTINGS = Settings(coreset={"size": 8})

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
-from catstream import storage
 from catstream.box import Box, Window
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.compression.tree import REDUCTIONS, CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.heads import APPEARANCE, EXTENT, TREES
-from catstream.messages import DetectorState, Features, Motion, ObjectFeatures, Sample, TrainingRows
+from catstream.messages import storage
+from catstream.messages.heads import APPEARANCE, EXTENT, TREES
+from catstream.messages.kinds import DetectorState, Features, Motion, ObjectFeatures, Sample, TrainingRows
 from catstream.settings import Settings
 
 WIDTH = 20

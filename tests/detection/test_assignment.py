@@ -12,7 +12,7 @@ from catstream.detection.assignment import assigned
 from catstream.detection.search import Detection, ScoreMap, local
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.messages import DetectorState, Model
+from catstream.messages.kinds import DetectorState, Model
 from catstream.settings import SearchSettings
 
 CONTEXT = 1.25

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from catstream.box import Window
 from catstream.detection import belief
-from catstream.messages import DetectorState
+from catstream.messages.kinds import DetectorState
 from catstream.settings import Settings
 
 SETTINGS = Settings()

@@ -9,7 +9,7 @@ from catstream.detection.search import ScoreMap
 from catstream.features import colours
 from catstream.features.layout import COLOURS, row_length
 from catstream.features.pyramid import Pyramid, planes_of
-from catstream.messages import Model
+from catstream.messages.kinds import Model
 
 RED, GREEN = (40, 40, 200), (60, 160, 60)
 SLACK = 0.14

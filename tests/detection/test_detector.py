@@ -14,7 +14,7 @@ from catstream.detection.step import looked, settled, taught
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Model, Motion
+from catstream.messages.kinds import Model, Motion
 from catstream.settings import Settings
 
 START = Box(60, 50, 48, 40)

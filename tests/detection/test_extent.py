@@ -4,13 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream import ridge
 from catstream.box import Box, Window
 from catstream.detection import extent, teacher
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW as WINDOW_CELLS
 from catstream.features.pyramid import Pyramid
-from catstream.heads import ASPECT, EXTENT, GROUPS, HEADS, SIZE
+from catstream.messages.heads import ASPECT, EXTENT, GROUPS, HEADS, SIZE
+from catstream.numerics import ridge
 from catstream.settings import ExtentSettings, Settings
 from catstream.tracker import Tracker
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catstream.detection.motion import at_rest, measured, predicted
-from catstream.messages import Motion
+from catstream.messages.kinds import Motion
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from catstream.detection.search import ScoreMap, due, non_maximum_suppression
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
-from catstream.messages import Model
+from catstream.messages.kinds import Model
 from catstream.settings import ExtentSettings
 
 

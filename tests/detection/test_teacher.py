@@ -9,8 +9,8 @@ from catstream.detection.search import ScoreMap
 from catstream.features.cells import Cells
 from catstream.features.layout import COLOURS, WINDOW, row_length
 from catstream.features.pyramid import Pyramid
-from catstream.heads import APPEARANCE, EXTENT
-from catstream.messages import Model
+from catstream.messages.heads import APPEARANCE, EXTENT
+from catstream.messages.kinds import Model
 from catstream.settings import Settings
 
 OBJECT = Window(120, 80, 64, 64)

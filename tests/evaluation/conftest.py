@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.applications.evaluation.datasets import Sequence, find_sequences
 from catstream.video.demo import render
 
 

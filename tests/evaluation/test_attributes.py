@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from catstream.applications.evaluation.attributes import attributes_of, computed_attributes, read_attributes
 from catstream.errors import SettingsError
-from catstream.evaluation.attributes import attributes_of, computed_attributes, read_attributes
 
 ALL = ["fast motion", "scale variation", "aspect change", "low resolution", "out of view"]
 

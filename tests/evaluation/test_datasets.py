@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from catstream.applications.evaluation.datasets import find_sequences
 from catstream.errors import VideoError
-from catstream.evaluation.datasets import find_sequences
 
 TRUTH = np.array([[10, 20, 30, 40], [12.5, 21, 30, 40], [np.nan] * 4, [15, 22, 31, 41.5]])
 

@@ -13,9 +13,9 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
+from catstream.applications.evaluation import workers
+from catstream.applications.evaluation.workers import run_tasks
 from catstream.cli import INTERRUPTED, interruptible
-from catstream.evaluation import workers
-from catstream.evaluation.workers import run_tasks
 
 EVALUATE = [sys.executable, "-c", "from catstream.cli import main; main()", "evaluate"]
 

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from catstream.box import Box
-from catstream.evaluation.metrics import (
+from catstream.applications.evaluation.metrics import (
     PIXELS,
     distances,
     long_term,
@@ -18,6 +17,7 @@ from catstream.evaluation.metrics import (
     score,
     success_plot,
 )
+from catstream.box import Box
 
 
 def boxes(frames: int = 40) -> tuple[np.ndarray, np.ndarray]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from catstream.applications.evaluation.multiple import hota, score_multiple
 from catstream.box import Box
-from catstream.evaluation.multiple import hota, score_multiple
 
 NAMES = "abcde"
 

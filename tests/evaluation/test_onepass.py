@@ -11,13 +11,13 @@ import numpy as np
 import psutil
 import pytest
 
+from catstream.applications.evaluation import onepass, runs
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.onepass import evaluate, follow
+from catstream.applications.evaluation.runs import EvaluationRun, load, save
+from catstream.applications.evaluation.starts import FIRST, Start, jittered, spatial, temporal
+from catstream.applications.evaluation.summary import MEASURES, describe_flips, flips_of, mean_of, rows_of, to_json
 from catstream.errors import CatstreamError, SettingsError, VideoError
-from catstream.evaluation import onepass, runs
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import evaluate, follow
-from catstream.evaluation.runs import EvaluationRun, load, save
-from catstream.evaluation.starts import FIRST, Start, jittered, spatial, temporal
-from catstream.evaluation.summary import MEASURES, describe_flips, flips_of, mean_of, rows_of, to_json
 from catstream.settings import Settings
 
 SETTINGS = Settings()
@@ -222,9 +222,9 @@ def test_a_killed_evaluation_leaves_no_worker(tmp_path, sequence):
     script = tmp_path / "killed.py"
     script.write_text(f"""
 import signal
-from catstream.evaluation.datasets import find_sequences
-from catstream.evaluation.onepass import evaluate
-from catstream.evaluation.starts import temporal
+from catstream.applications.evaluation.datasets import find_sequences
+from catstream.applications.evaluation.onepass import evaluate
+from catstream.applications.evaluation.starts import temporal
 from catstream.settings import Settings
 
 def done(run):

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
+from catstream.applications.evaluation.onepass import evaluate, follow
+from catstream.applications.evaluation.peers import MODELS, PEERS, Peer
 from catstream.errors import BoxError, SettingsError
-from catstream.evaluation.onepass import evaluate, follow
-from catstream.evaluation.peers import MODELS, PEERS, Peer
 from catstream.settings import Settings
 
 _FLOAT, _INT, _INTS = 1, 2, 7  # types of elements and attributes

@@ -9,8 +9,8 @@ import subprocess
 
 import pytest
 
-from catstream.evaluation import provenance as module
-from catstream.evaluation.provenance import machine, provenance
+from catstream.applications.evaluation import provenance as module
+from catstream.applications.evaluation.provenance import machine, provenance
 from catstream.settings import Settings
 
 

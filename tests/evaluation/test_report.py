@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from catstream.applications.evaluation.failures import failure_strip, worst_runs
+from catstream.applications.evaluation.report import write_report, write_strips
+from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.evaluation.starts import FIRST
 from catstream.cli.evaluate import evaluate
 from catstream.errors import CatstreamError, VideoError
-from catstream.evaluation.failures import failure_strip, worst_runs
-from catstream.evaluation.report import write_report, write_strips
-from catstream.evaluation.runs import EvaluationRun
-from catstream.evaluation.starts import FIRST
 from catstream.settings import Settings
 
 

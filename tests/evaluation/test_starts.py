@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.onepass import evaluate
+from catstream.applications.evaluation.starts import FIRST, SHIFTS, Start, jittered, one_pass, spatial, temporal
 from catstream.box import Box
 from catstream.errors import CatstreamError
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import evaluate
-from catstream.evaluation.starts import FIRST, SHIFTS, Start, jittered, one_pass, spatial, temporal
 from catstream.settings import Settings
 
 

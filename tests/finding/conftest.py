@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from catstream.box import Box
-from catstream.learned import Learned
+from catstream.run.learned import Learned
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 

@@ -13,9 +13,9 @@ from contextlib import ExitStack
 import pytest
 from click.testing import CliRunner
 
+from catstream.applications.finding.log import SearchLog
 from catstream.cli.find import find
 from catstream.errors import CatstreamError
-from catstream.finding.log import SearchLog
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from catstream.applications.finding.files import File, find_files
 from catstream.errors import VideoError
-from catstream.finding.files import File, find_files
 from catstream.settings import RunSettings
 
 

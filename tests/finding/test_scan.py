@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from catstream.applications.finding.scan import Scan
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
-from catstream.finding.scan import Scan
 
 
 def every_window(cells, weights, bias, least):

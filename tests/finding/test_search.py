@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import catstream
+from catstream.applications.finding.files import File
+from catstream.applications.finding.log import SearchLog
+from catstream.applications.finding.search import Search, load_models
 from catstream.errors import ProtocolError, ServiceError, SettingsError, VideoError
-from catstream.finding.files import File
-from catstream.finding.log import SearchLog
-from catstream.finding.search import Search, load_models
 from catstream.video.writer import VideoWriter
 
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
+from catstream.applications.finding.sightings import Linker, Sighting
 from catstream.box import Box
-from catstream.finding.sightings import Linker, Sighting
 
 
 def sighting(time, x=0.0, size=40.0, name="anna", score=0.8):

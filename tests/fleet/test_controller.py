@@ -10,6 +10,7 @@ from importlib.machinery import ModuleSpec
 
 import pytest
 
+from catstream.client.registry import Registry
 from catstream.errors import FleetError, SilenceError, StoreError
 from catstream.fleet import controller as module
 from catstream.fleet.controller import Controller, Record
@@ -17,8 +18,7 @@ from catstream.fleet.life import Node
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
 from catstream.fleet.stream import Report
-from catstream.messages import StreamStatus
-from catstream.registry import Registry
+from catstream.messages.kinds import StreamStatus
 
 GATE, ROOF = StreamSpec("gate", "demo:1"), StreamSpec("roof", "demo:2", cores=0.5)
 SEARCHED = {"anna": "a"}

@@ -9,8 +9,8 @@ import jsonschema
 import pytest
 import yaml
 
+from catstream.client.registry import REGISTRY, REGISTRY_PORT
 from catstream.fleet import stream
-from catstream.registry import REGISTRY, REGISTRY_PORT
 from catstream.wire.channels import CHANNELS
 
 ROOT = Path(__file__).parents[2]

@@ -15,13 +15,13 @@ import psutil
 import pytest
 
 import catstream
+from catstream.client.registry import Registry
 from catstream.errors import FleetError, StoreError
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.local import LocalCluster
 from catstream.fleet.merge import merge_streams
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.registry import Registry
 from catstream.services.start import environment, python_command
 from catstream.wire.endpoint import fleets
 from tests.fleet.conftest import LIVE

@@ -16,12 +16,12 @@ from catstream.errors import FleetError
 from catstream.features.layout import row_length
 from catstream.fleet.merge import Part, apart, merge_in_pairs, merge_models, merge_streams, saved_part
 from catstream.fleet.store import Store
-from catstream.heads import APPEARANCE, EXTENT
-from catstream.job import Job
-from catstream.learned import Learned, merge
-from catstream.messages import DetectorState, Features, ObjectFeatures, TrainingRows
+from catstream.messages.heads import APPEARANCE, EXTENT
+from catstream.messages.kinds import DetectorState, Features, ObjectFeatures, TrainingRows
+from catstream.run.job import Job
+from catstream.run.learned import Learned, merge
+from catstream.run.state import files
 from catstream.settings import Settings
-from catstream.state import files
 
 SETTINGS = Settings(coreset={"size": 4})
 BOX = Box(1.0, 2.0, 30.0, 40.0)

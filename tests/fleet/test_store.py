@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from catstream import storage
 from catstream.errors import FencedError, FleetError, StoreError
 from catstream.fleet import objects
 from catstream.fleet.states import Listing
 from catstream.fleet.store import Store
+from catstream.messages import storage
 
 STATE = {"job.safetensors": secrets.token_bytes(300), "trees/12.safetensors": b""}
 SECRETS = {

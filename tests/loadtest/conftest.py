@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from catstream.applications.loadtest.latencies import Latencies
+from catstream.applications.loadtest.measures import Measures
+from catstream.applications.loadtest.plan import Plan
+from catstream.applications.loadtest.run import Result
 from catstream.box import Box
-from catstream.loadtest.latencies import Latencies
-from catstream.loadtest.measures import Measures
-from catstream.loadtest.plan import Plan
-from catstream.loadtest.run import Result
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.video.broadcast import Schedule
 
 BOX = Box(10.0, 10.0, 20.0, 20.0)

@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
+from catstream.applications.loadtest.latencies import PERCENTILES, Latencies
 from catstream.errors import VideoError
-from catstream.loadtest.latencies import PERCENTILES, Latencies
 
 
 def test_percentiles_are_those_of_the_sorted_latencies_to_three_digits(rng):

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from catstream.applications.loadtest.chaos import Kill
+from catstream.applications.loadtest.limits import KINDS, Limit, violations
+from catstream.applications.loadtest.plan import Plan
+from catstream.applications.loadtest.run import Recovery
+from catstream.applications.loadtest.search import find_highest_rate
 from catstream.errors import SettingsError
-from catstream.loadtest.chaos import Kill
-from catstream.loadtest.limits import KINDS, Limit, violations
-from catstream.loadtest.plan import Plan
-from catstream.loadtest.run import Recovery
-from catstream.loadtest.search import find_highest_rate
 from catstream.settings import Settings
 
 

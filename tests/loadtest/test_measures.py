@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.loadtest.measures import carried_forward, latencies_to_answer, measure
-from catstream.loadtest.observer import Observations
+from catstream.applications.loadtest.measures import carried_forward, latencies_to_answer, measure
+from catstream.applications.loadtest.observer import Observations
 
 TRUTH = np.tile((10.0, 10.0, 20.0, 20.0), (10, 1))
 

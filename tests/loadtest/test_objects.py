@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from catstream.applications.loadtest.objects import several
+from catstream.applications.loadtest.plan import Plan
 from catstream.errors import ObjectError, SettingsError
-from catstream.loadtest.objects import several
-from catstream.loadtest.plan import Plan
 from catstream.multi import MultiTracker
 from catstream.video.demo import render
 

@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import pytest
 
-from catstream.loadtest.chaos import Kill
-from catstream.loadtest.figures import to_json
-from catstream.loadtest.limits import Limit, violations
-from catstream.loadtest.load_test import LoadTest, Step
-from catstream.loadtest.report import write_report
-from catstream.loadtest.run import Recovery, Result
-from catstream.loadtest.usage import UsageReading
+from catstream.applications.loadtest.chaos import Kill
+from catstream.applications.loadtest.figures import to_json
+from catstream.applications.loadtest.limits import Limit, violations
+from catstream.applications.loadtest.load_test import LoadTest, Step
+from catstream.applications.loadtest.report import write_report
+from catstream.applications.loadtest.run import Recovery, Result
+from catstream.applications.loadtest.usage import UsageReading
 
 
 def is_search(*results: Result) -> LoadTest:

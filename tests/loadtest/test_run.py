@@ -12,11 +12,11 @@ from multiprocessing import resource_tracker
 import psutil
 import pytest
 
-from catstream.loadtest.chaos import Chaos
-from catstream.loadtest.limits import Limit
-from catstream.loadtest.load_test import run_load_test
-from catstream.loadtest.plan import Plan
-from catstream.loadtest.usage import REST, Usage
+from catstream.applications.loadtest.chaos import Chaos
+from catstream.applications.loadtest.limits import Limit
+from catstream.applications.loadtest.load_test import run_load_test
+from catstream.applications.loadtest.plan import Plan
+from catstream.applications.loadtest.usage import REST, Usage
 
 
 class Sleepers:
@@ -86,7 +86,7 @@ def test_chaos_does_not_kill_one_process_so_often_that_the_supervisor_gives_up(s
 def test_no_child_receives_ctrl_c():
     script = """if True:
         import time
-        from catstream.loadtest.children import SPAWN, start
+        from catstream.applications.loadtest.children import SPAWN, start
         child = SPAWN.Process(target=time.sleep, args=(600,))
         start(child)
         print(open(f"/proc/{child.pid}/status").read())

@@ -7,11 +7,11 @@ import subprocess
 
 import pytest
 
+from catstream.client.subscription import subscribe
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.pipeline import Pipeline
+from catstream.run.state import TREES
 from catstream.settings import Settings
-from catstream.state import TREES
-from catstream.subscription import subscribe
 
 #: A small window is soon full, a short pause soon over: the disk is noticed within this video.
 SETTINGS = Settings(run={"unstored_frames": 16, "checkpoint_seconds": 0.2})

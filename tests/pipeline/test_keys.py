@@ -6,11 +6,11 @@ from contextlib import suppress
 
 import pytest
 
+from catstream.client.subscription import subscribe
 from catstream.errors import ServiceError, SilenceError
 from catstream.pipeline import Pipeline
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
-from catstream.subscription import subscribe
 from catstream.wire.keys import allow, create
 
 

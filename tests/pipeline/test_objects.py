@@ -7,13 +7,13 @@ import signal
 
 import pytest
 
+from catstream.client.control import control
 from catstream.errors import CommandRejectedError
-from catstream.learned import Learned
-from catstream.messages import ObjectPosition, Position
+from catstream.messages.kinds import ObjectPosition, Position
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
+from catstream.run.learned import Learned
 from catstream.settings import Settings
-from catstream.steering import control
 from catstream.video.source import open_source
 from catstream.wire.keys import create
 

@@ -14,10 +14,10 @@ import pytest
 from catstream.errors import BoxError, ServiceError, VideoError
 from catstream.features import COMPILING, compiled
 from catstream.pipeline import Pipeline
-from catstream.recording.file import Recording
-from catstream.recording.learning import learn
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
+from catstream.sinks.recording.file import Recording
+from catstream.sinks.recording.learning import learn
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 from catstream.wire.channels import HEALTH, MODELS

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
+from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.services.previews import Previews
-from catstream.subscription import subscribe
 from catstream.video.demo import render
 from catstream.wire.endpoint import Endpoint
 

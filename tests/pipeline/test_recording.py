@@ -8,11 +8,11 @@ import signal
 import pytest
 
 from catstream.errors import RecordingError
-from catstream.messages import Features, Model
+from catstream.messages.kinds import Features, Model
 from catstream.pipeline import Pipeline
-from catstream.recording.file import Recording
-from catstream.recording.learning import learn
 from catstream.settings import Settings
+from catstream.sinks.recording.file import Recording
+from catstream.sinks.recording.learning import learn
 
 
 def test_no_features_are_missing_and_every_model_is_reproduced_whichever_process_dies(video, tmp_path):

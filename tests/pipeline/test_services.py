@@ -14,14 +14,14 @@ import pytest
 from catstream.box import Box
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
-from catstream.job import Job
-from catstream.messages import End, Track
+from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
-from catstream.recording.file import Recording
+from catstream.run.job import Job
+from catstream.run.state import TREES
 from catstream.services.start_server import NAMES
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.state import TREES
+from catstream.sinks.recording.file import Recording
 from catstream.video.source import open_source
 from catstream.wire.channels import HEALTH, TRACKS
 from catstream.wire.endpoint import Endpoint

@@ -6,7 +6,7 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
-from catstream.state import files, position, restore, skip
+from catstream.run.state import files, position, restore, skip
 
 
 @pytest.fixture

@@ -12,17 +12,17 @@ import cv2
 import pytest
 import zmq
 
+from catstream.client.control import control
+from catstream.client.subscription import subscribe
 from catstream.errors import CommandRejectedError, ObjectError, ProtocolError, ServiceError, SettingsError
-from catstream.learned import Learned
-from catstream.messages import Model
+from catstream.messages.kinds import Model
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
-from catstream.recording.file import Recording
-from catstream.recording.learning import learn
+from catstream.run.learned import Learned
 from catstream.services.desired import DesiredState
 from catstream.settings import Settings
-from catstream.steering import control
-from catstream.subscription import subscribe
+from catstream.sinks.recording.file import Recording
+from catstream.sinks.recording.learning import learn
 from catstream.video.source import open_source
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint

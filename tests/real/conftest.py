@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.applications.evaluation.datasets import Sequence, find_sequences
 
 DATA = Path(os.environ.get("TRACKING_DATA") or Path(__file__).parents[3] / "shared" / "data")
 

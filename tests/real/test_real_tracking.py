@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from catstream.evaluation.onepass import evaluate
+from catstream.applications.evaluation.onepass import evaluate
 from catstream.settings import Settings
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from catstream.applications.evaluation.datasets import find_sequences
 from catstream.errors import VideoError
-from catstream.evaluation.datasets import find_sequences
 from catstream.video.source import open_source
 
 VIDEOS = ["TLD_01_david", "TLD_02_jumping", "TLD_04_pedestrian2", "TLD_06_car", "TLD_10_panda"]

@@ -8,9 +8,9 @@ from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Run
-from catstream.recording.file import RecordingWriter
+from catstream.messages.kinds import Run
 from catstream.settings import Settings
+from catstream.sinks.recording.file import RecordingWriter
 from catstream.training.trainer import Trainer
 from catstream.video.source import open_source
 from catstream.wire.endpoint import Endpoint, private_folder

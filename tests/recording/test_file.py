@@ -19,10 +19,10 @@ from mcap.stream_reader import StreamReader
 
 from catstream.box import Box
 from catstream.errors import RecordingError
-from catstream.messages import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
-from catstream.recording.container import MAGIC, pack
-from catstream.recording.file import TOPICS, Recording, RecordingWriter
+from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
 from catstream.settings import Settings
+from catstream.sinks.recording.container import MAGIC, pack
+from catstream.sinks.recording.file import TOPICS, Recording, RecordingWriter
 from catstream.wire.codec import decode, encode
 
 

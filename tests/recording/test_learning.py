@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from catstream.errors import RecordingError
-from catstream.messages import Features, Model, ObjectFeatures, TrainingRows
-from catstream.recording.file import Recording
-from catstream.recording.learning import Prequential, learn, prequential_of_recorded
+from catstream.messages.kinds import Features, Model, ObjectFeatures, TrainingRows
+from catstream.sinks.recording.file import Recording
+from catstream.sinks.recording.learning import Prequential, learn, prequential_of_recorded
 from catstream.wire.codec import encode
 
 

@@ -9,10 +9,10 @@ import pytest
 
 import catstream
 from catstream.box import Box
-from catstream.messages import End, Features, Health, Model, Track
-from catstream.recording.file import Recording
-from catstream.recording.player import Player
-from catstream.subscription import wait_until_running
+from catstream.client.subscription import wait_until_running
+from catstream.messages.kinds import End, Features, Health, Model, Track
+from catstream.sinks.recording.file import Recording
+from catstream.sinks.recording.player import Player
 from catstream.wire.channels import HEALTH, TRACKS, TRAINING
 from catstream.wire.codec import encode
 from catstream.wire.newest import Publisher, Subscriber
@@ -104,7 +104,7 @@ def test_it_is_not_played_faster_than_wanted(written, endpoint, monkeypatch):
     moments = iter([99.0, 100.0, 101.0, 104.0])
     track = Track(1, 0, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 0)
     with monkeypatch.context() as clock:
-        clock.setattr("catstream.recording.file.time.time_ns", lambda: int(1e9 * next(moments)))
+        clock.setattr("catstream.sinks.recording.file.time.time_ns", lambda: int(1e9 * next(moments)))
         path = written([track, Health("trainer", 101.0), Health("detector", 104.0)])
     with Player(Recording(path), endpoint) as player:
         started = time.monotonic()

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from catstream.messages import Model
+from catstream.messages.kinds import Model
 
 #: Prints how many recorded models a replay reproduces, and digests of the models that it trains and of two models that
 #: a Tracker learns, merged. The replay is first: it then computes before a tracker has loaded the libraries.
@@ -19,8 +19,8 @@ from hashlib import blake2b
 from pathlib import Path
 
 import catstream
-from catstream.recording.file import Recording
-from catstream.recording.learning import learn
+from catstream.sinks.recording.file import Recording
+from catstream.sinks.recording.learning import learn
 from catstream.video.source import open_source
 from catstream.wire.codec import encode
 

@@ -9,8 +9,8 @@ from threading import Event
 
 import pytest
 
-from catstream.messages import FleetStatus
-from catstream.registry import RegistryServer
+from catstream.client.registry import RegistryServer
+from catstream.messages.kinds import FleetStatus
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, create
 

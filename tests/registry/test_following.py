@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 import catstream
 from catstream.box import Box
+from catstream.client.registry import FollowedStream, Place
+from catstream.client.subscription import wait_until_running
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import Answer, Command, End, FleetStatus, Health, StreamStatus, Track
-from catstream.registry import FollowedStream, Place
-from catstream.subscription import wait_until_running
+from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus, Track
 from catstream.wire.channels import CONTROL, HEALTH, TRACKS
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder

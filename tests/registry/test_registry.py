@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+from catstream.client.registry import Registry, address_of, fleet_and_stream, locate
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import FleetStatus, NodeStatus, StreamStatus
-from catstream.registry import Registry, address_of, fleet_and_stream, locate
+from catstream.messages.kinds import FleetStatus, NodeStatus, StreamStatus
 from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, running
 from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, public_key, revoke, synchronise
 from catstream.wire.rejects import rejects

@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from catstream.box import Box
 from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Command
+from catstream.messages.kinds import Command
 from catstream.multi import MultiTracker
 from catstream.services.commands import STOPPED, CommandHandler
 from catstream.services.desired import DesiredObject, DesiredState, PastObject
@@ -263,7 +263,7 @@ def test_commands_that_wait_when_the_stream_ends_are_rejected():
 
 def test_a_saved_model_that_is_too_large_for_the_message_of_a_frame_is_refused_and_the_run_goes_on(monkeypatch):
     data = saved().to_bytes()
-    monkeypatch.setattr("catstream.learned.LARGEST_GIVEN_MODELS", 2 * len(data))
+    monkeypatch.setattr("catstream.run.learned.LARGEST_GIVEN_MODELS", 2 * len(data))
     handler = CommandHandler(Detectors(QUICK.but({"run.objects_most": 3})), DesiredState(), ModelFiles(None))
     answers = [
         answer

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from catstream.messages import End, ObjectPosition, Position
+from catstream.messages.kinds import End, ObjectPosition, Position
 from catstream.services.progress import Progress
 
 WINDOW = 8

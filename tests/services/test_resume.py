@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Box, Window
-from catstream.messages import DetectorState, Model, ObjectPosition, Position
+from catstream.messages.kinds import DetectorState, Model, ObjectPosition, Position
 from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.resume import agree, start
 

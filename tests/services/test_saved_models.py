@@ -8,9 +8,9 @@ import pytest
 from catstream.box import Box, Window
 from catstream.compression.compressor import Compressor
 from catstream.features.layout import row_length
-from catstream.heads import APPEARANCE, EXTENT
-from catstream.learned import Learned
-from catstream.messages import DetectorState, ObjectFeatures, SavedModel, TrainingRows
+from catstream.messages.heads import APPEARANCE, EXTENT
+from catstream.messages.kinds import DetectorState, ObjectFeatures, SavedModel, TrainingRows
+from catstream.run.learned import Learned
 from catstream.services.saved_models import SavedModels
 from catstream.settings import Settings
 from catstream.wire.channels import SAVED_MODELS

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from catstream.job import Job
+from catstream.run.job import Job
 from catstream.services import start_server as module
 from catstream.services.process_log import ProcessLog
 from catstream.services.start_server import Request, start_server
@@ -192,7 +192,7 @@ def test_processes_of_one_server_have_random_numbers_of_their_own(server, start,
     numbers = "print(random.random(), numpy.random.random(), file=sys.stderr)"
     prefixed(
         monkeypatch,
-        "from catstream.threads import limit_process; limit_process(); "
+        "from catstream.numerics.threads import limit_process; limit_process(); "
         "import numpy, random, sys; from catstream.services import loop; "
         f"loop.run_child = lambda *_, **__: {numbers} or 0; ",
     )

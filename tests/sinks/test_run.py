@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import ObjectPosition, Position, Track
+from catstream.messages.kinds import ObjectPosition, Position, Track
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT, open_sink, reader
 from catstream.video.demo import write

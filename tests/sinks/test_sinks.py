@@ -13,7 +13,7 @@ import pytest
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.sinks.sink import SUFFIXES, open_sink, reader
 from catstream.sinks.sqlite import SqliteSink
 from catstream.video.results import ResultsWriter

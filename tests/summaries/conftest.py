@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.summaries.images import describe
+from catstream.applications.summaries.images import describe
 from catstream.video.source import open_source
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from catstream import summarize
+from catstream.applications.summaries.collection import Collection
+from catstream.applications.summaries.images import describe
 from catstream.errors import FrameError, SettingsError, VideoError
-from catstream.summaries.collection import Collection
-from catstream.summaries.images import describe
 
 
 def test_images_of_different_sizes_are_summarised(photographs):

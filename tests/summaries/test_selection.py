@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from catstream.applications.summaries.selection import RowSelection, Selection
+from catstream.applications.summaries.subset import choose, exchange
 from catstream.errors import SettingsError
-from catstream.summaries.selection import RowSelection, Selection
-from catstream.summaries.subset import choose, exchange
 
 ROUNDING = 1e-5  # of float32
 

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from catstream.applications.summaries.taught import Novelty, TaughtFrame, most_taught, taught_frames
 from catstream.compression.tree import REDUCTIONS
 from catstream.errors import SettingsError
-from catstream.heads import APPEARANCE
-from catstream.messages import Features, ObjectFeatures, TrainingRows
+from catstream.messages.heads import APPEARANCE
+from catstream.messages.kinds import Features, ObjectFeatures, TrainingRows
 from catstream.settings import CoresetSettings
-from catstream.summaries.taught import Novelty, TaughtFrame, most_taught, taught_frames
 
 WIDTH, CHANGE = 400, 25
 

@@ -10,7 +10,7 @@ from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
 from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Summary
+from catstream.messages.kinds import Summary
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 

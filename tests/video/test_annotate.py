@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.colours import Colours, rgb
 from catstream.errors import VideoError
-from catstream.messages import State, Track
+from catstream.messages.kinds import State, Track
 from catstream.video.annotate import AnnotatedVideo, draw, thumbnail
+from catstream.video.palette import Colours, rgb
 from catstream.video.source import open_source
 
 BOX = Box(40, 30, 60, 40)

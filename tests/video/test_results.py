@@ -10,7 +10,7 @@ import pytest
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages import Track
+from catstream.messages.kinds import Track
 from catstream.video.results import ResultsWriter, complete_rows
 
 BOX = Box(1, 2, 3.5, 4.25)

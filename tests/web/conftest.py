@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.messages import (
+from catstream.client.registry import RegistryServer
+from catstream.messages.kinds import (
     Features,
     FleetStatus,
     Health,
@@ -26,7 +27,6 @@ from catstream.messages import (
     Track,
     TrainingRows,
 )
-from catstream.registry import RegistryServer
 from catstream.web.app import pipeline_site
 from catstream.web.fleet_app import fleet_site
 from catstream.web.server import Server

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from catstream.messages import Preview
+from catstream.messages.kinds import Preview
 from catstream.web import connections
 from catstream.web.dashboard import Dashboard
 

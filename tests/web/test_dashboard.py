@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from catstream.colours import PALETTE
-from catstream.heads import TREES
-from catstream.messages import End, Health
+from catstream.messages.heads import TREES
+from catstream.messages.kinds import End, Health
+from catstream.video.palette import PALETTE
 from catstream.web.dashboard import Dashboard
 
 

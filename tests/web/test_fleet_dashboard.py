@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from catstream.messages import FleetStatus, NodeStatus, StreamStatus
+from catstream.messages.kinds import FleetStatus, NodeStatus, StreamStatus
 from catstream.web.fleet_dashboard import FleetDashboard, in_order, stream_card
 
 NORTH = NodeStatus("north-1", "alive", "10.0.0.2", 4.0, 1.5, {"site": "north"}, 2)

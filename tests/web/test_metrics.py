@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.messages import Health
+from catstream.messages.kinds import Health
 from catstream.web import metrics
 from catstream.web.feed import Feed
 

@@ -19,7 +19,7 @@ import pytest
 from catstream.detection.objects import Detectors
 from catstream.errors import ServiceError
 from catstream.features.pyramid import Pyramid
-from catstream.messages import Health
+from catstream.messages.kinds import Health
 from catstream.services.commands import CommandHandler
 from catstream.services.control import CommandChannel
 from catstream.services.desired import DesiredState

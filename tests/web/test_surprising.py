@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from catstream.messages import Model, TrainingRows
+from catstream.messages.kinds import Model, TrainingRows
 from catstream.web.surprising import SurprisingFrames, surprise
 
 

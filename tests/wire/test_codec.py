@@ -17,7 +17,7 @@ from catstream.box import Box, Window
 from catstream.detection.objects import Detectors
 from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
-from catstream.messages import (
+from catstream.messages.kinds import (
     LARGEST_GIVEN_MODELS,
     Answer,
     Command,
@@ -44,7 +44,18 @@ from catstream.messages import (
     Tracks,
     TrainingRows,
 )
-from catstream.schema import LARGEST_INTEGER, Array, ByObject, Bytes, Field, Name, Named, OnlyWith, Whole, fields
+from catstream.messages.schema import (
+    LARGEST_INTEGER,
+    Array,
+    ByObject,
+    Bytes,
+    Field,
+    Name,
+    Named,
+    OnlyWith,
+    Whole,
+    fields,
+)
 from catstream.settings import RunSettings, Settings
 from catstream.video import demo
 from catstream.wire.channels import CHANNELS

@@ -10,9 +10,9 @@ import pytest
 import zmq
 
 from catstream.box import Box
+from catstream.client.control import Control
 from catstream.errors import CommandRejectedError, ProtocolError, SilenceError
-from catstream.messages import Answer, Command
-from catstream.steering import Control
+from catstream.messages.kinds import Answer, Command
 from catstream.wire import commands
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.codec import decode, encode

@@ -13,7 +13,7 @@ from catstream.wire.endpoint import Endpoint
 SENDER = """
 import sys
 import numpy as np
-from catstream.messages import Features, ObjectFeatures, Position, TrainingRows
+from catstream.messages.kinds import Features, ObjectFeatures, Position, TrainingRows
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES
 from catstream.wire.endpoint import Endpoint

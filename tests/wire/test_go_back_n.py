@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from catstream.errors import ProtocolError, StreamRewoundError
-from catstream.messages import ObjectPosition, Position, Stored
+from catstream.messages.kinds import ObjectPosition, Position, Stored
 from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow
 
 STRANGER = b"stranger"

@@ -12,7 +12,7 @@ import zmq
 
 import catstream
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages import (
+from catstream.messages.kinds import (
     Answer,
     Command,
     End,

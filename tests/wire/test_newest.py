@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from catstream.messages import End, Model, Sample, Summary, Track
+from catstream.messages.kinds import End, Model, Sample, Summary, Track
 from catstream.wire.channels import MODELS, SAMPLES, TRACKS
 from catstream.wire.codec import encode, opening, topic_of
 from catstream.wire.endpoint import Endpoint, private_folder

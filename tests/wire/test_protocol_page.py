@@ -17,8 +17,8 @@ import msgpack
 import pytest
 
 from catstream.box import Box, Window
-from catstream.heads import TREES
-from catstream.messages import (
+from catstream.messages.heads import TREES
+from catstream.messages.kinds import (
     DetectorState,
     End,
     Motion,
@@ -31,7 +31,7 @@ from catstream.messages import (
     Track,
     TrainingRows,
 )
-from catstream.schema import (
+from catstream.messages.schema import (
     LARGEST_INTEGER,
     LONGEST_LIST,
     LONGEST_TEXT,

@@ -14,7 +14,18 @@ import pytest
 import zmq
 
 from catstream.errors import ProtocolError, ServiceError
-from catstream.messages import End, Health, Model, ObjectPosition, Position, Sample, Stored, Summary, Track, Tracks
+from catstream.messages.kinds import (
+    End,
+    Health,
+    Model,
+    ObjectPosition,
+    Position,
+    Sample,
+    Stored,
+    Summary,
+    Track,
+    Tracks,
+)
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, FEATURES, HEALTH, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.codec import decode, encode
@@ -318,7 +329,7 @@ def test_the_bytes_of_a_stranger_are_counted_and_dropped(endpoint, stranger, unt
 #: Takes nothing while its queue is full and the sender dies, for longer than any timer of ZeroMQ.
 BUSY_RECEIVER = """
 import sys, time
-from catstream.messages import Position
+from catstream.messages.kinds import Position
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import RESULTS
 from catstream.wire.endpoint import Endpoint

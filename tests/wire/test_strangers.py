@@ -11,7 +11,7 @@ import zmq
 
 from catstream.compression.forest import Forest
 from catstream.errors import ProtocolError
-from catstream.messages import (
+from catstream.messages.kinds import (
     Command,
     End,
     Features,

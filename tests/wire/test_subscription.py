@@ -14,7 +14,7 @@ import zmq
 import catstream
 from catstream.box import Box
 from catstream.errors import ObjectError, ServiceError, SilenceError
-from catstream.messages import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
+from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
 from catstream.wire import socket
 from catstream.wire.announced import Announcement, readers_of
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING

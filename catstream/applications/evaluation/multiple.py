@@ -1,0 +1,121 @@
+"""Measures for several objects: MOTA and IDF1 by py-motmetrics, and HOTA.
+
+HOTA is computed here (Luiten et al., "HOTA: A Higher Order Metric for Evaluating Multi-Object Tracking", 2021): the
+libraries that have it cannot be installed beside the headless OpenCV.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from catstream.box import Box
+from catstream.errors import require_extra
+
+__all__ = ["Boxes", "MultipleScores", "hota", "score_multiple"]
+
+#: The box of each object in one frame by name; None while it is absent.
+Boxes = Mapping[str, Box | None]
+
+_OVERLAP = 0.5  # with the truth, from which a box counts as found in MOTA and IDF1
+_ALPHAS = np.arange(0.05, 0.99, 0.05)  # the overlaps over which HOTA is averaged
+
+
+#: Objects of the truth, objects that were found, and the overlap of each pair, of one frame.
+_Frame = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, slots=True)
+class MultipleScores:
+    """Accuracy of the tracks of several objects; all shares are 1 at best.
+
+    mota      1 - (missed + false boxes + identity switches) / boxes of the truth
+    idf1      F1 score of the boxes that have the right identity
+    hota      higher order tracking accuracy, the mean over the overlaps 0.05, 0.1 ... 0.95
+    switches  how often an object of the truth is followed under another name than before
+    """
+
+    mota: float
+    idf1: float
+    hota: float
+    switches: int
+
+
+def score_multiple(truth: Sequence[Boxes], found: Sequence[Boxes]) -> MultipleScores:
+    """Compare the boxes that were found with the truth, frame by frame.
+
+    The names need not agree: an object of the truth is compared with the object that overlaps it.
+
+    Raises
+    ------
+    MissingExtraError
+        If py-motmetrics is not installed.
+    """
+    require_extra("mot")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of pandas and motmetrics, about their own code
+        import motmetrics
+
+        accumulator = motmetrics.MOTAccumulator(auto_id=True)
+        for rows, columns, overlaps in _numbered(truth, found)[0]:
+            accumulator.update(rows, columns, np.where(overlaps >= _OVERLAP, 1 - overlaps, np.nan))
+        names = ["mota", "idf1", "num_switches"]
+        row: Any = motmetrics.metrics.create().compute(accumulator, metrics=names).iloc[0]
+    return MultipleScores(float(row.mota), float(row.idf1), hota(truth, found), int(row.num_switches))
+
+
+def hota(truth: Sequence[Boxes], found: Sequence[Boxes]) -> float:
+    """Higher order tracking accuracy: the mean over the overlaps of sqrt(detection accuracy * association accuracy).
+
+    Examples
+    --------
+    >>> frames = [{"anna": Box(0, 0, 10, 10), "ben": Box(50, 0, 10, 10)}] * 4
+    >>> float(hota(frames, frames))
+    1.0
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    frames, (true_total, found_total) = _numbered(truth, found)
+    if not true_total or not found_total:
+        return 0.0
+    together = np.zeros((true_total, found_total))
+    true_count, found_count = np.zeros((true_total, 1)), np.zeros((1, found_total))
+    for rows, columns, overlaps in frames:
+        union = overlaps.sum(axis=0) + overlaps.sum(axis=1, keepdims=True) - overlaps
+        together[np.ix_(rows, columns)] += np.divide(overlaps, union, out=np.zeros_like(overlaps), where=union > 0)
+        true_count[rows] += 1
+        found_count[:, columns] += 1
+    aligned = together / (true_count + found_count - together)
+    matches = np.zeros((len(_ALPHAS), *together.shape))
+    for rows, columns, overlaps in frames:
+        chosen = linear_sum_assignment(-aligned[np.ix_(rows, columns)] * overlaps)
+        for i, alpha in enumerate(_ALPHAS):
+            enough = overlaps[chosen] >= alpha - np.finfo(float).eps
+            matches[i, rows[chosen[0][enough]], columns[chosen[1][enough]]] += 1
+    right = matches.sum(axis=(1, 2))
+    detection = right / (true_count.sum() + found_count.sum() - right)
+    jaccard = matches / (true_count + found_count - matches)
+    association = (matches * jaccard).sum(axis=(1, 2)) / np.maximum(right, 1)
+    return float(np.sqrt(detection * association).mean())
+
+
+def _present(boxes: Boxes) -> dict[str, Box]:
+    return {name: box for name, box in boxes.items() if box is not None}
+
+
+def _numbered(truth: Sequence[Boxes], found: Sequence[Boxes]) -> tuple[list[_Frame], tuple[int, int]]:
+    """The objects of each frame as numbers, with the overlaps of their boxes, and how many objects there are in all."""
+    names = [sorted({name for boxes in each for name in _present(boxes)}) for each in (truth, found)]
+    frames = []
+    for pair in zip(truth, found, strict=True):
+        boxes = [_present(each) for each in pair]
+        rows, columns = (
+            np.array([of.index(name) for name in each], int) for of, each in zip(names, boxes, strict=True)
+        )
+        overlaps = [[box.overlap(other) for other in boxes[1].values()] for box in boxes[0].values()]
+        frames.append((rows, columns, np.array(overlaps, float).reshape(len(rows), len(columns))))
+    return frames, (len(names[0]), len(names[1]))

@@ -1,0 +1,176 @@
+"""The output of one tracker on one sequence, and its files.
+
+The files have the layouts of the benchmarks' toolkits:
+
+    TRACKER/NAME.txt, TRACKER/times/NAME_time.txt      got10k's layout for OTB
+    TRACKER/longterm/NAME/NAME_001.txt                 that of the VOT toolkit's long-term experiment, with
+                          NAME_001_confidence.value    the confidence
+                          NAME_001_time.value          and seconds a frame
+    catstream/settings.json                            settings and versions of the runs
+
+A run is stored as a sequence of its own: NAME if it starts with the first box of the ground truth, otherwise
+NAME@FRAME (a later frame), NAME@VARIATION (a changed first box, for example walk@left) or NAME@FRAME-VARIATION.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.metrics import Score, score
+from catstream.applications.evaluation.peers import OPENCV
+from catstream.applications.evaluation.starts import Start
+from catstream.errors import CatstreamError, SettingsError, VideoError
+from catstream.numerics.arrays import Float64
+from catstream.settings import Settings
+
+__all__ = ["EvaluationRun", "load", "prepare_folder", "run_name", "save"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EvaluationRun:
+    """The output of one tracker on one sequence from one start.
+
+    tracker     name of the tracker
+    sequence    the whole sequence
+    start       frame and variation of the first box
+    boxes       float64 (frames, 4) from this frame on, the first as given; NaN if the tracker reported no box
+    confidence  float64 (frames,)
+    seconds     float64 (frames,), time of the tracker alone, without reading the frame
+    """
+
+    tracker: str
+    sequence: Sequence
+    start: Start
+    boxes: Float64
+    confidence: Float64
+    seconds: Float64
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence and of the start."""
+        return run_name(self.sequence, self.start)
+
+    @property
+    def truth(self) -> Float64:
+        """Ground truth of the frames of this run, float64 (frames, 4)."""
+        return self.sequence.boxes[self.start.frame :]
+
+    @property
+    def fps(self) -> float:
+        """Frames per second without the first frame, which initialises the tracker."""
+        return (len(self.seconds) - 1) / max(float(self.seconds[1:].sum()), 1e-9)
+
+    def score(self) -> Score:
+        """Return the measures of this run."""
+        return score(self.boxes, self.truth, self.confidence)
+
+
+def run_name(sequence: Sequence, start: Start) -> str:
+    """Return the name of a run."""
+    return sequence.name + start.suffix
+
+
+def prepare_folder(output: Path, settings: Settings) -> None:
+    """Make the folder for runs, and verify that runs in it were made with the same settings and versions.
+
+    Raises
+    ------
+    SettingsError
+        If they were not; the message names the settings that differ.
+    VideoError
+        If the folder cannot be written to.
+    """
+    file = output / "catstream" / "settings.json"
+    values = settings.values() | {"catstream": version("catstream"), "opencv": OPENCV}
+    try:
+        if file.exists():
+            before = json.loads(file.read_text(encoding="utf-8"))
+            changed = sorted(key for key in {*before, *values} if before.get(key) != values.get(key))
+            if changed:
+                raise SettingsError(
+                    f"the runs in {str(output)!r} were made with other settings or versions ({', '.join(changed)}): "
+                    "give another --output, or remove that folder"
+                )
+        else:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise VideoError(f"cannot write results to {str(output)!r} ({error.strerror}): give another folder") from None
+
+
+def _files(output: Path, tracker: str, name: str) -> tuple[Path, Path, Path]:
+    """Return the paths of boxes, confidence and times of a run in the VOT toolkit's layout."""
+    folder, stem = output / tracker / "longterm" / name, f"{name}_001"
+    return folder / f"{stem}.txt", folder / f"{stem}_confidence.value", folder / f"{stem}_time.value"
+
+
+def save(output: Path, run: EvaluationRun) -> None:
+    """Write a run. The folder in VOT's layout is renamed into place last: its existence marks the run as complete.
+
+    Raises
+    ------
+    VideoError
+        If a file cannot be written.
+    """
+    boxes, confidence, seconds = _files(output, run.tracker, run.name)
+    folder, home = boxes.parent, output / run.tracker
+    part = folder.with_name(folder.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        for made in (part, home / "times"):
+            made.mkdir(parents=True, exist_ok=True)
+        np.savetxt(home / f"{run.name}.txt", run.boxes, fmt="%.4f", delimiter=",")
+        np.savetxt(home / "times" / f"{run.name}_time.txt", run.seconds, fmt="%.8f")
+        np.savetxt(part / boxes.name, run.boxes, fmt="%.4f", delimiter=",")
+        np.savetxt(part / confidence.name, run.confidence, fmt="%.6f")
+        np.savetxt(part / seconds.name, run.seconds, fmt="%.8f")
+        part.rename(folder)
+    except OSError as error:
+        raise VideoError(f"its result cannot be written to {str(home)!r} ({error.strerror}): free some space") from None
+
+
+def load(output: Path, tracker: str, sequence: Sequence, start: Start) -> EvaluationRun | None:
+    """Return a complete run, or None if there is none or it started with another box.
+
+    Raises
+    ------
+    CatstreamError
+        If its files cannot be read.
+    """
+    boxes, confidence, seconds = _files(output, tracker, run_name(sequence, start))
+    if not boxes.parent.is_dir():
+        return None
+    try:
+        run = EvaluationRun(
+            tracker,
+            sequence,
+            start,
+            np.loadtxt(boxes, delimiter=",", ndmin=2),
+            np.loadtxt(confidence, ndmin=1),
+            np.loadtxt(seconds, ndmin=1),
+        )
+    except (OSError, ValueError) as error:
+        raise CatstreamError(f"{str(boxes.parent)!r} cannot be read ({error}): remove it to repeat the run") from None
+    if not len(sequence) - start.frame == len(run.boxes) == len(run.confidence) == len(run.seconds):
+        return None
+    return run if _has_first_box(run) else None
+
+
+def _has_first_box(run: EvaluationRun) -> bool:
+    """Return whether a stored run has the first box of its start. Only if it may have been moved is a frame read."""
+    if np.array_equal(run.boxes[0], np.round(run.start.box(run.sequence), 4)):
+        return True
+    if run.start.variation.name:
+        with suppress(VideoError):  # the run is repeated, and reports the error
+            size = run.sequence.size(run.start.frame)
+            return np.array_equal(run.boxes[0], np.round(run.start.box(run.sequence, size), 4))
+    return False

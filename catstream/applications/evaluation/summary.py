@@ -1,0 +1,140 @@
+"""Summaries of runs: a row for each sequence and tracker, the mean of each tracker, and both as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean, pstdev
+
+from catstream.applications.evaluation.provenance import provenance
+from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.settings import Settings
+
+__all__ = ["FLIP", "MEASURES", "Row", "by_attribute", "describe_flips", "flips_of", "mean_of", "rows_of", "to_json"]
+
+#: The measures of a row that are averaged.
+MEASURES = ("auc", "success", "precision", "normalised_precision", "f_score", "fps")
+
+#: Difference of the smallest and the largest success over several first boxes, above which a sequence flips.
+FLIP = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The measures of one tracker on one sequence: means over its runs.
+
+    `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and `normalised_precision` are those of `metrics.py`,
+    from 0 to 1. `f_score` and its two components are None if the object is never absent. The spreads are standard
+    deviations over the runs. `flips` is None unless the runs have different first boxes; it is true if their smallest
+    and largest success differ by more than 0.25: then chance decides.
+    """
+
+    name: str
+    tracker: str
+    frames: int
+    runs: int
+    auc: float
+    auc_spread: float
+    success: float
+    success_spread: float
+    precision: float
+    normalised_precision: float
+    f_score: float | None
+    long_term_precision: float | None
+    long_term_recall: float | None
+    flips: bool | None
+    fps: float
+
+
+def rows_of(runs: Iterable[EvaluationRun]) -> list[Row]:
+    """Return a row for each sequence and tracker, in order of first occurrence."""
+    groups: dict[tuple[str, str], list[EvaluationRun]] = {}
+    for run in runs:
+        groups.setdefault((run.sequence.name, run.tracker), []).append(run)
+    return [_row(name, tracker, group) for (name, tracker), group in groups.items()]
+
+
+def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
+    """Return the mean of each measure over the sequences, by tracker; that of the F-score over those that have one."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row.tracker, []).append(row)
+    return {
+        tracker: {measure: _mean(getattr(row, measure) for row in group) for measure in MEASURES}
+        for tracker, group in groups.items()
+    }
+
+
+def by_attribute(
+    rows: Iterable[Row], attributes: Mapping[str, Sequence[str]]
+) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Return the means of each tracker over the sequences with an attribute: {attribute: {tracker: {measure: mean}}}.
+
+    attributes : names of the sequences that have each attribute
+    """
+    rows = list(rows)
+    means = {attribute: mean_of(row for row in rows if row.name in names) for attribute, names in attributes.items()}
+    return {attribute: mean for attribute, mean in means.items() if mean}
+
+
+def flips_of(rows: Iterable[Row]) -> dict[str, list[str]]:
+    """Return the names of the sequences that flip, by tracker; only trackers whose runs have different first boxes."""
+    found: dict[str, list[str]] = {}
+    for row in rows:
+        if row.flips is not None:
+            found.setdefault(row.tracker, []).extend([row.name] if row.flips else [])
+    return found
+
+
+def describe_flips(rows: Iterable[Row]) -> list[str]:
+    """Return the number and the names of the sequences that flip, a sentence for each tracker as in `flips_of`."""
+    rows = list(rows)
+    count = len({row.name for row in rows})
+    return [
+        f"{tracker}: {len(names)} of {count} sequences flip with the first box (success differs by more than {FLIP})"
+        + (f": {', '.join(names)}" if names else "")
+        for tracker, names in flips_of(rows).items()
+    ]
+
+
+def to_json(rows: list[Row], settings: Settings, attributes: Mapping[str, Sequence[str]]) -> dict[str, object]:
+    """Return the JSON of `catstream evaluate --json`: rows, means, flips and attributes, and provenance."""
+    means = by_attribute(rows, attributes)
+    return {
+        **provenance(settings),
+        "sequences": [dataclasses.asdict(row) for row in rows],
+        "mean": mean_of(rows),
+        "flips": flips_of(rows),
+        "attributes": {
+            attribute: {"sequences": list(attributes[attribute]), "mean": mean} for attribute, mean in means.items()
+        },
+    }
+
+
+def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
+    scores = [run.score() for run in runs]
+    success = [score.success for score in scores]
+    long = [score.long_term for score in scores if score.long_term is not None]
+    return Row(
+        name=name,
+        tracker=tracker,
+        frames=len(runs[0].sequence),
+        runs=len(runs),
+        auc=fmean(score.auc for score in scores),
+        auc_spread=pstdev(score.auc for score in scores),
+        success=fmean(success),
+        success_spread=pstdev(success),
+        precision=fmean(score.precision for score in scores),
+        normalised_precision=fmean(score.normalised_precision for score in scores),
+        f_score=_mean(part.f_score for part in long),
+        long_term_precision=_mean(part.precision for part in long),
+        long_term_recall=_mean(part.recall for part in long),
+        flips=max(success) - min(success) > FLIP if any(run.start.variation.name for run in runs) else None,
+        fps=fmean(run.fps for run in runs),
+    )
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None

@@ -1,0 +1,179 @@
+"""Computes the measures of one stream under load from the messages that were received.
+
+Every due frame counts once, tracked or skipped. Its track latency ends with the first track of this frame or a newer
+one; its model latency ends with the first model whose training sample includes this frame or a newer one. Thus a
+pipeline does not get better figures by skipping frames while it is slow (no coordinated omission).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from catstream.applications.evaluation.metrics import overlaps
+from catstream.applications.loadtest.latencies import Latencies
+from catstream.applications.loadtest.observer import Observations
+from catstream.video.broadcast import Schedule
+
+__all__ = ["Measures", "carried_forward", "latencies_to_answer", "measure"]
+
+_SUCCESS = 0.5  # a frame with a larger overlap with the ground truth is a success
+
+
+@dataclass(slots=True)
+class Measures:
+    """The measures of one stream.
+
+    due              due time of each frame, float64 (frames,)
+    followed         whether each frame has a track, bool (frames,)
+    track            seconds from the due time of each frame to the track of this frame or a newer one
+    model            seconds to the model trained on this frame or a newer one
+    without_track    frames without such a track until the end of the run, which counts as their arrival
+    success          share of frames with the object whose overlap is above 0.5; a skipped frame has the last known box
+    success_followed the same share of the tracked frames alone; None if there are none
+    lag              reports of the number of messages that the compressor had not received: arrival time and number
+    sent, stored     number of features messages at the end; None if the stream has not ended
+    """
+
+    due: np.ndarray
+    followed: np.ndarray
+    track: Latencies
+    model: Latencies
+    without_track: int
+    success: float | None
+    success_followed: float | None
+    lag: list[tuple[float, int]] = field(default_factory=list)
+    sent: int | None = None
+    stored: int | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of due frames."""
+        return len(self.due)
+
+    @property
+    def skipped(self) -> int:
+        """Number of frames without a track of their own."""
+        return self.frames - int(self.followed.sum())
+
+    @property
+    def skipped_share(self) -> float:
+        return self.skipped / self.frames
+
+    def rate(self, rate: float) -> float:
+        """Return the tracked frames per second if `rate` frames per second were due."""
+        return rate * (1 - self.skipped_share)
+
+    @property
+    def max_lag(self) -> int:
+        return max((behind for _, behind in self.lag), default=0)
+
+
+def measure(
+    observations: Observations, schedule: Schedule, frames: int, truth: np.ndarray, end: float, totals: dict[str, int]
+) -> Measures:
+    """Compute the measures of one stream.
+
+    Parameters
+    ----------
+    observations : messages of the stream
+    schedule : schedule of the camera
+    frames : number of due frames: all of the schedule, or those before an interruption
+    truth : ground truth, float64 (pictures, 4), NaN if the object is absent
+    end : time at which the observation ended
+    totals : totals of the pipeline at its end
+    """
+    due = np.array([schedule.due(number) for number in range(frames)])
+    tracks = [
+        (moment, track, schedule.number(track.pts)) for moment, track in observations.tracks if track.pts is not None
+    ]
+    numbers = np.array([number for *_, number in tracks], int)
+    to_track, without_track = latencies_to_answer(due, numbers, np.array([moment for moment, *_ in tracks]), end)
+    models = _models(observations, schedule)
+    to_model, _ = latencies_to_answer(
+        due, np.array([number for _, number in models], int), np.array([at for at, _ in models]), end
+    )
+
+    boxes = np.full((frames, 4), np.nan)
+    followed = np.zeros(frames, bool)
+    for _, track, number in tracks:
+        if 0 <= number < frames:
+            boxes[number], followed[number] = track.box or np.nan, True
+    true = truth[[schedule.picture(number, len(truth)) for number in range(frames)]]
+    return Measures(
+        due=due,
+        followed=followed,
+        track=Latencies(to_track),
+        model=Latencies(to_model),
+        without_track=without_track,
+        success=_success(carried_forward(boxes, followed), true),
+        success_followed=_success(boxes[followed], true[followed]),
+        lag=[
+            (moment, int(health.counters["sent"] - health.counters["taken"]))
+            for moment, health in observations.health
+            if health.process == "detector" and schedule.start <= moment <= end
+        ],
+        sent=totals.get("sent"),
+        stored=totals.get("stored"),
+    )
+
+
+def latencies_to_answer(
+    due: np.ndarray, numbers: np.ndarray, moments: np.ndarray, end: float
+) -> tuple[np.ndarray, int]:
+    """Return the seconds from each frame's due time to the first answer for this frame or a newer one.
+
+    Parameters
+    ----------
+    due : due times, float64 (frames,)
+    numbers, moments : frame number and arrival time of each answer, int and float64 (answers,)
+    end : arrival time that is assumed for frames without an answer
+
+    Returns
+    -------
+    float64 (frames,), and the number of frames without an answer
+
+    >>> latencies_to_answer(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0, 2]), np.array([0.5, 2.5]), end=9.0)
+    (array([0.5, 1.5, 0.5, 6. ]), 1)
+    """
+    frames = len(due)
+    first = np.full(frames, np.inf)
+    known = numbers >= 0
+    np.minimum.at(first, np.minimum(numbers[known], frames - 1), moments[known])
+    first = np.minimum.accumulate(first[::-1])[::-1]
+    return np.minimum(first, end) - due, int(np.isinf(first).sum())
+
+
+def carried_forward(boxes: np.ndarray, followed: np.ndarray) -> np.ndarray:
+    """Return the last known box at each frame: its own, or that of the last tracked frame before it.
+
+    >>> carried_forward(np.array([[1.0], [2.0], [3.0]]), np.array([False, True, False])).ravel()
+    array([nan,  2.,  2.])
+    """
+    last = np.maximum.accumulate(np.where(followed, np.arange(len(boxes)), -1))
+    return np.where(last[:, None] >= 0, boxes[last], np.nan)
+
+
+def _success(boxes: np.ndarray, truth: np.ndarray) -> float | None:
+    present = np.isfinite(truth).all(axis=1)
+    return float((overlaps(boxes, truth)[present] > _SUCCESS).mean()) if present.any() else None
+
+
+def _models(observations: Observations, schedule: Schedule) -> list[tuple[float, int]]:
+    """Return the arrival time of each model, and the newest frame of its sample as a number of the schedule.
+
+    After a restart, the detector reuses the numbers of frames that were lost. The mapping from its frame numbers to the
+    schedule therefore depends on the time.
+    """
+    number_of_frame: dict[int, int] = {}
+    models, tracks = [], iter(observations.tracks)
+    ahead = next(tracks, None)
+    for moment, frame in observations.models:
+        while ahead is not None and ahead[0] <= moment:
+            if ahead[1].pts is not None:
+                number_of_frame[ahead[1].frame] = schedule.number(ahead[1].pts)
+            ahead = next(tracks, None)
+        if frame in number_of_frame:
+            models.append((moment, number_of_frame[frame]))
+    return models

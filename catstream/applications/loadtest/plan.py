@@ -1,0 +1,75 @@
+"""The plan of a load test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from catstream.errors import SettingsError
+from catstream.messages.names import check_count
+from catstream.settings import Settings
+from catstream.video import demo
+
+__all__ = ["Plan"]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The parameters of one run.
+
+    streams      number of pipelines, each of three processes
+    objects      number of objects that each pipeline tracks
+    subscribers  number of subscribers to the tracks of each stream
+    slow         number of those that are slow; half of these are frozen instead
+    rate         frames per second of each stream, whether or not the pipeline keeps up
+    duration     seconds
+    size         (width, height) of a frame in pixels
+    chaos        whether random processes are killed during the run
+    settings     settings of all pipelines; their seed is used for the chaos too
+
+    Raises
+    ------
+    SettingsError
+        If the parameters contradict one another, or a setting is not possible in a load test.
+    ObjectError
+        If there are too many objects.
+    """
+
+    streams: int = 1
+    objects: int = 1
+    subscribers: int = 0
+    slow: int = 0
+    rate: float = 25.0
+    duration: float = 10.0
+    size: tuple[int, int] = demo.SIZE
+    chaos: bool = False
+    settings: Settings = field(default_factory=Settings)
+
+    def __post_init__(self) -> None:
+        if self.slow > self.subscribers:
+            raise SettingsError(
+                f"{self.slow} of {self.subscribers} subscribers cannot be slow: give more, or fewer slow ones"
+            )
+        if self.frames < 1:
+            raise SettingsError(
+                f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: give a higher rate or more seconds"
+            )
+        check_count(self.objects, self.settings.run.objects_most)
+        if self.settings.run.lockstep:
+            raise SettingsError("the frames of a load test do not wait for models: leave out lockstep")
+        if self.settings.run.endpoint:
+            raise SettingsError("each stream of a load test has an endpoint of its own: leave out endpoint")
+
+    def __str__(self) -> str:
+        streams = f"{self.streams} streams" if self.streams > 1 else "1 stream"
+        objects = f", {self.objects} objects" if self.objects > 1 else ""
+        return f"{streams} of {self.size[0]}x{self.size[1]} pixels{objects}, {self.rate:g} frames/s due in each"
+
+    @property
+    def frozen(self) -> int:
+        """Number of the slow subscribers that are frozen."""
+        return self.slow // 2
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of each stream."""
+        return round(self.rate * self.duration)

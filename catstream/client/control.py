@@ -1,0 +1,241 @@
+"""Send commands to a running pipeline: set a box, search for an object, forget one, pause, resume, save, stop.
+
+    import catstream
+
+    with catstream.control("run") as pipeline:
+        pipeline.set_box((120, 80, 64, 48), "anna")
+
+A command is resent until it is answered, and is executed once.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import replace
+from time import monotonic
+from typing import Self
+from uuid import uuid4
+
+from catstream.box import Box
+from catstream.client.registry import fleet_and_stream, locate
+from catstream.errors import CommandRejectedError, SilenceError
+from catstream.messages.kinds import Answer, Command, SavedModel
+from catstream.messages.names import UNNAMED, check_name
+from catstream.run.learned import Learned
+from catstream.wire.channels import CONTROL, SAVED_MODELS
+from catstream.wire.commands import Requester
+from catstream.wire.endpoint import Endpoint, is_deserted
+from catstream.wire.newest import Subscriber
+
+__all__ = ["Control", "control"]
+
+#: Seconds to wait for an answer from a folder in which no pipeline seems to run; its detector may be restarted.
+_DESERTED_SECONDS = 1.0
+#: Seconds to wait for the registry of a fleet before each command; without an answer, the stream has not moved.
+_REGISTRY_SECONDS = 1.0
+
+
+class Control:
+    """Sends commands to one running pipeline; close it, or use it in a `with`. Several clients may connect at once.
+
+    Attributes
+    ----------
+    endpoint : str
+        Endpoint of the pipeline.
+    source : str
+        Source that the pipeline tracks; empty if it is unknown here.
+    timeout : float
+        Seconds to wait for the answer to a command.
+
+    Raises
+    ------
+    CommandRejectedError
+        From each command, if the pipeline does not execute it.
+    SilenceError
+        From each command, if no answer arrives in time; the command may still be executed later. If no pipeline runs at
+        the endpoint, a folder, that is said after a second.
+    ServiceError
+        From each command, if these keys do not have the role "steer".
+    """
+
+    def __init__(
+        self, endpoint: str | Endpoint = "", *, timeout: float = 5.0, keys: str = "", source: str = ""
+    ) -> None:
+        self._stream = str(endpoint) if fleet_and_stream(endpoint) is not None else ""
+        self._keys = keys
+        self._place = locate(endpoint, keys, source)
+        self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
+        self._commands = Requester[Command, Answer](CONTROL, self._place)
+
+    def set_box(self, box: str | Iterable[float], object: str = UNNAMED, *, keep: bool = False) -> Answer:
+        """Set the box of an object in the next frame that is tracked: x, y, w, h in pixels.
+
+        During a pause it is the frame that is held, or the next one of a live source; the pipeline tracks it and stays
+        paused.
+
+        Parameters
+        ----------
+        object : str
+            Name of the object. If no object has this name, it is tracked from that frame on, beside the others. Without
+            a name, the only object is meant.
+        keep : bool
+            Whether the box corrects the position of the same object. By default, another object takes the name, and
+            everything that was learned of the previous one is dropped.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid.
+        """
+        return self._ask(Command(uuid4().hex, "set-box", Box.parse(box), keep, object=check_name(object)))
+
+    def search(self, model: Learned | str | os.PathLike[str], object: str = UNNAMED) -> Answer:
+        """Search for the object of a saved model from the next frame on, beside the others.
+
+        The object is absent until it is found in the whole frame, and learning continues from the saved model, as with
+        the argument `model` of `catstream.Pipeline`. The model is sent to the pipeline, which keeps a copy.
+
+        Parameters
+        ----------
+        model : path or Learned
+            The saved model, or a file of it on this machine.
+        object : str
+            Name of the object. If an object has this name already, this one takes its place, and everything that was
+            learned of the previous one is dropped. Without a name, the only object is meant.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid.
+        ServiceError, ProtocolError
+            If the file cannot be read, or is not a saved model.
+        """
+        learned = model if isinstance(model, Learned) else Learned.load(model)
+        return self._ask(Command(uuid4().hex, "search", model=learned.to_bytes(), object=check_name(object)))
+
+    def forget(self, object: str = UNNAMED) -> Answer:
+        """Stop tracking an object, and drop everything that was learned of it; without a name, the only object.
+
+        The other objects continue. If none is left, the run waits for a box, as if it was paused.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid.
+        """
+        return self._ask(Command(uuid4().hex, "forget", object=check_name(object)))
+
+    def pause(self) -> Answer:
+        """Stop processing frames; the frames of a live source are counted as skipped."""
+        return self._ask(Command(uuid4().hex, "pause"))
+
+    def resume(self) -> Answer:
+        """Continue processing frames."""
+        return self._ask(Command(uuid4().hex, "resume"))
+
+    def save(self, path: str | os.PathLike[str], object: str = UNNAMED) -> Answer:
+        """Write everything that was learned of an object to a file on this machine, atomically.
+
+        The file is written by this process; `catstream.Learned` reads it. The pipeline is not interrupted.
+
+        Parameters
+        ----------
+        path : path
+            The file.
+        object : str
+            Name of the object; without a name, the only object is meant.
+
+        Raises
+        ------
+        ObjectError
+            If the name is not valid.
+        ServiceError
+            If the file cannot be written.
+        """
+        answer = self._ask(Command(uuid4().hex, "save", object=check_name(object)))
+        learned = self._newest(answer.object, answer.version)
+        learned.save(path)
+        return replace(answer, version=learned.model.version)
+
+    def stop(self) -> Answer:
+        """End the run as if the source had ended: everything learned is stored first."""
+        return self._ask(Command(uuid4().hex, "stop"))
+
+    def close(self) -> None:
+        """Disconnect; the pipeline continues."""
+        self._commands.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _newest(self, name: str, version: int) -> Learned:
+        """Return what was learned of an object up to a version or a later one."""
+        deadline = monotonic() + self.timeout
+        with Subscriber(SAVED_MODELS, self._place, SavedModel, about=name) as saved:
+            while (left := deadline - monotonic()) > 0:
+                message = saved.receive(left)
+                if message is not None and message.version >= version:
+                    return Learned.from_bytes(message.file, f"the saved model from {self.endpoint}")
+        raise SilenceError(
+            f"no coreset trees arrived from {self.endpoint} within {self.timeout:g} s: "
+            "check the pipeline with catstream status"
+        )
+
+    def _follow(self) -> None:
+        """Connect to the pipeline that a stream of a fleet has now; the last one, if the registry does not answer."""
+        if not self._stream:
+            return
+        with suppress(SilenceError):
+            place = locate(self._stream, self._keys, timeout=_REGISTRY_SECONDS)
+            if place != self._place:
+                self._commands.close()
+                self._place, self.endpoint = place, str(place)
+                self._commands = Requester[Command, Answer](CONTROL, place)
+
+    def _ask(self, command: Command) -> Answer:
+        self._follow()
+        verb, first = command.verb, min(self.timeout, _DESERTED_SECONDS) if self._place.folder is not None else 0.0
+        answer = self._commands.ask(command, first)
+        if answer is None and first and is_deserted(self._place):
+            raise SilenceError(
+                f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
+                "or give the endpoint of one that runs (--endpoint)"
+            )
+        answer = answer or self._commands.ask(command, self.timeout - first)
+        if answer is None:
+            raise SilenceError(
+                f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "
+                "Check it with catstream status"
+            )
+        if not answer.done:
+            raise CommandRejectedError(f"{verb}: {answer.reason}")
+        return answer
+
+
+def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> Control:
+    """Connect to a running pipeline to send commands.
+
+    Parameters
+    ----------
+    endpoint : str
+        Endpoint of the pipeline, in the format of the setting `run.endpoint`. Empty for the only pipeline of this user.
+        The address of a stream of a fleet, as for `catstream.subscribe`: each command goes where the stream runs then.
+    timeout : float
+        Seconds to wait for the answer to a command.
+    keys : str
+        Folder of the keys of this client, if the pipeline requires keys; their role must be "steer".
+    source : str
+        Source that the pipeline tracks, for example "walk.mp4", instead of its endpoint.
+
+    Raises
+    ------
+    ServiceError
+        If `endpoint` is empty and not exactly one pipeline runs, if the fleet has no such stream or it runs nowhere, or
+        if the keys cannot be read.
+    """
+    return Control(endpoint, timeout=timeout, keys=keys, source=source)

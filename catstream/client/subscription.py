@@ -1,0 +1,467 @@
+"""Subscribe to the messages of a running pipeline.
+
+    import catstream
+
+    with catstream.subscribe("run", "tracks") as tracks:
+        for track in tracks:
+            print(track.frame, track.state, track.box)
+
+The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them. With
+`object="anna"`, only the messages about this object are transmitted.
+
+`catstream.subscribe("fleet://cam-7", "tracks")` subscribes to a stream of a fleet, wherever it runs: the subscription
+goes on if the stream moves to another node.
+"""
+
+from __future__ import annotations
+
+import select
+from time import monotonic
+from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
+
+from catstream.client.registry import FollowedStream, Registry, described, fleet_and_stream, locate
+from catstream.errors import ServiceError, SilenceError
+from catstream.messages.kinds import End, Features, Health, Model, Preview, Run, Sample, Track
+from catstream.messages.names import UNNAMED, check_name
+from catstream.wire.announced import Announcement
+from catstream.wire.channels import CHANNELS, HEALTH, TRACKS, Channel
+from catstream.wire.endpoint import Endpoint, find
+from catstream.wire.newest import Subscriber
+from catstream.wire.readable import readable
+
+__all__ = ["AnyMessage", "GapCounter", "Subscription", "subscribe", "wait_until_running"]
+
+#: Seconds to wait for messages after the end was received; it arrives on a connection of its own and may overtake them.
+_DRAIN_SECONDS = 0.5
+
+#: Seconds to wait for a health report; each process of a running pipeline sends one every second.
+_HEALTH_TIMEOUT_SECONDS = 5.0
+
+#: Seconds between checks of the connections, which report whether the pipeline has rejected the keys.
+_CONNECTION_CHECK_SECONDS = 1.0
+
+#: Public name -> channel. Subscribers get features from the channel of copies; `catstream.control` gets saved models.
+_SUBSCRIBABLE = {
+    **{name: name for name in ("samples", "models", "tracks", "health", "previews")},
+    "features": "training",
+}
+
+#: A message of any channel that can be subscribed to.
+AnyMessage = Track | Model | Health | Sample | Features | Preview
+Message = TypeVar("Message", bound=AnyMessage)
+
+
+#: Public name of a channel whose messages are about one object each -> their kind.
+_KINDS: dict[str, type] = {"tracks": Track, "models": Model, "samples": Sample}
+
+
+class GapCounter:
+    """Counts lost frames of a stream by the gaps in the numbers `seq` of its messages, which start with 1.
+
+    The tracks of all objects in a frame have the same number. A restarted sender may repeat numbers.
+
+    missed  frames without a message between the first and the last one that was received
+    before  frames before the first message that was received
+    """
+
+    def __init__(self) -> None:
+        self.missed = self.before = self._seq = 0
+
+    def take(self, seq: int) -> None:
+        """Count the frames missing before the number of the next message, or of the end."""
+        if self._seq:
+            self.missed += max(0, seq - self._seq - 1)
+        else:
+            self.before = max(0, seq - 1)
+        self._seq = seq
+
+    def begin(self, seq: int) -> None:
+        """Count from this number on: an object begins here, so there were no messages about it before."""
+        self._seq = seq
+
+
+class _Connection:
+    """The sockets of a subscription to one pipeline.
+
+    Parameters
+    ----------
+    only, about : the one kind of message to receive, and the object that it is about; None for all
+    announcement : announces this subscription to a pipeline that starts later; None if nothing does
+
+    Attributes
+    ----------
+    messages : receives the messages of the channel
+    endpoint : Endpoint
+    ends : receives the end: if this subscriber is slow, the end could be among the messages that are dropped
+    """
+
+    def __init__(
+        self,
+        channel: Channel[Any],
+        endpoint: Endpoint,
+        only: type | None,
+        about: str | None,
+        announcement: Announcement | None = None,
+    ) -> None:
+        self.endpoint, self._announcement = endpoint, announcement
+        reader = announcement.reader if announcement is not None else ""
+        self.messages = Subscriber(channel, endpoint, only, about=about, reader=reader)
+        self.ends = Subscriber(TRACKS, endpoint, only=End)
+
+    def withdraw_announcement(self) -> None:
+        """Tell pipelines at this endpoint not to wait for this subscriber any more."""
+        if self._announcement is not None:
+            self._announcement.close()
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.withdraw_announcement()
+        self.messages.close()
+        self.ends.close()
+
+
+class Subscription(Generic[Message]):
+    """The messages of one channel of a running pipeline, until the pipeline ends; iterate with `for` or `async for`.
+
+    There is one features message for each frame, and one track for each object and frame; after a restart of the
+    detector some are repeated. For models, samples, previews and health reports, the last message arrives at once; then
+    each iteration returns the newest, and older ones that were not read are dropped. Models and samples are kept for
+    each object, and the object that has waited longest comes first. A subscriber to a named endpoint may start before
+    the pipeline. If both run on the same machine as the same user, the pipeline waits for it, so that it receives every
+    message.
+
+    The subscription to a stream of a fleet goes on if the stream moves or is started again, and while the registry of
+    the fleet cannot be reached. It ends if the stream has ended, or was removed from the fleet. A frame that the stream
+    repeats is not returned a second time; the frames that nobody tracked in between are counted in `missed`.
+
+    Attributes
+    ----------
+    end : End or None
+        The last message of the pipeline, or the reason why the stream of a fleet has ended; None before that.
+    endpoint : str
+        Endpoint of the pipeline, or the address of the stream.
+    keys : str
+        Folder of the client keys; empty if there are none.
+    timeout : float or None
+        Seconds without a message after which iteration raises `SilenceError`.
+
+    Raises
+    ------
+    SilenceError
+        During iteration, if no message arrived within `timeout`. Iteration may continue afterwards.
+    ServiceError
+        During iteration, if the pipeline rejects the keys.
+    """
+
+    def __init__(
+        self,
+        endpoint: str | Endpoint,
+        channel: str,
+        *,
+        object: str | None = None,
+        timeout: float | None = None,
+        keys: str = "",
+    ) -> None:
+        if channel not in _SUBSCRIBABLE:
+            raise ServiceError(
+                f"expected one of the channels {', '.join(_SUBSCRIBABLE)}, got {channel!r}: subscribe to one of them"
+            )
+        if object is not None and channel not in _KINDS:
+            raise ServiceError(
+                f"a message of {channel} is about all objects: subscribe to {', '.join(_KINDS)} for one object, or to "
+                f"{channel} without an object"
+            )
+        self._about = None if object is None else check_name(object)
+        self.endpoint, self.keys, self.timeout = str(endpoint), keys, timeout
+        self.end: End | None = None
+        self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
+        self._close_time = float("inf")  # when to wait no more
+        self._began: int | None = None  # first frame of the object
+        self._frames: dict[str, int] = {}  # the newest of each object, of a stream of a fleet
+        self._rejected = 0  # by the connections before this one
+        self._connection: _Connection | None = None
+        self._stream: FollowedStream | None = None
+        if (address := fleet_and_stream(endpoint)) is not None:
+            fleet, stream = address
+            self._stream = FollowedStream(Registry(fleet, keys), stream)
+            self._follow()
+        else:
+            place = locate(endpoint, keys)
+            self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
+            # A pipeline that starts here later waits until this subscription has connected.
+            waits = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
+            self._connection = _Connection(self._channel, place, self._only, self._about, waits)
+
+    @property
+    def missed(self) -> int:
+        """Number of frames whose tracks or features were not received: sent before the connection, or dropped.
+
+        For one object, the frames between its first and its last track that was received.
+        """
+        return self._gaps.missed + self._gaps.before
+
+    @property
+    def missed_before(self) -> int:
+        """Number of those that were sent before the connection; 0 for one object, which may begin later."""
+        return self._gaps.before
+
+    def losses(self) -> str:
+        """Describe the missed messages in words."""
+        before = f", {self.missed_before} of them before this subscriber connected" if self.missed_before else ""
+        return f"{self.missed} missed{before}"
+
+    @property
+    def place(self) -> Endpoint | None:
+        """Endpoint of the connected pipeline; None if the stream of a fleet has not run yet."""
+        return self._connection.endpoint if self._connection is not None else None
+
+    @property
+    def run(self) -> str:
+        """Id of the run that the last message is from: of one start of one pipeline; empty if it is not known."""
+        return self._connection.messages.run if self._connection is not None else ""
+
+    @property
+    def rejected(self) -> int:
+        """Messages that were dropped because they were not what the channel carries."""
+        return self._rejected + (self._connection.messages.rejected if self._connection is not None else 0)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._disconnect()
+        if self._stream is not None:
+            self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Message:
+        deadline = self._deadline()
+        while (message := self._take()) is None:
+            if self._ended():
+                raise StopIteration
+            poller = select.poll()
+            for socket in self._sockets():
+                poller.register(socket.fileno(), select.POLLIN)
+            seconds = self._wait_seconds(deadline)
+            poller.poll(seconds * 1000)
+        return message
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Message:
+        deadline = self._deadline()
+        while (message := self._take()) is None:
+            if self._ended():
+                raise StopAsyncIteration
+            await readable(self._sockets(), self._wait_seconds(deadline))
+        return message
+
+    @property
+    def _only(self) -> type | None:
+        """The one kind of message to receive, None for all of the channel."""
+        return None if self._about is None else _KINDS[self._name]
+
+    def _sockets(self) -> list[Subscriber[Any] | FollowedStream]:
+        """The sockets that are polled for messages."""
+        sockets: list[Subscriber[Any] | FollowedStream] = []
+        if self._connection is not None:
+            sockets += [self._connection.messages, self._connection.ends]
+        return sockets if self._stream is None else [*sockets, self._stream]
+
+    def _take(self) -> Message | None:
+        """Return the next message if one was received, without waiting."""
+        if self._connection is not None and (message := self._receive(self._connection)) is not None:
+            return message
+        self._follow()
+        return None
+
+    def _receive(self, connection: _Connection) -> Message | None:
+        while (message := connection.messages.receive(0)) is not None:
+            if self._stream is not None and not isinstance(message, End):
+                self._stream.message_arrived()
+            if isinstance(message, Track | Features):
+                if self._stream is not None and self._is_repeat(message):
+                    continue
+                self._count(message)
+            if not isinstance(message, Run | End):
+                connection.withdraw_announcement()
+                return cast(Message, message)
+            if isinstance(message, End) and self._channel.keeps == "every":  # the last message here
+                self._pipeline_ended(message, 0.0)
+                return None
+        for end in connection.ends.receive_all():
+            if self.end is None and isinstance(end, End):
+                self._pipeline_ended(end, monotonic() + _DRAIN_SECONDS)
+        return None
+
+    def _pipeline_ended(self, end: End, close_time: float) -> None:
+        """End at this time; a stream of a fleet may go on with another pipeline."""
+        if self._stream is not None:
+            self._stream.pipeline_ended(end)
+        else:
+            self.end, self._close_time = end, close_time
+
+    def _follow(self) -> None:
+        """Connect to the pipeline of a stream of a fleet if it has another one, and end if the stream has ended."""
+        if self._stream is None or self.end is not None:
+            return
+        before = self._stream.place
+        moved = self._stream.has_moved()
+        if self._stream.end is not None:
+            self.end, self._close_time = self._stream.end, monotonic() + _DRAIN_SECONDS
+        elif (moved or self._connection is None) and (place := self._stream.place.endpoint) is not None:
+            if not before.continues_as(self._stream.place):
+                self._frames.clear()
+            self._disconnect()
+            self._connection = _Connection(self._channel, place, self._only, self._about)
+
+    def _disconnect(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._rejected += self._connection.messages.rejected
+            self._connection = None
+
+    def _is_repeat(self, message: Track | Features) -> bool:
+        """Whether a stream of a fleet repeats a frame, after it was started again."""
+        name = message.object if isinstance(message, Track) else UNNAMED
+        if message.frame <= self._frames.get(name, -1):
+            return True
+        self._frames[name] = message.frame
+        return False
+
+    def _count(self, message: Track | Features) -> None:
+        """Count the frames missing before a message, unless its object was not there."""
+        if self._about is not None and isinstance(message, Track):
+            if message.began != self._began:  # another object of this name
+                self._gaps.begin(message.seq)
+            self._began = message.began
+        self._gaps.take(message.seq)
+
+    def _ended(self) -> bool:
+        if self.end is None or monotonic() < self._close_time:
+            return False
+        # One object may have been forgotten before; a stream of a fleet may have no last message.
+        if self._channel.keeps == "every" and self._about is None and self.end.seq:
+            self._gaps.take(self.end.seq)
+        return True
+
+    def _deadline(self) -> float:
+        return float("inf") if self.timeout is None else monotonic() + self.timeout
+
+    def _wait_seconds(self, deadline: float) -> float:
+        """Return the seconds to wait for the sockets. Raises SilenceError after the deadline."""
+        now = monotonic()
+        if now >= deadline and self.end is None:
+            why = "is a pipeline running there?" if self._stream is None else described(self._stream.status)
+            raise SilenceError(f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {why}")
+        until = min(deadline if self.end is None else float("inf"), self._close_time, now + _CONNECTION_CHECK_SECONDS)
+        return max(0.0, until - now)
+
+
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["tracks"], *, object: str | None = ..., timeout: float | None = ..., keys: str = ...
+) -> Subscription[Track]: ...
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["models"], *, object: str | None = ..., timeout: float | None = ..., keys: str = ...
+) -> Subscription[Model]: ...
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["health"], *, timeout: float | None = ..., keys: str = ...
+) -> Subscription[Health]: ...
+@overload
+def subscribe(
+    endpoint: str,
+    channel: Literal["samples"],
+    *,
+    object: str | None = ...,
+    timeout: float | None = ...,
+    keys: str = ...,
+) -> Subscription[Sample]: ...
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["features"], *, timeout: float | None = ..., keys: str = ...
+) -> Subscription[Features]: ...
+@overload
+def subscribe(
+    endpoint: str, channel: Literal["previews"], *, timeout: float | None = ..., keys: str = ...
+) -> Subscription[Preview]: ...
+def subscribe(
+    endpoint: str,
+    channel: str,
+    *,
+    object: str | None = None,
+    timeout: float | None = None,
+    keys: str = "",
+) -> Subscription[Any]:
+    """Subscribe to a channel of a running pipeline.
+
+    Parameters
+    ----------
+    endpoint : str
+        Endpoint of the pipeline, which may start later; the format is that of the setting `run.endpoint`. Empty for the
+        only running pipeline of this user. The address of a stream of a fleet is `fleet://HOST:PORT/STREAM`, with host
+        and port of its registry; `fleet://FLEET/STREAM` for a fleet of this user, `fleet://STREAM` for the only one.
+    channel : str
+        "tracks", "models", "health", "samples", "features" or "previews".
+    object : str or None
+        Name of the one object whose tracks, models or samples are received; "" for the object without a name, None for
+        all objects.
+    timeout : float or None
+        Seconds without a message after which iteration raises `SilenceError`; None to wait without limit.
+    keys : str
+        Folder of the keys of this client, if the pipeline requires keys.
+
+    Raises
+    ------
+    ObjectError
+        If `object` is not a valid name.
+    ServiceError
+        If there is no such channel, or its messages are not about one object each; if `endpoint` is empty and not
+        exactly one pipeline runs; if the fleet has no such stream; or if the keys cannot be read.
+    SilenceError
+        If the registry of the fleet does not answer.
+    """
+    return Subscription(endpoint, channel, object=object, timeout=timeout, keys=keys)
+
+
+def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_TIMEOUT_SECONDS) -> Endpoint:
+    """Wait for a health report of the pipeline, and return its endpoint.
+
+    Tracks and models are no sign of a running pipeline: they may pause for long.
+
+    Raises
+    ------
+    ServiceError
+        If `endpoint` is empty and not exactly one pipeline runs, or the pipeline rejects the keys.
+    SilenceError
+        If no report arrives in time.
+    """
+    if fleet_and_stream(endpoint) is not None:
+        return _wait_for_stream(endpoint, keys, seconds)
+    place, deadline = find(endpoint, keys), monotonic() + seconds
+    # Not a `Subscription`: it subscribes to the end of the tracks, too, and a replay waits for a subscriber to tracks.
+    with Subscriber(HEALTH, place) as reports:
+        while reports.receive(min(_CONNECTION_CHECK_SECONDS, seconds)) is None:
+            if monotonic() >= deadline:
+                raise SilenceError(f"no health arrived from {place} within {seconds:g} s: is a pipeline running there?")
+    return place
+
+
+def _wait_for_stream(endpoint: str, keys: str, seconds: float) -> Endpoint:
+    """Wait for a health report of a stream of a fleet, and return the endpoint of its pipeline."""
+    with Subscription[Health](endpoint, "health", timeout=seconds, keys=keys) as reports:
+        next(reports, None)
+        if reports.end is not None or reports.place is None:
+            raise ServiceError(
+                f"{endpoint} does not run: {reports.end.reason if reports.end is not None else 'no place'}"
+            )
+        return reports.place

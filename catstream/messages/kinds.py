@@ -1,0 +1,654 @@
+"""The messages between the stages.
+
+A message is frozen and complete by itself. In one process the stages pass the objects themselves. Between processes
+`catstream.wire` converts them to msgpack and back, and checks every field on arrival.
+
+The annotations are the schema (see `catstream.messages.schema`), and the docstrings describe the fields. The checks,
+the files of `catstream.messages.packing`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
+
+`d` is the length of a feature row (`catstream.features.layout.row_length`), `n` the coreset size, frames count from 0.
+The objects of a stream have names (`catstream.messages.names`); an object that is alone may have the name "".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+
+from catstream.box import Box, Window
+from catstream.messages.heads import GROUPS, HEADS, TREES
+from catstream.messages.schema import Array, ByObject, Bytes, Name, Named, OnlyWith, Whole
+
+__all__ = [
+    "Answer",
+    "Command",
+    "DetectorState",
+    "End",
+    "Features",
+    "FleetStatus",
+    "Health",
+    "Level",
+    "Listing",
+    "Model",
+    "Motion",
+    "NodeState",
+    "NodeStatus",
+    "ObjectFeatures",
+    "ObjectPosition",
+    "Position",
+    "Preview",
+    "Question",
+    "Run",
+    "Sample",
+    "SavedModel",
+    "State",
+    "Stored",
+    "StreamState",
+    "StreamStatus",
+    "Summary",
+    "Track",
+    "Tracks",
+    "TrainingRows",
+    "Verb",
+]
+
+State = Literal["bootstrapping", "present", "absent"]
+
+Level = Literal["lost", "redetected", "weak", "confident"]
+
+Verb = Literal["set-box", "search", "forget", "pause", "resume", "save", "stop"]
+
+#: Bytes of a saved model at most.
+LARGEST_MODEL = 511 << 20
+
+#: The same for one that an object begins with.
+LARGEST_GIVEN_MODEL = 63 << 20
+
+#: Bytes at most of all saved models that objects begin with in one frame: one message contains them.
+LARGEST_GIVEN_MODELS = 200 << 20
+
+#: The state of a stream of a fleet: "waiting" is for a box, "unplaced" is without a node that fits.
+StreamState = Literal["starting", "running", "waiting", "paused", "moving", "unplaced", "failed", "ended"]
+
+NodeState = Literal["alive", "draining", "dead"]
+
+#: The name of an object.
+ObjectName = Annotated[str, Name()]
+
+_COLUMNS = {name: tree.more_columns for name, tree in TREES.items()}
+_REQUIRED = frozenset(name for name, tree in TREES.items() if tree.required)
+_NOT_IN_THE_SCORE = {name: 0 for name, head in HEADS.items() if not head.adds_to_score}
+_WITH_BIAS = {name: 0 for name, head in HEADS.items() if head.has_bias}
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Parameters of the Kalman filter of the centre, found by EM (paper, section "Classification").
+
+    process      covariance of what the constant-velocity model misses in a frame; of x, y, then their speeds
+    observation  covariance of a measured centre, pixels squared
+    """
+
+    process: Annotated[np.ndarray, Array("float64", (4, 4))]
+    observation: Annotated[np.ndarray, Array("float64", (2, 2))]
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorState:
+    """All that a detector knows after a frame, besides the model: with both, another one continues bit for bit.
+
+    first_frame       the object's first: with its name, it says which object this is; see `began` of a track
+    level             of the belief that the object was found, see `catstream.detection.belief`
+    window            window of the object; the next search is centred on it
+    confident_window  the same in the last frame whose level was confident or redetected; while the object of a saved
+                      model is searched for, the best window of the last frame
+    first_window      the same in the first frame; None while the object of a saved model has not been found
+    trusted           false after the object was found again elsewhere in the frame, until its score is high
+    sightings         frames in a row in which the object of a saved model was seen in one place
+    motion            of the Kalman filter of the centre, None before a model had any
+    centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
+    colour_centroid   where in the window the object's colours are: frames taken in, contrast, x and y at first, x and y
+                      now; None before the first of these frames
+    """
+
+    first_frame: int
+    level: Level
+    window: Window
+    confident_window: Window
+    first_window: Window | None
+    trusted: bool = True
+    sightings: int = 0
+    motion: Motion | None = None
+    centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None
+    colour_centroid: Annotated[np.ndarray, Array("float64", (6,))] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingRows:
+    """Feature rows of windows of a frame, each with its label and weight.
+
+    rows     features of the windows
+    labels   group "appearance": 1 for the object, 0 for background, between them for a near miss; group "extent": 1 for
+             a window of the right size and aspect, towards 0 for windows far from it
+    weights  number of ordinary rows that each stands for
+    offsets  group "extent": 0.5 for a window of the right size, and 1/16 more for each step by which it is too large;
+             then the same for the aspect; None if all are right
+    """
+
+    rows: Annotated[np.ndarray, Array("float32", ("k", "d"))]
+    labels: Annotated[np.ndarray, Array("float32", ("k",), low=0, high=1)]
+    weights: Annotated[np.ndarray, Array("float32", ("k",), above=0)]
+    offsets: Annotated[np.ndarray, Array("float32", ("k", 2), low=0, high=1)] | None = None
+
+    @classmethod
+    def labelled(cls, rows: Sequence[np.ndarray], label: float | Sequence[float], weight: float = 1.0) -> Self:
+        """Rows of one weight, with one label or each its own."""
+        k = len(rows)
+        return cls(np.array(rows, np.float32), np.full(k, label, np.float32), np.full(k, weight, np.float32))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __add__(self, other: TrainingRows) -> TrainingRows:
+        """The rows of both, of a group without offsets."""
+        return TrainingRows(
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.labels, other.labels]),
+            np.concatenate([self.weights, other.weights]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectFeatures:
+    """The part of `Features` for one object.
+
+    box       the object's box, None if it was not found
+    training  training rows of each group of `catstream.messages.heads`; a group without rows is left out
+    detector  state of the detector after this frame, from which a restarted detector continues; None before it has one
+    begins    whether a new object is tracked under this name from this frame on: its trees begin anew
+    model     the saved model that the trees continue, if the object begins with one; otherwise empty
+    """
+
+    box: Box | None
+    training: Annotated[dict[str, TrainingRows], Named(dict.fromkeys(GROUPS, 0))] = field(default_factory=dict)
+    detector: DetectorState | None = None
+    begins: bool = False
+    model: Annotated[bytes, Bytes("a saved model", longest=LARGEST_GIVEN_MODEL, begin=b"")] = b""
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """The training rows of one frame, detector -> compressor.
+
+    seq      number of the message: 1, 2, 3 ... without a gap, one message a frame
+    frame    number of the frame that the rows were cut from
+    time     seconds since the start of the source, or of the run if the source is live
+    objects  the part of each object that is tracked, by name; the trees of all other objects are dropped
+    """
+
+    seq: int
+    frame: int
+    time: float
+    objects: Annotated[dict[str, ObjectFeatures], ByObject()]
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """Acknowledges the messages of an acknowledged channel, receiver -> sender.
+
+    seq       all messages up to this one are stored, except for the last `unsaved` ones: the sender drops them
+    taken     all messages up to this one have been processed by the receiver
+    versions  version of the newest Sample of each object that has one, by name
+    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    """
+
+    seq: int
+    taken: int
+    versions: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
+    unsaved: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectPosition:
+    """The part of `Position` for one object.
+
+    box       box in which it was last found
+    version   version of its newest Sample, 0 before the first
+    detector  its detector state of message `seq`, None if it had none
+    """
+
+    box: Box | None = None
+    version: int = 0
+    detector: DetectorState | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """The position at which a stream continues: the answer of a receiver to each new connection.
+
+    seq      the last message that is stored, 0 in a new stream: the sender continues with the next one
+    frame    number of its frame
+    objects  the part of each object of that message, by name; empty in a new stream
+    unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    """
+
+    seq: int = 0
+    frame: int = 0
+    objects: Annotated[dict[str, ObjectPosition], ByObject()] = field(default_factory=dict)
+    unsaved: int = 0
+
+    @property
+    def versions(self) -> dict[str, int]:
+        """Version of the newest Sample of each object that has one, by name."""
+        return {name: each.version for name, each in self.objects.items() if each.version}
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A hierarchical sample of one coreset tree (paper, section "Coreset Appearance Model").
+
+    rows    at most 2n rows, rotated and rescaled so that each has the weight of one original row
+    mean    exact mean of all rows that were inserted
+    count   number of rows that were inserted
+    levels  level of each node in memory, oldest first, strictly decreasing
+    """
+
+    rows: Annotated[np.ndarray, Array("float32", ("r", "d"))]
+    mean: Annotated[np.ndarray, Array("float32", ("d",))]
+    count: int
+    levels: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A training sample of all frames so far, compressor -> trainer; only the newest of each object is used.
+
+    version  1, 2, 3 ... in the order in which the samples of all objects are made
+    frame    number of the newest frame that it summarises
+    trees    the summary of each tree of `catstream.messages.heads.TREES`; a tree without a leaf is left out
+    centres  centre of the object in each frame of the last complete block of frames, pixels; NaN while absent
+    object   name of the object
+    began    number of the object's first frame
+    """
+
+    version: int
+    frame: int
+    trees: Annotated[dict[str, Summary], Named(_COLUMNS, _REQUIRED)]
+    centres: Annotated[np.ndarray, Array("float64", ("m", 2), may_be_nan=True)]
+    object: ObjectName = ""
+    began: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A trained appearance model, trainer -> detector and anyone.
+
+    version  version of the Sample that it was trained on
+    frame    number of the newest frame that the sample summarises
+    weights  of the score of a window: weights @ row + bias
+    bias     chosen so that the score is 0 at the mean of the background and 1 at the mean of the object
+    motion   parameters of the Kalman filter, None until there are enough centres for EM
+    heads    vector of each head that does not add to the score, once it is trained. A window fits well if
+             (weights + heads["extent"]) @ row is high, and heads[name] @ row + biases[name] is near 0.5 for the names
+             "size" and "aspect"
+    biases   bias of each of these heads that has one
+    object   name of the object
+    began    number of the object's first frame: the detector uses no model of an object that had the name before
+    """
+
+    version: int
+    frame: int
+    weights: Annotated[np.ndarray, Array("float32", ("d",))]
+    bias: float
+    motion: Motion | None = None
+    heads: Annotated[dict[str, Annotated[np.ndarray, Array("float32", ("d",))]], Named(_NOT_IN_THE_SCORE)] = field(
+        default_factory=dict
+    )
+    biases: Annotated[dict[str, float], Named(_WITH_BIAS)] = field(default_factory=dict)
+    object: ObjectName = ""
+    began: int = 0
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Track:
+    """An object in one frame, detector -> anyone.
+
+    Attributes
+    ----------
+    seq : int
+        1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means that this subscriber
+        missed messages, or that the object was not tracked in between.
+    frame : int
+        Number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted.
+    time : float
+        Seconds since the start of the source, or of the run if the source is live.
+    state : str
+        "absent" if no box is reported. Otherwise "bootstrapping" while the model is that of the object's first frame
+        (version 0), then "present".
+    box : Box or None
+        Box of the object, in pixels of the frame; None while absent.
+    score : float
+        Confidence: about 0 on background, about 1 on the object.
+    model_version : int
+        Version of the model that scored it, 0 before the first.
+    pts : float or None
+        Time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file.
+    object : str
+        Name of the object; "" if it has none.
+    began : int
+        Number of the object's first frame. If it differs from that of the track before, another object was given this
+        name, by a box or a saved model.
+
+    Examples
+    --------
+    >>> Track(13, 12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
+    Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
+    """
+
+    seq: int
+    frame: int
+    time: float
+    state: State
+    box: Box | None
+    score: float
+    model_version: int
+    pts: float | None = None
+    object: ObjectName = ""
+    began: int = 0
+
+    def __repr__(self) -> str:
+        name = f"object={self.object!r}, " if self.object else ""
+        box = None if self.box is None else f"({', '.join(f'{side:.1f}' for side in self.box)})"
+        return (
+            f"Track({name}frame={self.frame}, time={self.time:.3f}, state={self.state!r}, box={box}, "
+            f"score={self.score:.2f}, model_version={self.model_version})"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields by name, of plain types for JSON: a box is a list [x, y, w, h], or None.
+
+        `catstream sink FILE.ndjson` writes the same.
+
+        Examples
+        --------
+        >>> Track(13, 12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
+        True
+        """
+        return {
+            "seq": int(self.seq),
+            "frame": int(self.frame),
+            "time": float(self.time),
+            "state": self.state,
+            "box": None if self.box is None else [float(side) for side in self.box],
+            "score": float(self.score),
+            "model_version": int(self.model_version),
+            "pts": None if self.pts is None else float(self.pts),
+            "object": self.object,
+            "began": int(self.began),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """The tracks of one frame, detector -> the owner of the run.
+
+    seq     number of the message: 1, 2, 3 ... without a gap, one message a frame
+    frame   number of the frame
+    tracks  the track of each object, by name
+    """
+
+    seq: int
+    frame: int
+    tracks: Annotated[dict[str, Track], ByObject()]
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """A small picture of a frame, detector -> anyone.
+
+    frame   number of the frame
+    width   width of the frame in pixels; the picture may be smaller
+    height  height of the frame in pixels
+    boxes   box of each object that is present, in pixels of the frame, by name
+    jpeg    the picture as a JPEG file, with the frame's aspect ratio
+    """
+
+    frame: int
+    width: Annotated[int, Whole(low=1)]
+    height: Annotated[int, Whole(low=1)]
+    boxes: Annotated[dict[str, Box], ByObject()]
+    jpeg: Annotated[bytes, Bytes("a JPEG", longest=1 << 19, begin=b"\xff\xd8\xff")]
+
+
+@dataclass(frozen=True, slots=True)
+class SavedModel:
+    """Everything that was learned of an object, compressor -> anyone.
+
+    version  version of the newest sample of the object
+    file     the file that `catstream save` writes: the coreset trees whole, and a model
+    object   name of the object
+    """
+
+    version: int
+    file: Annotated[bytes, Bytes("a saved model", longest=LARGEST_MODEL, begin=b"")]
+    object: ObjectName = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """The condition of a process, once a second, every process -> anyone.
+
+    process   name of the process
+    time      seconds since the epoch (1970)
+    counters  counters of the process, by name
+    trouble   description of a problem of the process, empty if there is none
+    source    the video source without user and password; empty except for the detector
+    objects   counters of each object, by name
+    """
+
+    process: str
+    time: float
+    counters: dict[str, float] = field(default_factory=dict)
+    trouble: str = ""
+    source: str = ""
+    objects: Annotated[dict[str, dict[str, float]], ByObject()] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """The settings of a pipeline, with which its features can be used for training again, detector -> anyone.
+
+    program   version of catstream
+    settings  all settings except `run.endpoint` and `run.keys`, by name, each as the text that `--set` takes
+    """
+
+    program: str
+    settings: dict[str, str]
+
+    @classmethod
+    def from_settings(cls, settings: dict[str, str]) -> Run:
+        """A run of this version of catstream, with what `Settings.portable` returned."""
+        return cls(version("catstream"), settings)
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """The last message of a stream.
+
+    seq     number of the last message before it, plus one
+    reason  description of why the stream ended
+    failed  whether it ended because of an error
+    totals  final counters, by name: features messages `sent` and `stored`, frames that were `damaged` or `skipped`, and
+            how often a live source was `reopened`
+    """
+
+    seq: int
+    reason: str
+    failed: bool = False
+    totals: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A control command to a running pipeline, anyone -> detector.
+
+    id      unique for each command: a command that is received twice is executed once and answered twice
+    verb    the action
+    box     for "set-box": box of the object in the next frame that is tracked, in pixels; during a pause of a file, in
+            the frame that is held
+    keep    for "set-box": whether it is the same object, so that everything learned about it is kept
+    object  for "set-box", "search", "forget" and "save": name of the object
+    model   for "search": the saved model of the object, which is searched for from the next frame on
+    """
+
+    id: str
+    verb: Verb
+    box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
+    keep: bool = False
+    object: ObjectName = ""
+    model: Annotated[bytes | None, Bytes("a saved model", LARGEST_GIVEN_MODEL, b""), OnlyWith("verb", "search")] = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer to a Command, detector -> its sender.
+
+    id       id of the command
+    done     whether it was executed
+    reason   description of the effect, or of the reason for a rejection
+    frame    number of the newest frame that was processed
+    box      last box of the object, None if there is none
+    version  version of the newest model of this object, 0 before the first
+    object   name of the object that the command was for
+    """
+
+    id: str
+    done: bool
+    reason: str
+    frame: int = 0
+    box: Box | None = None
+    version: int = 0
+    object: ObjectName = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStatus:
+    """The state of one stream of a fleet: where it runs, and how it is.
+
+    name            name of the stream, unique in its fleet
+    state           "waiting" for a box, "unplaced" if it fits on no node, "moving" between two nodes
+    node            name of the node on which it runs, empty if it runs on none
+    source          the video source without user and password
+    endpoint        of its pipeline, in the format of the setting `run.endpoint`; empty if it does not run
+    server          public key of the sockets of its pipeline, empty if the pipeline has no keys
+    token           fencing token of its pipeline: each pipeline that is started for the stream has a larger one
+    began           token of the pipeline that began the stream anew, without the state of the one before it, so that
+                    frames count from 0 again; 0 if none did
+    frame           number of the newest frame that was tracked
+    rate            tracked frames per second
+    skipped         frames of a live source that were not tracked, because the pipeline was too slow
+    cores           processor cores that it uses, as measured; 0 before the first measurement
+    models          version of the newest model of each object that has one, by name
+    restarts        how many times it was started again after a failure
+    lost_frames     frames of a live source that were lost because of failures and moves
+    lost_seconds    duration of these frames
+    stored_seconds  seconds since its newest state in the store was written; None if there is none
+    trouble         description of a problem, empty if there is none
+    """
+
+    name: str
+    state: StreamState
+    node: str = ""
+    source: str = ""
+    endpoint: str = ""
+    server: str = ""
+    token: int = 0
+    began: int = 0
+    frame: int = 0
+    rate: float = 0.0
+    skipped: int = 0
+    cores: float = 0.0
+    models: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
+    restarts: int = 0
+    lost_frames: int = 0
+    lost_seconds: float = 0.0
+    stored_seconds: float | None = None
+    trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatus:
+    """The state of one node of a fleet.
+
+    name     name of the node, unique in its fleet
+    state    "draining" if its streams are moved away and none is placed on it
+    address  name or address of the machine
+    cores    processor cores that streams may use
+    used     cores that the streams placed on it need
+    labels   labels of the node, by name
+    streams  number of streams placed on it
+    trouble  description of a problem, empty if there is none
+    """
+
+    name: str
+    state: NodeState
+    address: str = ""
+    cores: float = 0.0
+    used: float = 0.0
+    labels: dict[str, str] = field(default_factory=dict)
+    streams: int = 0
+    trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetStatus:
+    """The state of a fleet. It may have more streams than one message holds, and is transmitted as `Listing`s.
+
+    name     name of the fleet
+    time     seconds since the epoch (1970)
+    streams  state of each stream, by name
+    nodes    state of each node, by name
+    """
+
+    name: str
+    time: float
+    streams: dict[str, StreamStatus] = field(default_factory=dict)
+    nodes: dict[str, NodeStatus] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question about the streams and nodes of a fleet, anyone -> controller of the fleet.
+
+    id      unique for each question
+    stream  name of the one stream that it is about; empty for all streams and nodes
+    after   only streams and nodes whose names sort after this one are listed; empty for the first part
+    """
+
+    id: str
+    stream: str = ""
+    after: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """The answer to a Question, controller of the fleet -> its sender.
+
+    id       id of the question
+    fleet    name of the fleet
+    time     seconds since the epoch (1970)
+    streams  state of the streams, by name
+    nodes    state of the nodes, by name
+    more     whether there are more: the next question has the last name of this listing as `after`
+    """
+
+    id: str
+    fleet: str
+    time: float
+    streams: dict[str, StreamStatus] = field(default_factory=dict)
+    nodes: dict[str, NodeStatus] = field(default_factory=dict)
+    more: bool = False

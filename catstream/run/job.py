@@ -1,0 +1,202 @@
+"""The job of a run: its source, objects, settings and files.
+
+Whoever starts a run writes its job to one file, and every process of the run reads it there. A run with a state
+folder keeps a copy of the job in that folder, from which it is resumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from catstream.box import Box
+from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.messages import storage
+from catstream.messages.names import check_count, listed
+from catstream.messages.storage import Metadata
+from catstream.settings import Settings
+
+__all__ = ["Job", "Results"]
+
+_NAME = "job.safetensors"
+
+#: Settings that do not affect the training: a run can be resumed with other values.
+_FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"}
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """The files that `catstream track` writes for a run; a resumed run continues the same files.
+
+    output      folder of the results files, None for none
+    video       whether an annotated video is among the results files
+    write       further files of tracks
+    models      files for what was learned of each object, by name; a file without a name is for the only object
+    """
+
+    output: Path | None = None
+    video: bool = False
+    write: tuple[Path, ...] = ()
+    models: dict[str, Path] = field(default_factory=dict)
+
+    @classmethod
+    def from_json(cls, metadata: Metadata) -> Results:
+        """Return the results that `asdict` and JSON converted to this metadata."""
+        write = tuple(Path(file) for file in metadata["write"])
+        models = {name: Path(file) for name, file in metadata["models"].items()}
+        return cls(_path(metadata["output"]), bool(metadata["video"]), write, models)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Everything that the processes of a run have to agree on.
+
+    source    the text that `catstream.video.source.open_source` takes
+    boxes     the objects in the first frame, by name; without a box or a model, the run waits for the box of a command
+    models    file that `catstream save` wrote of each object that is searched for, by name
+    part      the frames of the source that are followed
+    settings  all settings
+    size      width and height of a frame, None if that is not known yet
+    started   seconds since 1970 at which the run first started
+    results   files that `catstream track` writes
+
+    The others hold for one start of the run, and are not in the copy that is kept:
+
+    endpoint  where the processes meet; the setting of the same name if this is empty
+    state     folder of the checkpoints and of the desired state; None if nothing is kept
+    resume    whether the processes continue from that state
+    record    file that the compressor records all messages to
+    run       id of this start of the run, which its messages carry; empty if the processes were started by hand
+    owned     whether the process that started the run receives every track on the channel `results`
+    since     value of `time.monotonic` from which the times of a live source count; None for its first frame
+    """
+
+    source: str = field(default="", repr=False)  # it may contain a password
+    boxes: dict[str, Box] = field(default_factory=dict)
+    models: dict[str, Path] = field(default_factory=dict)
+    part: slice = field(default_factory=lambda: slice(None))
+    settings: Settings = field(default_factory=Settings)
+    size: tuple[int, int] | None = None
+    started: float = 0.0
+    results: Results = Results()
+    endpoint: str = ""
+    state: Path | None = None
+    resume: bool = False
+    record: Path | None = None
+    run: str = ""
+    owned: bool = False
+    since: float | None = None
+
+    def __post_init__(self) -> None:
+        if both := self.boxes.keys() & self.models.keys():
+            raise SettingsError(
+                f"{listed(sorted(both))}: a box gives the position of an object, and a model searches for it: "
+                "give one of them"
+            )
+        check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
+
+    def save(self, folder: Path) -> Path:
+        """Write the job to a folder, readable by its owner only: the source may contain a password.
+
+        Returns
+        -------
+        the file
+
+        Raises
+        ------
+        ServiceError
+            If the file cannot be written.
+        """
+        try:
+            metadata = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+            storage.write(folder / _NAME, {}, metadata, mode=0o600)
+        except OSError as error:
+            raise ServiceError(
+                f"cannot write the state to {str(folder)!r} ({error.strerror}): give another folder"
+            ) from None
+        return folder / _NAME
+
+    @classmethod
+    def load(cls, path: Path) -> Job:
+        """Read the job from the file that `save` wrote, or from the folder that it is in.
+
+        Raises
+        ------
+        ServiceError
+            If there is no such file.
+        ProtocolError, SettingsError
+            If the file is damaged, or was written by another version of catstream.
+        """
+        file = path / _NAME if path.is_dir() else path
+        if not file.is_file():
+            raise ServiceError(f"{str(path)!r} contains no run: start one with --state {path}")
+        metadata = storage.read(file)[1]
+        try:
+            read = {name: _READERS[name](metadata[name]) for name in _READERS}
+            return cls(**(metadata | read))
+        except (KeyError, TypeError) as error:
+            raise ProtocolError(f"{file} is not a valid job of a pipeline ({error!r})") from None
+
+    @staticmethod
+    def is_in(folder: Path) -> bool:
+        """Whether a folder contains a job."""
+        return (folder / _NAME).exists()
+
+    def check_fits(self, other: Job, folder: Path) -> None:
+        """Raise SettingsError if another job cannot continue this one, whose state is in `folder`."""
+        if other.size != self.size or other.part != self.part:
+            raise SettingsError(
+                f"the run in {str(folder)!r} has {self._frames()}, and this one has {other._frames()}: "
+                "continue with the same frames, or start a new run in another folder"
+            )
+        ours, theirs = self.settings.values(), other.settings.values()
+        for name in sorted(ours.keys() - _FREE):
+            if ours[name] != theirs[name]:
+                raise SettingsError(
+                    f"the run in {str(folder)!r} was started with {name}={ours[name]}, not {theirs[name]}: "
+                    "continue without settings (they are stored too), or start a new run in another folder"
+                )
+
+    def _frames(self) -> str:
+        """The size and the numbers of the frames, for an error."""
+        size = "" if self.size is None else f"{self.size[0]}x{self.size[1]} pixels, "
+        numbers = (self.part.start, self.part.stop, self.part.step)
+        return f"{size}frames {':'.join('' if number is None else str(number) for number in numbers)}"
+
+
+def _plain(value: object) -> object:
+    """A field of a job in the types of JSON."""
+    match value:
+        case Path():
+            return str(value)
+        case slice():
+            return [value.start, value.stop, value.step]
+        case Settings():
+            return value.values()
+        case Results():
+            return {name: _plain(item) for name, item in asdict(value).items()}
+        case tuple():
+            return [_plain(item) for item in value]
+        case dict():
+            return {name: _plain(item) for name, item in value.items()}
+        case _:
+            return value
+
+
+def _path(text: str | None) -> Path | None:
+    return Path(text) if text is not None else None
+
+
+#: Functions that convert a JSON value back to the type of a field, for fields of other types.
+_READERS: dict[str, Callable[[Any], object]] = {
+    "boxes": lambda boxes: {name: Box(*box) for name, box in boxes.items()},
+    "models": lambda models: {name: Path(file) for name, file in models.items()},
+    "part": lambda part: slice(*part),
+    "settings": Settings.from_values,
+    "size": lambda size: size and tuple(size),
+    "record": _path,
+    "state": _path,
+    "results": Results.from_json,
+}

@@ -1,0 +1,151 @@
+"""The state of a pipeline on disk: what it needs to continue after a power cut.
+
+    DIR/job.safetensors     the job of the run, readable by its owner only: see `catstream.run.job`
+    DIR/desired_state.json  what was commanded: see `catstream.services.desired`
+    DIR/searched_models/    the saved models that objects are searched for by: see `catstream.services.model_files`
+    DIR/trees/              the compressor's checkpoints: see `catstream.compression.checkpoint_store`
+
+A pipeline locks DIR, and its compressor DIR/trees. The kernel releases a lock when its process ends, however that
+happens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.compression.compressor import Compressor
+from catstream.errors import ObjectError, ServiceError
+from catstream.messages import storage
+from catstream.messages.kinds import Position
+from catstream.messages.names import UNNAMED, listed
+from catstream.run.job import Job
+from catstream.run.learned import Learned
+from catstream.settings import Settings
+
+__all__ = ["SEARCHED", "TREES", "began", "files", "learned", "locked", "position", "restore", "skip"]
+
+#: Folder of the checkpoints, in that of the state.
+TREES = "trees"
+#: Folder of the saved models that objects are searched for by, in that of the state.
+SEARCHED = "searched_models"
+
+_HELP = "give another folder"
+_SMALL = ("job.safetensors", "desired_state.json")
+_NAMES = re.compile(
+    rf"job\.safetensors|desired_state\.json|{TREES}/[0-9]+\.safetensors|{SEARCHED}/[0-9a-f]+\.safetensors"
+)
+_ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
+
+
+def began(folder: Path) -> bool:
+    """Whether a pipeline was started in this folder."""
+    return Job.is_in(folder) or (folder / TREES).exists()
+
+
+def position(folder: Path, settings: Settings) -> Position:
+    """The position of the newest valid checkpoint."""
+    return CheckpointStore(folder / TREES).load(settings).position
+
+
+def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
+    """Everything that was learned of an object up to the newest valid checkpoint.
+
+    Parameters
+    ----------
+    name : the name of the object; "" also means the only object, if it has a name
+
+    Raises
+    ------
+    ObjectError
+        If there is no such object.
+    ServiceError
+        If there is no checkpoint, or nothing was learned before the newest one.
+    """
+    forest = CheckpointStore(folder / TREES).load(settings)
+    if name == UNNAMED and len(forest.compressors) == 1:
+        (name,) = forest.compressors
+    if forest.compressors and name not in forest.compressors:
+        wanted = repr(name) if name else "without a name"
+        raise ObjectError(f"there is no object {wanted}: the objects are {listed(forest.compressors)}")
+    return Learned.of(forest.compressors.get(name) or Compressor(settings, name), settings)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """The content of the files that a pipeline needs to continue from its newest checkpoint, by their names.
+
+    Empty if there is no checkpoint yet. The pipeline may be running.
+    """
+    for _ in range(_ATTEMPTS):
+        with contextlib.suppress(FileNotFoundError):  # a newer file has just taken its place
+            # The desired state is read before the folder of the saved models that it names: they are stored before it.
+            content = {name: (folder / name).read_bytes() for name in _SMALL if (folder / name).exists()}
+            checkpoints = sorted((folder / TREES).glob("[0-9]*.safetensors"))
+            for path in [*(folder / SEARCHED).glob("[0-9a-f]*.safetensors"), *checkpoints[-1:]]:
+                content[f"{path.parent.name}/{path.name}"] = path.read_bytes()
+            return content if checkpoints else {}
+    raise ServiceError(f"the state in {str(folder)!r} changes too quickly to be read: try again")
+
+
+def restore(folder: Path, content: Mapping[str, bytes]) -> None:
+    """Write what `files` returned to a new folder, from which a pipeline can be resumed.
+
+    Raises
+    ------
+    ServiceError
+        If a name is not one that `files` returns, or a file cannot be written.
+    """
+    for name, data in content.items():
+        if not _NAMES.fullmatch(name):
+            raise ServiceError(f"{name!r} is not a file of the state of a pipeline")
+        try:
+            (folder / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            storage.write_atomically(folder / name, data, 0o600)
+        except OSError as error:
+            raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
+
+
+def skip(folder: Path, settings: Settings, seq: int) -> int:
+    """Count the frames of a live source up to a number as lost: the numbers go on after it.
+
+    Returns
+    -------
+    how many there are after the newest checkpoint
+    """
+    store = CheckpointStore(folder / TREES)
+    forest = store.load(settings)
+    lost = max(0, seq - forest.seq)
+    forest.skip(lost)
+    if not store.save(forest):
+        raise ServiceError(f"cannot keep the state in {str(folder)!r}: {store.trouble}")
+    return lost
+
+
+@contextlib.contextmanager
+def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
+    """Lock a folder for this process alone; the folder is made if it does not exist.
+
+    Parameters
+    ----------
+    seconds : how long to wait if another process has locked it
+
+    Raises
+    ------
+    ServiceError
+        If another process keeps it locked, or it cannot be made.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
+    try:
+        if not storage.lock(handle, seconds):
+            raise ServiceError(f"a pipeline that runs keeps its state in {str(folder)!r}: stop it, or {_HELP}")
+        yield folder
+    finally:
+        os.close(handle)
