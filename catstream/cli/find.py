@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn, Task
+from rich.progress import Task
 from rich.table import Table
-from rich.text import Text
 
 from catstream.cli import INTERRUPTED, interruptible
 from catstream.cli.interrupts import Interrupts
+from catstream.cli.line import line_of
 from catstream.errors import CatstreamError, VideoError
 from catstream.numerics.threads import one_thread
 from catstream.settings import RunSettings
@@ -175,8 +175,8 @@ def find(
 def _search(search: Search, files: list[File], log: SearchLog, interrupts: Interrupts, console: Console) -> None:
     """Search all files that are not complete, and show the progress."""
     state = _State(len(files))
-    with Progress(_Line(console), console=console, transient=True, refresh_per_second=8) as progress:
-        task = progress.add_task("", state=state)
+    with line_of(console, _line) as progress:
+        task = progress.add_task("", total=None, state=state)
         for number, file in enumerate(files):
             result = log.begin(file)
             state.begin(number, result)
@@ -223,29 +223,20 @@ class _State:
         self.number, self.result, self.time = number, result, result.time
 
 
-class _Line(ProgressColumn):
-    """File, frames and sightings on one line: in a narrow terminal those that matter least are left out."""
-
-    def __init__(self, console: Console) -> None:
-        super().__init__()
-        self._console = console
-
-    def render(self, task: Task) -> Text:
-        state: _State = task.fields["state"]
-        result = state.result
-        if result is None:
-            return Text("starting")
-        speed = state.searched / max(perf_counter() - state.started, 1e-6)
-        parts = [
-            f"file {state.number + 1}/{state.files}",
-            f"frame {(result.position or 0) + 1}/{result.frames or '?'}",
-            f"{len(result.sightings)} sightings",
-            f"{speed:.1f} x real time",
-            Path(result.file).name,
-        ]
-        while len(line := "  ".join(parts)) >= self._console.width and len(parts) > 2:
-            parts.pop()
-        return Text(line, no_wrap=True, overflow="ellipsis")
+def _line(task: Task) -> list[str]:
+    """File, frames and sightings."""
+    state: _State = task.fields["state"]
+    result = state.result
+    if result is None:
+        return ["starting"]
+    speed = state.searched / max(perf_counter() - state.started, 1e-6)
+    return [
+        f"file {state.number + 1}/{state.files}",
+        f"frame {(result.position or 0) + 1}/{result.frames or '?'}",
+        f"{len(result.sightings)} sightings",
+        f"{speed:.1f} x real time",
+        Path(result.file).name,
+    ]
 
 
 def _print(results: list[FileResult], report: Path) -> None:

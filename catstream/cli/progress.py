@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn, Task
-from rich.text import Text
+from rich.progress import Progress, Task
 
+from catstream.cli.line import line_of
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, counted
 from catstream.pipeline import Pipeline
@@ -19,31 +19,6 @@ from catstream.sinks.sink import STDOUT
 __all__ = ["RunProgress"]
 
 _SHORTEST_SECONDS = 1.0  # of a run whose rate is told
-
-
-class _Line(ProgressColumn):
-    """State, frames and figures on one line: in a narrow terminal those that matter least are left out."""
-
-    _BAR = 24
-
-    def __init__(self, pipeline: Pipeline, console: Console) -> None:
-        super().__init__()
-        self._pipeline, self._console = pipeline, console
-
-    def render(self, task: Task) -> Text:
-        # If there are no tracks: the source is lost, or the run is paused or waits for a box.
-        lost = self._pipeline.lost_seconds
-        state = f"lost {lost:.0f} s" if lost else self._pipeline.holding or task.fields["state"]
-        total = "" if self._pipeline.live else f"/{'?' if task.total is None else int(task.total)}"
-        parts = [f"{state:13}", f"{int(task.completed)}{total}", *task.fields["figures"]]
-        room = self._console.width - 1
-        while len(line := "  ".join(parts)) > room and len(parts) > 2:
-            parts.pop()
-        bar = min(self._BAR, room - len(line) - 2)
-        if task.total and bar >= 6:
-            done = round(bar * min(task.completed / task.total, 1.0))
-            parts.insert(1, "━" * done + "─" * (bar - done))
-        return Text("  ".join(parts), no_wrap=True, overflow="ellipsis")
 
 
 @dataclass(slots=True)
@@ -72,9 +47,16 @@ class RunProgress:
         self._objects = {name: _Object() for name in names}
 
     def progress(self, console: Console) -> Progress:
-        progress = Progress(_Line(self._pipeline, console), console=console, transient=True, refresh_per_second=8)
+        progress = line_of(console, self._line)
         self._task = progress.add_task("", total=self._pipeline.frames, state="starting", figures=())
         return progress
+
+    def _line(self, task: Task) -> list[str]:
+        # If there are no tracks: the source is lost, or the run is paused or waits for a box.
+        lost = self._pipeline.lost_seconds
+        state = f"lost {lost:.0f} s" if lost else self._pipeline.holding or task.fields["state"]
+        total = "" if self._pipeline.live else f"/{'?' if task.total is None else int(task.total)}"
+        return [f"{state:13}", f"{int(task.completed)}{total}", *task.fields["figures"]]
 
     def show(self, progress: Progress, tracks: Mapping[str, Track]) -> None:
         """Count the tracks of a frame, and show them if the last ones were shown a while ago."""
