@@ -30,7 +30,7 @@ from catstream.services.commands import CommandHandler
 from catstream.services.control import CommandChannel
 from catstream.services.delivery import Step, next_step
 from catstream.services.desired import DesiredObject, DesiredState
-from catstream.services.loop import Process
+from catstream.services.loop import RECORDER, Process
 from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import DataSender, Outputs
 from catstream.services.pacing import Awaited, awaited
@@ -53,7 +53,7 @@ _OWNER_SECONDS = 0.5  # the same for the owner of the run, which may no longer r
 _OPEN_SECONDS = 60.0  # limit for opening the source, and for the first frame
 _SKIP_SECONDS = 0.1  # limit for decoding a skipped frame
 _TURN_SECONDS = 0.02  # from one turn of a waiting loop to the next
-_SUBSCRIBERS_SECONDS = 5.0  # limit for announced subscribers to connect
+_SUBSCRIBERS_SECONDS = 5.0  # limit for early subscribers to connect
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
 _log = logging.getLogger(__name__)
@@ -145,12 +145,9 @@ class DetectorLoop:
         self._process.beat(self._counters, self._object_counters, now=commanded)
 
     def wait_for_subscribers(self) -> None:
-        """Wait for the recorder without a time-out, and for announced subscribers for a few seconds."""
-        recorded = self._process.job.record is not None
+        """Wait for the recorder without a time-out, and for early subscribers for a few seconds."""
         deadline = time.monotonic() + _SUBSCRIBERS_SECONDS
-        while (recorded and not self._outputs.has_subscribers) or (
-            not self._outputs.all_connected and time.monotonic() < deadline
-        ):
+        while (missing := self._outputs.awaited) and (RECORDER in missing or time.monotonic() < deadline):
             self._outputs.poll(self._outputs.features)
             self._serve_or_exit()
 

@@ -24,13 +24,26 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 from catstream.wire.rejects import rejects
 
-__all__ = ["PERMANENT_FAILURE", "SOURCE_FAILED", "Parent", "Process", "die_with", "log_as", "run", "run_child"]
+__all__ = [
+    "PERMANENT_FAILURE",
+    "RECORDER",
+    "SOURCE_FAILED",
+    "Parent",
+    "Process",
+    "die_with",
+    "log_as",
+    "run",
+    "run_child",
+]
 
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
 PERMANENT_FAILURE = 2
 
 #: Exit code after the source failed, for example a damaged file: the process is not restarted either.
 SOURCE_FAILED = 3
+
+#: Name of the compressor's subscription to the tracks if it records: the detector waits for it before the first frame.
+RECORDER = "recorder"
 
 _HEALTH_SECONDS = 1.0
 _CLOSE_SECONDS = 30.0  # limit for closing all sockets after the last turn

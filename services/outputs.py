@@ -8,11 +8,10 @@ from typing import Self
 
 import numpy as np
 
-from catstream.messages.kinds import End, Features, Run, Track, Tracks
-from catstream.services.loop import Process
+from catstream.messages.kinds import End, Features, Track, Tracks
+from catstream.services.loop import RECORDER, Process
 from catstream.services.previews import Previews
 from catstream.wire.acknowledged import Sender
-from catstream.wire.announced import readers_of
 from catstream.wire.channels import FEATURES, RESULTS, TRACKS, TRAINING
 from catstream.wire.newest import Publisher
 
@@ -45,23 +44,13 @@ class Outputs:
             self._previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
         self.senders: list[DataSender] = [self.features, *([self.results] if self.results is not None else [])]
-        for channel, readers in readers_of(endpoint).items():
-            if (publisher := self._publishers.get(channel)) is not None:
-                publisher.expect(readers)
+        if process.job.record is not None:
+            self._tracks.awaited.add(RECORDER)
 
     @property
-    def _publishers(self) -> dict[str, Publisher[Track | End] | Publisher[Run | Features | End]]:
-        return {"tracks": self._tracks, "training": self._training}
-
-    @property
-    def has_subscribers(self) -> bool:
-        """Whether the tracks have a subscriber."""
-        return self._tracks.has_subscribers
-
-    @property
-    def all_connected(self) -> bool:
-        """Whether all subscribers that had announced themselves are connected."""
-        return all(publisher.all_connected for publisher in self._publishers.values())
+    def awaited(self) -> set[str]:
+        """Names of the subscribers that should be connected before the first frame, and are not yet."""
+        return self._tracks.awaited | self._training.awaited
 
     def poll(self, awaited: DataSender | None = None) -> None:
         """Process acknowledgements; wait a short time for one to the sender `awaited`."""
@@ -70,8 +59,8 @@ class Outputs:
 
     def serve_late_joiners(self) -> None:
         """Send the first message or the newest preview to new subscribers."""
-        for publisher in self._publishers.values():
-            publisher.serve_late_joiners()
+        self._tracks.serve_late_joiners()
+        self._training.serve_late_joiners()
         self._previews.turn()
 
     def publish_tracks(self, tracks: Tracks | End) -> None:

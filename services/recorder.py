@@ -6,9 +6,10 @@ from contextlib import ExitStack
 from typing import Self
 
 from catstream.errors import RecordingError
-from catstream.messages.kinds import End
+from catstream.messages.kinds import End, Health, Model, Track
+from catstream.services.loop import RECORDER
 from catstream.sinks.recording.file import Recorded, RecordingWriter
-from catstream.wire.channels import HEALTH, MODELS, TRACKS, Channel
+from catstream.wire.channels import HEALTH, MODELS, TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
@@ -24,7 +25,7 @@ class Recorder:
     ----------
     writer : writer of the recording; the caller closes it
     endpoint : endpoint of the pipeline
-    reader : name under which the subscription to the tracks was announced; empty if it was not
+    tracks : subscriber to the tracks, if there is one already
 
     Attributes
     ----------
@@ -32,15 +33,17 @@ class Recorder:
     failed : error that has ended the writing; empty if there was none
     """
 
-    def __init__(self, writer: RecordingWriter, endpoint: Endpoint, reader: str = "") -> None:
+    def __init__(
+        self, writer: RecordingWriter, endpoint: Endpoint, tracks: Subscriber[Track | End] | None = None
+    ) -> None:
         self.end: End | None = None
         self.failed = ""
         self._writer = writer
         with ExitStack() as stack:
-            channels: dict[Channel[Recorded], str] = {TRACKS: reader, MODELS: "", HEALTH: ""}
-            self._subscribers = [
-                stack.enter_context(Subscriber(channel, endpoint, every=True, reader=name))
-                for channel, name in channels.items()
+            self._subscribers: list[Subscriber[Track | End] | Subscriber[Model] | Subscriber[Health]] = [
+                stack.enter_context(tracks or Subscriber(TRACKS, endpoint, name=RECORDER)),
+                stack.enter_context(Subscriber(MODELS, endpoint, every=True)),
+                stack.enter_context(Subscriber(HEALTH, endpoint, every=True)),
             ]
             self._stack = stack.pop_all()
 

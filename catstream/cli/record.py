@@ -13,11 +13,10 @@ from rich.console import Console
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.client.registry import locate
 from catstream.errors import RecordingError
-from catstream.messages.kinds import End, Features, Run
+from catstream.messages.kinds import End, Features, Run, Track
 from catstream.services.recorder import Recorder
 from catstream.sinks.recording.file import Recording, RecordingWriter
-from catstream.wire.announced import Announcement
-from catstream.wire.channels import TRAINING
+from catstream.wire.channels import TRACKS, TRAINING
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
@@ -50,24 +49,26 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     place = locate(endpoint, keys)
     with (
-        Announcement(place, ("training", "tracks")) as waits,
-        Subscriber(TRAINING, place, reader=waits.reader) as training,
+        Subscriber(TRAINING, place, early=True) as training,
+        Subscriber(TRACKS, place, early=True) as tracks,
     ):
         wait_for_pipeline(endpoint, keys, wait)
         with suppress(KeyboardInterrupt):
-            _record(output, place, training, waits.reader)
+            _record(output, place, training, tracks)
     if output.exists():
         click.echo(f"{output}: {Recording(output)}", err=True)
 
 
-def _record(output: Path, place: Endpoint, training: Subscriber[Run | Features | End], reader: str) -> None:
+def _record(
+    output: Path, place: Endpoint, training: Subscriber[Run | Features | End], tracks: Subscriber[Track | End]
+) -> None:
     with ExitStack() as stack:
         status = stack.enter_context(Console(stderr=True).status("waiting for the settings of the pipeline"))
         while not isinstance(run := training.receive(0.1), Run):
             if isinstance(run, End):
                 raise RecordingError(f"nothing was recorded, because the pipeline has ended: {run.reason}")
         writer = stack.enter_context(RecordingWriter(output, run))
-        recorder = stack.enter_context(Recorder(writer, place, reader))
+        recorder = stack.enter_context(Recorder(writer, place, tracks))
         seq, last, deadline = 0, None, float("inf")
         while (last is None or recorder.end is None) and time.monotonic() < deadline:
             message = training.receive(0.05)

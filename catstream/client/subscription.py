@@ -23,7 +23,6 @@ from catstream.client.registry import FollowedStream, Registry, described, fleet
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.messages.names import UNNAMED, check_name
-from catstream.wire.announced import Announcement
 from catstream.wire.channels import CHANNELS, HEALTH, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.newest import Subscriber
@@ -86,7 +85,7 @@ class _Connection:
     Parameters
     ----------
     only, about : the one kind of message to receive, and the object that it is about; None for all
-    announcement : announces this subscription to a pipeline that starts later; None if nothing does
+    early : whether a pipeline that starts later waits for this subscription
 
     Attributes
     ----------
@@ -101,21 +100,14 @@ class _Connection:
         endpoint: Endpoint,
         only: type | None,
         about: str | None,
-        announcement: Announcement | None = None,
+        early: bool = False,
     ) -> None:
-        self.endpoint, self._announcement = endpoint, announcement
-        reader = announcement.reader if announcement is not None else ""
-        self.messages = Subscriber(channel, endpoint, only, about=about, reader=reader)
+        self.endpoint = endpoint
+        self.messages = Subscriber(channel, endpoint, only, about=about, early=early)
         self.ends = Subscriber(TRACKS, endpoint, only=End)
-
-    def withdraw_announcement(self) -> None:
-        """Tell pipelines at this endpoint not to wait for this subscriber any more."""
-        if self._announcement is not None:
-            self._announcement.close()
 
     def close(self) -> None:
         """Disconnect."""
-        self.withdraw_announcement()
         self.messages.close()
         self.ends.close()
 
@@ -188,9 +180,8 @@ class Subscription(Generic[Message]):
         else:
             place = locate(endpoint, keys)
             self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
-            # A pipeline that starts here later waits until this subscription has connected.
-            waits = Announcement(place, [self._channel.name]) if self._channel.keeps == "every" else None
-            self._connection = _Connection(self._channel, place, self._only, self._about, waits)
+            early = self._channel.keeps == "every"
+            self._connection = _Connection(self._channel, place, self._only, self._about, early)
 
     @property
     def missed(self) -> int:
@@ -291,7 +282,6 @@ class Subscription(Generic[Message]):
                     continue
                 self._count(message)
             if not isinstance(message, Run | End):
-                connection.withdraw_announcement()
                 return cast(Message, message)
             if isinstance(message, End) and self._channel.keeps == "every":  # the last message here
                 self._pipeline_ended(message, 0.0)

@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Self
 
 from catstream.errors import ServiceError
 from catstream.messages.storage import is_locked, lock
@@ -26,12 +27,13 @@ from catstream.wire.keys import Keys
 
 __all__ = [
     "Endpoint",
+    "Note",
     "find",
     "fleets",
-    "homes",
     "is_deserted",
     "meeting_place",
-    "notes",
+    "names_of_early_subscribers",
+    "note_early_subscriber",
     "private_folder",
     "running",
 ]
@@ -44,6 +46,7 @@ _NOTE = "endpoint"  # file in the private folder of a running pipeline that hold
 _SOURCE = "source"  # file beside it that names the source of the pipeline
 _FLEET_NOTE = "fleet-endpoint"  # file in the private folder of the controller of a fleet that holds its endpoint
 _FLEET_NAME = "fleet-name"  # file beside it that names the fleet
+_EARLY = f"{_PREFIX}early-"  # begins the names of the notes of subscribers that wait for a pipeline
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,23 +188,16 @@ def _file(channel: Channel[object], sender: str) -> str:
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
     """A new folder that only this user may enter, removed afterwards; also removes those of killed processes."""
-    home = homes()[0]
-    _sweep(home)
+    home = _homes()[0]
+    for path, text in _notes([home], f"{_PREFIX}*/{_OWNER}"):
+        if text is None:
+            shutil.rmtree(path.parent, ignore_errors=True)
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=home))
-    with (folder / ".mark").open("w") as mark:
-        lock(mark.fileno(), math.inf)  # until this process ends
-        (folder / ".mark").rename(folder / _OWNER)  # atomic: it is never visible without its lock
+    with Note(folder / _OWNER, ""):
         try:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _sweep(home: Path) -> None:
-    """Remove the private folders whose owner was killed."""
-    for path, text in notes([home], f"{_PREFIX}*/{_OWNER}"):
-        if text is None:
-            shutil.rmtree(path.parent, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -257,18 +253,14 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
 @contextlib.contextmanager
 def _noted(endpoint: Endpoint, folder: Path, source: str, fleet: str) -> Iterator[None]:
     """Keep a file with an endpoint, locked until the process ends, and beside it one with the source or the fleet."""
-    path = folder / (_FLEET_NOTE if fleet else _NOTE)
     about = folder / (_FLEET_NAME if fleet else _SOURCE)
-    with path.open("w") as note:
-        lock(note.fileno(), math.inf)
+    text = "\n".join([str(endpoint), *([str(endpoint.keys.folder)] if endpoint.keys is not None else [])])
+    try:
         about.write_text(fleet or source)
-        note.write("\n".join([str(endpoint), *([str(endpoint.keys.folder)] if endpoint.keys is not None else [])]))
-        note.flush()
-        try:
+        with Note(folder / (_FLEET_NOTE if fleet else _NOTE), text):
             yield
-        finally:
-            path.unlink(missing_ok=True)
-            about.unlink(missing_ok=True)
+    finally:
+        about.unlink(missing_ok=True)
 
 
 def running() -> list[Endpoint]:
@@ -286,8 +278,8 @@ def _endpoints(note: str, about: str, *, strict: bool = False) -> Iterator[tuple
 
     An endpoint whose keys cannot be read is skipped, because it must not hide the others; if `strict`, it is an error.
     """
-    for path, text in notes(set(homes()), f"{_PREFIX}*/{note}"):
-        if text:  # empty until the process has written it
+    for path, text in _notes(_homes(), f"{_PREFIX}*/{note}"):
+        if text is not None:
             try:
                 endpoint = Endpoint.parse(*text.split("\n"))
             except ServiceError:
@@ -371,8 +363,60 @@ def _follows(endpoint: Endpoint, source: str) -> bool:
     return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
 
 
-def notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | None]]:
-    """This user's files of a pattern: path and text of each, None as the text if the process that locked it is dead."""
+class Note:
+    """A file that is locked until it is closed or its process ends; it is never visible without its lock and text.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+
+    def __init__(self, path: Path, text: str) -> None:
+        hidden = path.with_name(f".{path.name}")
+        self._path, self._file = path, hidden.open("w")
+        lock(self._file.fileno(), math.inf)
+        self._file.write(text)
+        self._file.flush()
+        hidden.rename(path)
+
+    def close(self) -> None:
+        """Remove the file."""
+        self._path.unlink(missing_ok=True)
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def note_early_subscriber(name: str, channel: Channel[object], endpoint: Endpoint) -> Note | None:
+    """A note that a subscriber waits for a pipeline; None if this user may write no note anywhere."""
+    with contextlib.suppress(OSError, IndexError):
+        return Note(_homes()[0] / f"{_EARLY}{name}", f"{channel.name} {_place(endpoint)}")
+    return None
+
+
+def names_of_early_subscribers(channel: Channel[object], endpoint: Endpoint) -> set[str]:
+    """The names in the notes of this user's subscribers that wait at an endpoint; removes the notes of dead ones."""
+    names = set()
+    for path, text in _notes(_homes(), f"{_EARLY}*"):
+        if text is None:
+            path.unlink(missing_ok=True)
+        elif text == f"{channel.name} {_place(endpoint)}":
+            names.add(path.name.removeprefix(_EARLY))
+    return names
+
+
+def _place(endpoint: Endpoint) -> str:
+    """A text of the endpoint that does not depend on how its folder was written."""
+    return str(endpoint.folder.resolve() if endpoint.folder is not None else endpoint)
+
+
+def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | None]]:
+    """This user's notes of a pattern: path and text of each, None as the text if the process that locked it is dead."""
     for folder in folders:
         for path in folder.glob(pattern):
             # It may be removed by now, or belong to another user.
@@ -381,7 +425,7 @@ def notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | N
                     yield path, file.read() if is_locked(file.fileno()) else None
 
 
-def homes() -> list[Path]:
+def _homes() -> list[Path]:
     """The parent folders of private folders, preferred first; a pipeline started by a timer has no runtime folder."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    return [Path(home) for home in (runtime, tempfile.gettempdir()) if os.access(home, os.W_OK)]
+    return list(dict.fromkeys(Path(home) for home in (runtime, tempfile.gettempdir()) if os.access(home, os.W_OK)))

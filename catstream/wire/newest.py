@@ -10,12 +10,17 @@ all if nothing newer followed within 0.2 s, 0.6 s, 1.4 s ...: a burst may have c
 `Subscriber` drops repeats. No more are repeated at once than the queue of a subscriber holds, and the rate halves each
 time, so that all of them reach any subscriber that is not frozen.
 
+A subscriber that waits for a pipeline of the same user on the same machine leaves a note with its name, and also
+subscribes to this name. A publisher of a channel that keeps every message reads these notes when it starts, and knows
+by the subscriptions which of the `awaited` ones are connected: the detector begins with its first frame then.
+
 The number of topics that a peer can make either side remember is limited.
 """
 
 from __future__ import annotations
 
 import math
+import secrets
 from collections.abc import Iterable
 from hashlib import blake2b
 from time import monotonic
@@ -23,10 +28,10 @@ from typing import TypeVar
 
 import zmq
 
-from catstream.messages.kinds import End, Health
+from catstream.messages.kinds import End, Health, Run
 from catstream.wire.channels import Channel
 from catstream.wire.codec import opening, topic_of
-from catstream.wire.endpoint import Endpoint
+from catstream.wire.endpoint import Endpoint, Note, names_of_early_subscribers, note_early_subscriber
 from catstream.wire.socket import ChannelSocket
 
 __all__ = ["Publisher", "Subscriber"]
@@ -37,7 +42,7 @@ _MAX_CHANGES = 1000  # subscriptions that are processed at once
 _MAX_SUBSCRIPTION_BYTES = 4096
 _COMPARED_BYTES = 1 << 12  # at either end of a message, by which a repeat is known
 _REPEAT_SECONDS = 0.2  # without a newer message, after which the last ones are sent again; doubled each time
-_READER = b"\xffreader "  # begins the topic that makes an announced subscriber known; no message begins with it
+_NAME = b"\xffreader "  # begins the topic by which a subscriber gives its name; no message begins with it
 
 Message = TypeVar("Message")
 
@@ -49,6 +54,10 @@ class Publisher(ChannelSocket[Message]):
     ----------
     sender : which of the channel's senders this is, if there are several
     first_message : message that is sent whenever a subscriber connects; on a channel that keeps every message
+
+    Attributes
+    ----------
+    awaited : names of the subscribers that should be connected before the first message, and are not yet
     """
 
     def __init__(
@@ -64,7 +73,7 @@ class Publisher(ChannelSocket[Message]):
         self._socket.set(zmq.XPUB_VERBOSE, 1)  # report every subscription, also one that another subscriber has
         self._kinds = tuple(map(opening, channel.messages))  # the beginnings of topics that may be subscribed to
         self._subscribed: set[bytes] = set()
-        self._expected: set[bytes] = set()  # topics of announced subscribers that are not connected yet
+        self.awaited = set() if self._newest else names_of_early_subscribers(channel, endpoint)
         self._last: dict[bytes, bytes] = {}  # the messages for late joiners by topic, oldest first
         if first_message is not None:
             self._last[b""] = self._encode(first_message)
@@ -77,15 +86,6 @@ class Publisher(ChannelSocket[Message]):
     def has_subscribers(self) -> bool:
         """Whether there was a subscriber when `send` or `serve_late_joiners` was last called."""
         return bool(self._subscribed)
-
-    def expect(self, readers: Iterable[str]) -> None:
-        """Name the announced subscribers that should be connected before the first message."""
-        self._expected = {_READER + reader.encode() for reader in readers}
-
-    @property
-    def all_connected(self) -> bool:
-        """Whether all that were expected were connected when `serve_late_joiners` was last called."""
-        return not self._expected
 
     def send(self, message: Message) -> None:
         """Send to all subscribers; on a channel that keeps the newest message, later to late joiners too."""
@@ -143,8 +143,8 @@ class Publisher(ChannelSocket[Message]):
 
     def _process(self, subscribes: bool, topic: bytes) -> bool:
         """Process one subscription or its end; returns whether there is a new subscriber."""
-        if topic.startswith(_READER):
-            self._expected.discard(topic)
+        if topic.startswith(_NAME):
+            self.awaited.discard(topic.removeprefix(_NAME).decode(errors="replace"))
         elif topic and not topic.startswith(self._kinds):
             self._reject(
                 "subscription",
@@ -171,7 +171,8 @@ class Subscriber(ChannelSocket[Message]):
     only : the one kind of message to receive; None for all
     about : name of the one object whose messages of this kind are received; None for all
     every : on a channel that keeps the newest message, receive older ones too, as far as they arrive
-    reader : name by which this subscriber was announced, see `catstream.wire.announced`
+    early : whether a pipeline that starts later, on this machine as this user, waits for this subscriber
+    name : by which the publisher may wait for this subscriber; if `early`, a new one
     """
 
     def __init__(
@@ -182,7 +183,8 @@ class Subscriber(ChannelSocket[Message]):
         *,
         about: str | None = None,
         every: bool = False,
-        reader: str = "",
+        early: bool = False,
+        name: str = "",
     ) -> None:
         self._newest = channel.keeps == "newest"
         self._passes_over = self._newest and len(channel.senders) == 1 and not every
@@ -191,8 +193,12 @@ class Subscriber(ChannelSocket[Message]):
         self._arrived: dict[bytes, zmq.Frame] = {}  # newest message of each topic, the topic that waits longest first
         self._last: dict[bytes, bytes] = {}  # digest of the last message of each topic or process, to drop repeats
         self._socket.subscribe(b"" if only is None else opening(only, about))
-        if reader:  # after the topic of the messages: subscriptions are transmitted in order, the empty one first
-            self._socket.subscribe(_READER + reader.encode())
+        self._note: Note | None = None
+        if early:
+            name = secrets.token_hex(8)
+            self._note = note_early_subscriber(name, channel, endpoint)
+        if name:  # after the topic of the messages: subscriptions are transmitted in order, the empty one first
+            self._socket.subscribe(_NAME + name.encode())
         self._connect()
 
     def pending(self) -> bool:
@@ -205,12 +211,24 @@ class Subscriber(ChannelSocket[Message]):
         while (frame := self._next_frame(deadline)) is not None:
             message = self._decode(frame.buffer, *self.channel.messages)
             if message is not None and not (self._newest and self._is_repeat(message, frame.buffer)):
+                if not isinstance(message, Run):  # it has heard the pipeline: no other one has to wait for it
+                    self._remove_note()
                 return message
         return None
 
     def receive_all(self) -> list[Message]:
         """All messages that have arrived, oldest first."""
         return list(iter(lambda: self.receive(0), None))
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._remove_note()
+        super().close()
+
+    def _remove_note(self) -> None:
+        if self._note is not None:
+            self._note.close()
+            self._note = None
 
     def _next_frame(self, deadline: float) -> zmq.Frame | None:
         """The next message as it arrived, None if none arrives before the deadline."""

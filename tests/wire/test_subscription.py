@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import shutil
 import threading
 from dataclasses import replace
 
@@ -16,10 +17,9 @@ from catstream.box import Box
 from catstream.errors import ObjectError, ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
 from catstream.wire import socket
-from catstream.wire.announced import Announcement, readers_of
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
-from catstream.wire.endpoint import Endpoint
-from catstream.wire.newest import Publisher
+from catstream.wire.endpoint import Endpoint, names_of_early_subscribers
+from catstream.wire.newest import Publisher, Subscriber
 
 
 def track(seq, name="", version=1):
@@ -307,27 +307,40 @@ def test_a_subscriber_that_receives_only_the_end_has_missed_all(endpoint, tracks
 @pytest.mark.parametrize("channel", ["tracks", "features"])
 def test_a_pipeline_waits_for_a_subscriber_that_started_first(endpoint, until, channel):
     with catstream.subscribe(str(endpoint), channel, timeout=20) as subscription:
-        (name, readers), *others = readers_of(endpoint).items()
-        assert not others
-        with Publisher(CHANNELS[name], endpoint) as publisher:
-            publisher.expect(readers)
-            assert not publisher.all_connected
-            until(lambda: publisher.all_connected, publisher.serve_late_joiners)
+        row = CHANNELS["tracks" if channel == "tracks" else "training"]
+        with Publisher(row, endpoint) as publisher:
+            assert publisher.awaited
+            until(lambda: not publisher.awaited, publisher.serve_late_joiners)
             message = track(1) if channel == "tracks" else features(1)
             publisher.send(message)
             assert next(subscription).seq == 1
-        assert readers_of(endpoint) == {}, "it has heard the pipeline: no other one has to wait for it"
+        assert not names_of_early_subscribers(row, endpoint), "it has heard the pipeline: no other one waits for it"
 
 
-def test_an_announcement_is_for_one_endpoint_and_ends_with_its_process(folder, tmp_path, monkeypatch):
+def test_subscribers_that_are_not_awaited_do_not_count_for_those_that_are(endpoint, until):
+    with (
+        catstream.subscribe(str(endpoint), "models"),  # it subscribes to the end of the tracks, too
+        Subscriber(CHANNELS["tracks"], endpoint),
+        Publisher(CHANNELS["tracks"], endpoint) as publisher,
+    ):
+        publisher.awaited.add("recorder")
+        until(lambda: publisher.has_subscribers, publisher.serve_late_joiners)
+        assert publisher.awaited == {"recorder"}
+        with Subscriber(CHANNELS["tracks"], endpoint, name="recorder"):
+            until(lambda: not publisher.awaited, publisher.serve_late_joiners)
+
+
+def test_a_subscriber_is_early_for_one_channel_of_one_endpoint_and_as_long_as_it_lives(folder, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     here, there = Endpoint.parse(str(folder)), Endpoint.parse("tcp://127.0.0.1:5700")
-    with Announcement(here, ["tracks"]) as waits:
-        assert readers_of(here) == {"tracks": {waits.reader}}
-        assert readers_of(there) == {}
+    tracks, training = CHANNELS["tracks"], CHANNELS["training"]
+    with Subscriber(tracks, here, early=True):
+        (name,) = names_of_early_subscribers(tracks, here)
+        assert not names_of_early_subscribers(training, here)
+        assert not names_of_early_subscribers(tracks, there)
         monkeypatch.chdir(folder.parent)
-        assert readers_of(Endpoint.parse(folder.name)) == readers_of(here), "however the folder is named"
-    assert readers_of(here) == {}
-    (dead := tmp_path / "catstream-reader-0").write_text(f"{folder}\ntracks")
-    assert readers_of(here) == {}
-    assert not dead.exists()
+        assert names_of_early_subscribers(tracks, Endpoint.parse(folder.name)) == {name}, "however the folder is named"
+        shutil.copy(tmp_path / f"catstream-early-{name}", dead := tmp_path / "catstream-early-0")
+        assert names_of_early_subscribers(tracks, here) == {name}
+        assert not dead.exists()
+    assert not list(tmp_path.iterdir())
