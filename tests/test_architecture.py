@@ -55,7 +55,6 @@ IMPORTERS = {
     "numba": ["catstream/features/compiler.py"],
     "llvmlite": ["catstream/features/compiled.py", "catstream/features/compiler.py"],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
-    "filelock": ["catstream/messages/storage.py"],
     "safetensors": ["catstream/messages/storage.py"],
     "fsspec": ["catstream/fleet/objects.py"],
     "s3fs": ["catstream/fleet/objects.py"],  # fsspec imports it
@@ -89,7 +88,6 @@ IMPORTERS = {
 
 #: Libraries that take long to import: inside the function that needs them.
 SLOW = {
-    "filelock",
     "sklearn",
     "av",
     "scipy",

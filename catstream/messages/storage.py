@@ -149,8 +149,7 @@ def why_not_writable(path: Path) -> str:
 
 
 def prepare() -> None:
-    """Import what reading, writing and locking files need."""
-    import filelock  # noqa: F401
+    """Import what reading and writing files need."""
     import safetensors.numpy  # noqa: F401
 
 
@@ -159,10 +158,8 @@ def lock(handle: int, seconds: float = 0.0) -> bool:
 
     The kernel releases the lock when the handle is closed, or when the process ends, however that happens.
     """
-    from filelock import lock_descriptor
-
     deadline = time.monotonic() + seconds
-    while not lock_descriptor(handle, blocking=False):
+    while not _flock(handle, fcntl.LOCK_EX):
         if time.monotonic() >= deadline:
             return False
         time.sleep(_PAUSE_SECONDS)
@@ -172,14 +169,18 @@ def lock(handle: int, seconds: float = 0.0) -> bool:
 def is_locked(handle: int) -> bool:
     """Whether another process has locked an open file.
 
-    The question is asked with a shared lock, which filelock does not offer: two processes that ask at the same moment
-    do not take each other for an owner.
+    The question is asked with a shared lock: two processes that ask at the same moment do not take each other for an
+    owner.
     """
+    return not _flock(handle, fcntl.LOCK_SH)
+
+
+def _flock(handle: int, kind: int) -> bool:
     try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except BlockingIOError:
-        return True
-    return False
+        return False
+    return True
 
 
 def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode: int = 0o666) -> None:
