@@ -51,7 +51,7 @@ def test_a_page_with_marks_has_the_figures_of_the_records(path):
 def test_every_benchmark_has_a_record_and_every_record_its_place_on_a_page():
     measured = {measured_by(record) for record in FOUND.values()}
     assert measured == SCRIPTS | {"catstream evaluate", "catstream loadtest"}, (
-        "benchmarks/results: see docs/benchmarks.md"
+        "benchmarks/results: see benchmarks/README.md"
     )
     assert FOUND.keys() == page.shown(), "benchmarks/page.py does not show a record, or shows one that is not there"
 

@@ -1,0 +1,55 @@
+"""What MkDocs adds to the pages when it builds them: the commands, from click, and the list of decisions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from inspect import cleandoc
+from pathlib import Path
+from typing import Any
+
+import click
+
+from catstream.cli import VERBS, verb
+
+_DECISIONS = Path(__file__).parent / "decisions"
+
+
+def on_config(config: Any) -> Any:
+    """List the records of decisions in the navigation, below their index."""
+    background = next(part["Background"] for part in config.nav if "Background" in part)
+    decisions = next(part["Decisions"] for part in background if "Decisions" in part)
+    decisions += [f"decisions/{path.name}" for path in sorted(_DECISIONS.glob("0*.md"))]
+    return config
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Append the help of every command to the page of the command line."""
+    return f"{markdown}\n{commands()}" if page.file.src_uri == "command-line.md" else markdown
+
+
+def commands() -> str:
+    """Return the help of every command in Markdown."""
+    return "\n".join(line for name in VERBS for line in described(verb(name), f"catstream {name}", level=2))
+
+
+def described(command: click.Command, path: str, level: int) -> Iterator[str]:
+    """Yield the lines of a command, and those of its own commands if it is a group."""
+    with click.Context(command, info_name=path) as context:
+        words = " ".join(command.collect_usage_pieces(context))
+        yield f"{'#' * level} {path.removeprefix('catstream ')}\n\n```\n{path} {words}\n```\n"
+        yield from map(paragraph, cleandoc(command.help or "").split("\n\n"))
+        rows = [option.get_help_record(context) for option in command.params if isinstance(option, click.Option)]
+        if rows:
+            yield "| option | meaning |\n| --- | --- |"
+            yield from (f"| `{names}` | {meaning.replace('|', '&#124;')} |" for names, meaning in filter(None, rows))
+            yield ""
+        if isinstance(command, click.Group):
+            for name in command.list_commands(context):
+                if (each := command.get_command(context, name)) is not None:
+                    yield from described(each, f"{path} {name}", level + 1)
+
+
+def paragraph(text: str) -> str:
+    """Return a paragraph of a docstring in Markdown. One that click must not wrap is shown as it is."""
+    _, unwrapped, lines = text.rpartition("\b\n")
+    return f"```\n{lines}\n```\n" if unwrapped else f"{text}\n"
