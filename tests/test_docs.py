@@ -145,11 +145,11 @@ def test_every_command_and_option_has_help():
 
 
 def test_the_page_of_the_architecture_names_each_entry_of_the_library():
-    tree = page("docs/architecture.md").partition("## Modules\n\n```\n")[2].partition("```")[0]
-    named = set(re.findall(r"(?<![\w/.])\w+(?:\.py|/)", tree)) - {"catstream/", "services/"}
-    there = {f"{path.name}/" if path.is_dir() else path.name for path in (ROOT / "catstream").iterdir()}
-    assert named == {name for name in there if name[0] != "_" and name not in {"services/", "py.typed"}}, (
-        "docs/architecture.md, the modules: name each file and package of catstream/"
+    rows = page("docs/architecture.md").partition("## Packages\n")[2].partition("\n**Imports")[0]
+    named = {name for row in re.findall(r"^\| (`.*?) \|", rows, re.M) for name in re.findall(r"`(.*?)`", row)}
+    there = {path.name for path in (ROOT / "catstream").iterdir()}
+    assert named == {name for name in there if name[0] != "_" and name != "py.typed"}, (
+        "docs/architecture.md, the packages: name each file and package of catstream/"
     )
 
 

@@ -1,6 +1,6 @@
 """docs/protocol.md says what the wire does: a channel or a field that it leaves out fails here.
 
-Run as a program, it writes the tables of the messages and of the heads anew: `make protocol`.
+Run as a program, it writes the fields of the messages and the table of the heads: `make protocol`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import select
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import fill
 from typing import Literal, get_args, get_origin
 
 import msgpack
@@ -53,7 +54,7 @@ PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
 PARTS = [DetectorState, Motion, NodeStatus, ObjectFeatures, ObjectPosition, StreamStatus, Summary, TrainingRows]
 MESSAGES = [*codec.KINDS.values(), *PARTS]
-PLAIN = {int: "whole number", float: "number", str: "text", bool: "boolean", Box: "box", Window: "window"}
+PLAIN = {int: "integer", float: "number", str: "text", bool: "boolean", Box: "box", Window: "window"}
 
 
 def block(language):
@@ -61,16 +62,17 @@ def block(language):
     return re.search(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)[1]
 
 
-def table(kind):
-    """The table of the fields of a message: types and limits from its schema, meanings from its docstring."""
+def listed(kind):
+    """The list of the fields of a message: types and limits from its schema, meanings from its docstring."""
     meanings = dict(
         re.findall(r"^(\w+)(?: : .*\n +|  +)(\S.*(?:\n +\S.*)*)", inspect.cleandoc(kind.__doc__), re.MULTILINE)
     )
     rows = []
     for field in fields(kind):
-        meaning = re.sub(r"\s+", " ", meanings[field.name]).replace("None", "nil").replace("|", "\\|").rstrip(".")
-        rows.append(f"| `{field.name}` | {described(field)} | {meaning} |\n")
-    return "".join(["| field | type | meaning |\n| --- | --- | --- |\n", *rows])
+        meaning = re.sub(r"\s+", " ", meanings[field.name]).replace("None", "nil").rstrip(".")
+        row = f"`{field.name}` ({described(field)}): {meaning[0].lower()}{meaning[1:]}"
+        rows.append(fill(row, 128, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False) + "\n")
+    return "".join(rows)
 
 
 def described(field):
@@ -96,7 +98,7 @@ def kind_of(field):
     if get_origin(field.type) is Literal:
         return f"text: {', '.join(f'`{value}`' for value in get_args(field.type))}"
     if get_origin(field.type) is tuple:
-        return "array of whole numbers"
+        return "array of integers"
     least = field.limit(Whole)
     return PLAIN[field.type] + (f", at least {least.low}" if least else "")
 
@@ -122,10 +124,10 @@ def heads_table():
 
 
 def section(kind):
-    """Where the page has the table of a message."""
+    """Where the page has the fields of a message."""
     name = kind.__name__.lower()
-    found = re.compile(rf"(^### `{name}`\n(?:(?!^###? ).*\n)*?)((?:^\|.*\n)+)", re.MULTILINE)
-    assert found.search(PAGE), f"docs/protocol.md has no table in a section on {name}"
+    found = re.compile(rf"(^### `{name}`\n(?:(?!^###? ).*\n)*?)((?:^(?:- |  )\S.*\n)+)", re.MULTILINE)
+    assert found.search(PAGE), f"docs/protocol.md has no list of fields in a section on {name}"
     return found
 
 
@@ -141,8 +143,8 @@ def test_every_channel_has_its_row(channel):
 
 
 @pytest.mark.parametrize("kind", MESSAGES, ids=lambda kind: kind.__name__.lower())
-def test_the_table_of_a_message_agrees_with_its_schema(kind):
-    assert section(kind).search(PAGE)[2] == table(kind), "docs/protocol.md is not the schema: run `make protocol`"
+def test_the_fields_of_a_message_agree_with_its_schema(kind):
+    assert section(kind).search(PAGE)[2] == listed(kind), "docs/protocol.md is not the schema: run `make protocol`"
 
 
 def test_the_table_of_heads_is_that_of_the_library():
@@ -200,5 +202,5 @@ def heard(stream):
 
 if __name__ == "__main__":
     for kind in MESSAGES:
-        PAGE = section(kind).sub(lambda found, kind=kind: found[1] + table(kind), PAGE)
+        PAGE = section(kind).sub(lambda found, kind=kind: found[1] + listed(kind), PAGE)
     PATH.write_text(re.sub(r"^\| tree \|.*\n(\|.*\n)+", lambda _: heads_table(), PAGE, flags=re.MULTILINE))
