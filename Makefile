@@ -11,7 +11,7 @@ TOOLS := $(VENV)/.tools
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo test test-system test-slow lint format docs pythons picture settings protocol bench results lock clean fuzz audit
+.PHONY: help setup develop demo test test-system test-slow lint format docs pythons picture life protocol bench results lock clean fuzz audit
 
 help:  ## list all commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -68,10 +68,10 @@ pythons:  ## run the demo on each supported Python of this machine
 picture: $(READY)  ## render the animated picture of README.md
 	@$(BIN)/python .ci/picture
 
-settings: $(TOOLS)  ## update the table of docs/settings.md
+life: $(TOOLS)  ## update the life of a stream in docs/how-to/fleet.md
 	$(BIN)/python tests/test_docs.py
 
-protocol: $(TOOLS)  ## update the tables of docs/protocol.md
+protocol: $(TOOLS)  ## update the fields in docs/protocol.md
 	$(BIN)/python tests/wire/test_protocol_page.py
 
 bench: $(TOOLS)  ## measure speed, memory and growth on an idle machine, into benchmarks/results: 20 minutes

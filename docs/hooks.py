@@ -1,7 +1,8 @@
-"""What MkDocs adds to the pages when it builds them: the commands, from click, and the list of decisions."""
+"""What MkDocs adds to the pages when it builds them: commands, settings, and the list of decisions."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from inspect import cleandoc
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import click
 
 from catstream.cli import VERBS, verb
+from catstream.settings import PRESETS, describe
 
 _DECISIONS = Path(__file__).parent / "decisions"
 
@@ -23,8 +25,23 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Append the help of every command to the page of the command line."""
-    return f"{markdown}\n{commands()}" if page.file.src_uri == "command-line.md" else markdown
+    """Append the help of every command to the page of the command line, and all settings to theirs."""
+    added = {"command-line.md": commands, "settings.md": settings}.get(page.file.src_uri)
+    return f"{markdown}\n{added()}" if added else markdown
+
+
+def settings() -> str:
+    """Return the tables of settings and of presets in Markdown."""
+    lines = ["| setting | takes | default | meaning |", "| --- | --- | --- | --- |"]
+    for name, takes, default, meaning in describe():
+        shown = "empty" if default == "" else str(default).lower() if isinstance(default, bool) else default
+        takes, meaning = takes.replace("|", "&#124;"), meaning.replace("|", "&#124;")
+        lines.append(f"| `{name}` | {takes} | {shown} | {meaning} |")
+    lines += ["", "| preset | sets |", "| --- | --- |"]
+    for preset, values in PRESETS.items():
+        pairs = ", ".join(f"`{name} = {json.dumps(value)}`" for name, value in values.items())
+        lines.append(f"| `{preset}` | {pairs} |")
+    return "\n".join(lines) + "\n"
 
 
 def commands() -> str:

@@ -1,6 +1,6 @@
 """The documentation matches the code: it describes every public name, and its examples run.
 
-Run as a program, this file updates the table of `docs/settings.md`: `make settings`.
+Run as a program, this file updates the life of a stream in `docs/how-to/fleet.md`: `make life`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
-import json
 import re
 import shlex
 import sys
@@ -37,7 +36,6 @@ sys.path.append(str(DOCS))
 import hooks  # noqa: E402
 
 _LIFE = re.compile(r"(<!-- life: .*? -->\n).*?(<!-- /life -->)", re.DOTALL)
-_TABLE = re.compile(r"(<!-- settings: .*? -->\n).*?(<!-- /settings -->)", re.DOTALL)
 
 
 def page(name: str) -> str:
@@ -73,20 +71,6 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
-def settings_table() -> str:
-    """The tables of settings and of presets, as `docs/settings.md` shows them."""
-    lines = ["| setting | takes | default | meaning |", "| --- | --- | --- | --- |"]
-    for name, takes, default, meaning in describe():
-        shown = "empty" if default == "" else str(default).lower() if isinstance(default, bool) else default
-        takes, meaning = takes.replace("|", "\\|"), meaning.replace("|", "\\|")
-        lines.append(f"| `{name}` | {takes} | {shown} | {meaning} |")
-    lines += ["", "| preset | sets |", "| --- | --- |"]
-    for preset, values in PRESETS.items():
-        pairs = (f"`{name} = {json.dumps(value)}`" for name, value in values.items())
-        lines.append(f"| `{preset}` | {', '.join(pairs)} |")
-    return "\n".join(lines) + "\n"
-
-
 def life_of_a_stream() -> str:
     """The tables and the diagram of the life of a stream, as `docs/how-to/fleet.md` shows them."""
     lines = ["", "| state | an actor in it |", "| --- | --- |"]
@@ -99,7 +83,7 @@ def life_of_a_stream() -> str:
 def test_the_life_of_a_stream_is_shown_as_its_table_says():
     shown = _LIFE.search(page("docs/how-to/fleet.md"))
     assert shown, "docs/how-to/fleet.md: the marks around the life of a stream are missing"
-    assert life_of_a_stream() in shown[0], "docs/how-to/fleet.md does not show the table as it is: run `make settings`"
+    assert life_of_a_stream() in shown[0], "docs/how-to/fleet.md does not show the table as it is: run `make life`"
 
 
 def verbs() -> dict[str, click.Command]:
@@ -118,10 +102,18 @@ def by_name(group: click.Group) -> dict[str, click.Command]:
     return {name: command for name, command in found.items() if command is not None}
 
 
-def test_every_setting_and_preset_has_its_row():
-    shown = _TABLE.search(page("docs/settings.md"))
-    assert shown, "docs/settings.md: the marks around its table are missing"
-    assert settings_table() in shown[0], "docs/settings.md does not show the settings as they are: run `make settings`"
+def built(name: str) -> str:
+    """What MkDocs adds to a page."""
+    return hooks.on_page_markdown("", SimpleNamespace(file=SimpleNamespace(src_uri=name)))
+
+
+def test_every_setting_and_preset_has_its_row_on_the_page_of_settings():
+    rows = built("settings.md")
+    for name, _, _, meaning in describe():
+        assert f"| `{name}` |" in rows
+        assert meaning, f"{name}: write what it means"
+    assert all(f"| `{preset}` |" in rows for preset in PRESETS)
+    assert not built("api.md").strip()
 
 
 @pytest.mark.parametrize("name", CHANNELS)
@@ -154,14 +146,13 @@ def test_the_page_of_the_architecture_names_each_entry_of_the_library():
 
 
 def test_the_page_of_the_command_line_shows_every_command_and_option():
-    shown = hooks.on_page_markdown("", SimpleNamespace(file=SimpleNamespace(src_uri="command-line.md")))
+    shown = built("command-line.md")
     for name, top in verbs().items():
         section = shown.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
         for option in (option for command in commands_of(top) for option in command.params):
             assert max(option.opts, key=len) in section or isinstance(option, click.Argument)
         if isinstance(top, click.Group):
             assert all(f"### {name} {command}\n" in section for command in by_name(top))
-    assert hooks.on_page_markdown("text", SimpleNamespace(file=SimpleNamespace(src_uri="api.md"))) == "text"
 
 
 def test_every_file_that_track_writes_is_explained():
@@ -286,14 +277,12 @@ def test_the_version_is_the_same_everywhere():
     assert tomllib.loads(page("pyproject.toml"))["project"]["version"] == catstream.__version__
 
 
-if __name__ == "__main__":
-    settings = DOCS / "settings.md"
-    fleet = DOCS / "how-to" / "fleet.md"
-    fleet.write_text(_LIFE.sub(lambda found: found[1] + life_of_a_stream() + found[2], fleet.read_text()))
-    settings.write_text(_TABLE.sub(lambda found: found[1] + settings_table() + found[2], page("docs/settings.md")))
-
-
 def test_every_name_of_the_library_is_in_the_reference_of_the_api():
     page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"^::: catstream\.(\w+)", page, re.MULTILINE))
     assert shown - {"errors"} == set(catstream.__all__) - {"CatstreamError", "__version__"}
+
+
+if __name__ == "__main__":
+    fleet = DOCS / "how-to" / "fleet.md"
+    fleet.write_text(_LIFE.sub(lambda found: found[1] + life_of_a_stream() + found[2], fleet.read_text()))
