@@ -13,21 +13,28 @@ import click
 from catstream.cli import VERBS, verb
 from catstream.settings import PRESETS, describe
 
-_DECISIONS = Path(__file__).parent / "decisions"
+RECORDS = sorted((Path(__file__).parent / "decisions").glob("0*.md"))
 
 
 def on_config(config: Any) -> Any:
     """List the records of decisions in the navigation, below their index."""
     background = next(part["Background"] for part in config.nav if "Background" in part)
-    decisions = next(part["Decisions"] for part in background if "Decisions" in part)
-    decisions += [f"decisions/{path.name}" for path in sorted(_DECISIONS.glob("0*.md"))]
+    records = next(part["Decisions"] for part in background if "Decisions" in part)
+    records += [f"decisions/{path.name}" for path in RECORDS]
     return config
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Append the help of every command to the page of the command line, and all settings to theirs."""
-    added = {"command-line.md": commands, "settings.md": settings}.get(page.file.src_uri)
+    """Append the help of every command, all settings, or the list of decisions to their page."""
+    pages = {"command-line.md": commands, "settings.md": settings, "decisions/index.md": decisions}
+    added = pages.get(page.file.src_uri)
     return f"{markdown}\n{added()}" if added else markdown
+
+
+def decisions() -> str:
+    """Return the list of decisions in Markdown."""
+    titles = ((path.name, path.read_text(encoding="utf-8").partition("\n")[0]) for path in RECORDS)
+    return "\n".join(f"- [{title.removeprefix('# ')}]({name})" for name, title in titles) + "\n"
 
 
 def settings() -> str:

@@ -47,11 +47,3 @@ def test_relations_between_decisions_are_mutual(number):
             assert number in relations(other).get(MUTUAL[word], []), f"{other} does not say: {MUTUAL[word]} {number}"
             assert f"[{other}]({PAGES[other].name})" in status(number)
             assert (other < number) == (word in ("supersedes", "amends")), "a decision changes an older one"
-
-
-def test_the_index_lists_all_decisions():
-    rows = re.findall(r"^- (\d+): \[(.*)\]\((.*)\)$", (FOLDER / "index.md").read_text(), re.MULTILINE)
-    assert rows == [
-        (str(number), path.read_text().partition("\n")[0].partition(". ")[2], path.name)
-        for number, path in PAGES.items()
-    ]

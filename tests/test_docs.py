@@ -127,6 +127,12 @@ def test_every_verb_is_shown(name):
     assert re.search(rf"catstream {name}\b", everything()), f"no page of docs/ shows `catstream {name}`"
 
 
+def test_the_index_of_decisions_lists_every_record():
+    shown = re.findall(r"^- \[(\d+)\. .+\]\((\d+)-.*\.md\)$", built("decisions/index.md"), re.MULTILINE)
+    assert [int(number) for _, number in shown] == [int(number) for number, _ in shown]
+    assert len(shown) == len([*DOCS.glob("decisions/0*.md")])
+
+
 def test_every_command_and_option_has_help():
     """The page of the command line is made from it when the documentation is built."""
     for top in verbs().values():
