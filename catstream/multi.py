@@ -203,7 +203,7 @@ class MultiTracker:
             (height, width), (first_height, first_width) = image.shape[:2], self._size
             raise FrameError(
                 f"this frame is {width}x{height} pixels, those before it {first_width}x{first_height}: "
-                "resize it, or call init to begin anew"
+                "resize it, or call init to start again"
             )
         with one_thread():
             pyramid = Pyramid.of(image)
@@ -223,7 +223,7 @@ class MultiTracker:
 
     @_one_at_a_time
     def forget(self, name: str) -> None:
-        """Follow an object no more; everything learned of it is dropped with the next frame.
+        """Stop tracking an object; everything learned of it is dropped with the next frame.
 
         Raises
         ------

@@ -289,7 +289,7 @@ class Pipeline:
         Raises
         ------
         ServiceError
-            If the pipeline was not started, or runs no more.
+            If the pipeline was not started, or has ended.
         """
         returned = time.monotonic()
         while not self._over():

@@ -348,7 +348,7 @@ class _Server:
                 self._leave(log, request)
                 return True
             self._answers[pid] = channel
-            if not _answer(channel, pid):  # the program wants it no more
+            if not _answer(channel, pid):  # the program no longer wants it
                 os.kill(pid, signal.SIGKILL)
         os.close(log)
         os.close(watchdog)

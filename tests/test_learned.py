@@ -150,7 +150,7 @@ def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
 def test_a_file_without_one_of_the_trees_is_an_error(learned, tree):
     arrays, metadata = storage.decode(learned.to_bytes(), "one")
     trees = {name: each for name, each in metadata["trees"].items() if name != tree}
-    with pytest.raises(ProtocolError, match=f"it has no tree '{tree}': learn the object anew"):
+    with pytest.raises(ProtocolError, match=f"it has no tree '{tree}': learn the object again"):
         Learned.from_bytes(storage.encode(arrays, {**metadata, "trees": trees}), "one")
 
 

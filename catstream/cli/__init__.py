@@ -20,7 +20,7 @@ INTERRUPTED = 130
 
 #: Command -> summary. The module of a command is imported when it is called, because some imports take long.
 VERBS = {
-    "track": "Track an object in a video.",
+    "track": "Track objects in a video.",
     "demo": "Track an object in a rendered demo video.",
     "find": "Find the objects of saved models in videos, folders and images.",
     "evaluate": "Measure accuracy on annotated sequences, also of other trackers.",

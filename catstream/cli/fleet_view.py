@@ -35,7 +35,7 @@ def view(fleet: str, keys: str, listen: Address, token: str | None) -> None:
     that of catstream view. If the fleet does not answer, the page keeps its
     last state and waits. Ctrl-C ends the server; the fleet continues.
 
-    Only who has the token may watch and steer: open the printed link, which
+    Only users with the token can watch and steer: open the printed link, which
     ends with it. Each start makes a new token; give one of your own to keep
     it, for example for Prometheus. The connection is not encrypted: from
     other machines, use an ssh tunnel, or a proxy with TLS.

@@ -84,7 +84,7 @@ def track(
     drawn on the web page.
 
     Several objects have names: --box NAME=X,Y,W,H or --model NAME=FILE for each
-    of them. More can be added, and others forgotten, while the run goes on:
+    of them. More can be added, and others forgotten, during the run:
     `catstream set-box NAME=X,Y,W,H` and `catstream forget NAME`.
 
     SOURCE is a video file, a folder of images, a pattern like

@@ -32,7 +32,7 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
     the page waits for the next one. Ctrl-C ends the server; the pipeline
     continues.
 
-    Only who has the token may watch and steer: open the printed link, which
+    Only users with the token can watch and steer: open the printed link, which
     ends with it. Each start makes a new token; give one of your own to keep
     it, for example for Prometheus. The connection is not encrypted: from
     other machines, use an ssh tunnel, or a proxy with TLS.

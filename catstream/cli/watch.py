@@ -191,7 +191,7 @@ def _print_line(channel: str, message: object) -> None:
 
 
 class _Screen:
-    """A table of the newest messages, of health the newest of each process, drawn anew in a thread of its own."""
+    """A table of the newest messages, of health the newest of each process, redrawn in a thread of its own."""
 
     def __init__(self, channel: str, messages: Subscription[AnyMessage]) -> None:
         self._cells, self._messages = _CELLS[channel], messages

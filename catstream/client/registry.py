@@ -143,8 +143,8 @@ class Registry:
         keys = self._endpoint.keys
         if status.server and keys is None:
             raise ServiceError(
-                f"the stream {status.name} asks for keys, and none were given: give a folder of keys that its fleet "
-                "lets in (--keys DIR, see catstream keys)"
+                f"the stream {status.name} requires authentication: pass a folder of keys that its fleet allows "
+                "(--keys DIR, see catstream keys)"
             )
         known = keys.for_server(status.server) if status.server and keys is not None else ""
         return Place(status, replace(Endpoint.parse(status.endpoint, known), source=status.source))
@@ -199,8 +199,8 @@ class Registry:
     def _remote(self, fleet: str) -> Endpoint:
         if self._keys is None and not fleet.startswith(("127.", "[::1]:")):
             raise ServiceError(
-                f"the fleet at {fleet} asks for keys: make them on its head (catstream keys allow FOLDER/keys NAME "
-                "--output DIR), and give them (--keys DIR)"
+                f"the fleet at {fleet} requires authentication: make keys on its head (catstream keys allow "
+                "FOLDER/keys NAME --output DIR), and pass them (--keys DIR)"
             )
         return Endpoint.parse(f"tcp://{fleet}", self._keys or "")
 
@@ -229,7 +229,7 @@ class FollowedStream:
 
     While nothing arrives from the stream's pipeline, the registry is asked once a second where the stream runs. If the
     registry does not answer, the last answer holds. The end of a pipeline is the end of the stream only if the registry
-    says so: a stream that moves is stopped on one node, and goes on at another one.
+    says so: a stream that moves is stopped on one node, and continues on another one.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ The pipeline never waits for a subscriber. A slow subscriber misses tracks, and 
 `object="anna"`, only the messages about this object are transmitted.
 
 `catstream.subscribe("fleet://cam-7", "tracks")` subscribes to a stream of a fleet, wherever it runs: the subscription
-goes on if the stream moves to another node.
+continues if the stream moves to another node.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Subscription(Generic[Message]):
     the pipeline. If both run on the same machine as the same user, the pipeline waits for it, so that it receives every
     message.
 
-    The subscription to a stream of a fleet goes on if the stream moves or is started again, and while the registry of
+    The subscription to a stream of a fleet continues if the stream moves or is started again, and while the registry of
     the fleet cannot be reached. It ends if the stream has ended, or was removed from the fleet. A frame that the stream
     repeats is not returned a second time; the frames that nobody tracked in between are counted in `missed`.
 
@@ -167,7 +167,7 @@ class Subscription(Generic[Message]):
         self.endpoint, self.keys, self.timeout = str(endpoint), keys, timeout
         self.end: End | None = None
         self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
-        self._close_time = float("inf")  # when to wait no more
+        self._close_time = float("inf")  # when to stop waiting
         self._began: int | None = None  # first frame of the object
         self._frames: dict[str, int] = {}  # the newest of each object, of a stream of a fleet
         self._rejected = 0  # by the connections before this one
@@ -292,7 +292,7 @@ class Subscription(Generic[Message]):
         return None
 
     def _pipeline_ended(self, end: End, close_time: float) -> None:
-        """End at this time; a stream of a fleet may go on with another pipeline."""
+        """End at this time; a stream of a fleet may continue with another pipeline."""
         if self._stream is not None:
             self._stream.pipeline_ended(end)
         else:

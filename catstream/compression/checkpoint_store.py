@@ -64,7 +64,7 @@ class CheckpointStore:
                 _log.warning("a checkpoint cannot be used: %s", error)
                 self._damaged.append(path)
         if self._damaged:
-            instead = f"the one of frame {forest.frame} was used" if forest else "all is learned anew"
+            instead = f"the one of frame {forest.frame} was used" if forest else "everything is learned again"
             self._found_damaged = f"damaged checkpoints: {len(self._damaged)}, {instead}"
             _log.warning("%s", self._found_damaged)
         return forest or Forest(settings)

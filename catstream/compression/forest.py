@@ -39,7 +39,7 @@ class Forest:
         self.compressors: dict[str, Compressor] = {}
 
     def skip(self, frames: int) -> None:
-        """Count frames of a live source that nobody saw: the next message has a number after theirs."""
+        """Count frames of a live source that were not tracked: the next message has a number after theirs."""
         self.seq, self.frame = self.seq + frames, self.frame + frames
 
     def check_features(self, features: Features) -> None:

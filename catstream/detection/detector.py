@@ -104,7 +104,7 @@ class Detector:
         if len(model.weights) != row_length():
             raise ProtocolError(
                 f"the model has {len(model.weights)} weights, the features of a window are {row_length()}: "
-                "learn it anew with this catstream"
+                "learn it again with this catstream"
             )
         window = Window.around(box, self.settings.search.context)
         self.state = DetectorState(frame, "lost", window, window, None)
@@ -150,7 +150,7 @@ class Detector:
                 window=window,
                 confident_window=window,
                 first_window=state.first_window or window,
-                colour_centroid=None,  # this box shows anew where in it the colours are
+                colour_centroid=None,  # this box determines again where in it the colours are
             )
         )
         score = float(ScoreMap.around(frame, window, WINDOW, self.model).scores[0, 0])

@@ -2,7 +2,7 @@
 
 While the object is present it moves at constant velocity, but for the random changes that `Motion` allows. While it is
 lost, its velocity decays and its estimate grows less certain. A measured centre that the motion all but rules out, as
-of an object found again elsewhere, starts the filter anew, at rest.
+of an object found again elsewhere, resets the filter, at rest.
 
 An estimate is a float64 (5, 4): the mean of the state (x, y, vx, vy) above its covariance.
 
@@ -27,7 +27,7 @@ from catstream.numerics.kalman import TRANSITION
 __all__ = ["at_rest", "expected", "measured", "observed", "predicted"]
 
 _COASTING = TRANSITION @ np.diag([1, 1, 0.8, 0.8])  # of a lost object: 0.8 + 0.8**2 + ... = the way of 4 frames in all
-_JUMP = 6.0  # Mahalanobis distance beyond which a measured centre starts the filter anew
+_JUMP = 6.0  # Mahalanobis distance beyond which a measured centre resets the filter
 _UNKNOWN_SPEED = 100.0  # variance of a velocity that has not been measured yet, in process variances of a frame
 
 

@@ -130,7 +130,7 @@ class Detectors:
         return found | assigned(claims, states, self.settings.search.context)
 
     def forget(self, name: str) -> None:
-        """Follow an object no more.
+        """Stop tracking an object.
 
         Raises
         ------

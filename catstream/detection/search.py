@@ -184,7 +184,7 @@ def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings:
 def seek(
     frame: Pyramid, state: DetectorState, seq: int, model: Model, likeness: Likeness, settings: Settings
 ) -> tuple[DetectorState, Detection]:
-    """The best window of the whole frame, of any size that an object that has not been found yet may have.
+    """The best window of the whole frame, over the range of sizes that are searched before the first detection.
 
     The object counts as found once this window has looked like the object and has led the rest of the frame, in one
     place in several successive frames: the state then has a first window. While no score is high, each frame is

@@ -221,7 +221,7 @@ class FleetSpec:
             elif before.digest != after.digest:
                 lines.append(f"{name}: starts again with its changes")
             else:
-                lines.append(f"{name}: {'is unchanged' if before == after else 'goes on with its changes'}")
+                lines.append(f"{name}: {'is unchanged' if before == after else 'continues with its changes'}")
         return lines
 
     @classmethod
@@ -354,8 +354,8 @@ _READERS: dict[str, tuple[str, Callable[[str, object, Path], Any]]] = {
 def _check_fleet_name(name: object, kind: str) -> None:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise FleetError(
-            f"{reprlib.repr(name)} is no name of a {kind}: expected 1 to 64 letters, digits, '_', '-' and '.', the "
-            "first of them a letter, a digit or '_'"
+            f"{reprlib.repr(name)} is not a valid name of a {kind}: expected 1 to 64 letters, digits, '_', '-' and "
+            "'.', the first of them a letter, a digit or '_'"
         )
 
 

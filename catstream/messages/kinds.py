@@ -169,7 +169,7 @@ class ObjectFeatures:
     box       the object's box, None if it was not found
     training  training rows of each group of `catstream.messages.heads`; a group without rows is left out
     detector  state of the detector after this frame, from which a restarted detector continues; None before it has one
-    begins    whether a new object is tracked under this name from this frame on: its trees begin anew
+    begins    whether a new object is tracked under this name from this frame on: its trees start empty
     model     the saved model that the trees continue, if the object begins with one; otherwise empty
     """
 
@@ -546,7 +546,7 @@ class StreamStatus:
     endpoint        of its pipeline, in the format of the setting `run.endpoint`; empty if it does not run
     server          public key of the sockets of its pipeline, empty if the pipeline has no keys
     token           fencing token of its pipeline: each pipeline that is started for the stream has a larger one
-    began           token of the pipeline that began the stream anew, without the state of the one before it, so that
+    began           token of the pipeline that began the stream again, without the state of the one before it, so that
                     frames count from 0 again; 0 if none did
     frame           number of the newest frame that was tracked
     rate            tracked frames per second

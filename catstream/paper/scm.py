@@ -35,7 +35,7 @@ _EVERY = 5  # frames from one update to the next
 
 
 def prepare() -> None:
-    """Import what the first frame needs, in two seconds: for who has the time before it."""
+    """Import what the first frame needs, which takes two seconds: call it before there is a frame."""
     import sklearn.cluster
     import sklearn.linear_model  # noqa: F401
 

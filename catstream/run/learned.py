@@ -175,7 +175,7 @@ class Learned:
         if width != row_length():
             raise ProtocolError(
                 f"{name} has {width} features of a window, this catstream has {row_length()}: "
-                "learn the object anew with this catstream"
+                "learn the object again with this catstream"
             )
         return learned
 
@@ -183,7 +183,7 @@ class Learned:
     def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
         trees = unpack_trees(arrays, metadata["trees"])
         if missing := [name for name in TREES if name not in trees]:
-            raise ValueError(f"it has no tree {missing[0]!r}: learn the object anew with this catstream")
+            raise ValueError(f"it has no tree {missing[0]!r}: learn the object again with this catstream")
         return cls(
             check_name(metadata["object"]),
             {name: trees[name] for name in TREES},

@@ -110,7 +110,7 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
 
 
 def skip(folder: Path, settings: Settings, seq: int) -> int:
-    """Count the frames of a live source up to a number as lost: the numbers go on after it.
+    """Count the frames of a live source up to a number as lost: the numbers continue after it.
 
     Returns
     -------

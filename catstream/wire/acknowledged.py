@@ -64,7 +64,7 @@ class Sender(ChannelSocket[Message]):
 
     @property
     def stored(self) -> int:
-        """Newest seq that survives the receiver's death; less than `acknowledged` while its disk takes nothing."""
+        """Newest seq that survives the receiver's death; below `acknowledged` while its disk cannot be written."""
         return self._window.stored
 
     @property

@@ -11,7 +11,7 @@ replies once the application has processed it:
     Position    requests a retransmission of everything after `seq`
 
 The receiver replies with a Position if a message is missing, and if the sender asks (with an empty frame, the
-hello). The sender asks if it was started anew, and after `PATIENCE` seconds without a reply while messages wait.
+hello). The sender asks if it was restarted, and after `PATIENCE` seconds without a reply while messages wait.
 So either side may be restarted, and any frame may be lost or arrive twice: each message is still delivered once, in
 order.
 
@@ -140,7 +140,7 @@ class SendWindow:
         if reply.seq > max(self.sent, self._sent_before):
             raise ProtocolError(
                 f"the receiver of {self._channel} has stored message {reply.seq}, only {self.sent} were sent: "
-                "it holds another stream, start it anew or this process with --resume"
+                "it holds another stream, restart it or start this process with --resume"
             )
         if isinstance(reply, Position):
             self._go_back(reply)

@@ -231,7 +231,7 @@ def clients(folder: Path) -> dict[str, Client]:
         role = facts.get("role")
         if role not in ROLES:
             raise ServiceError(
-                f"{path} gives the role {role!r}, there are {', '.join(ROLES)}: revoke it, allow it anew"
+                f"{path} gives the role {role!r}, there are {', '.join(ROLES)}: revoke it, and allow it again"
             )
         found[path.name] = Client(role, _key(facts, "public", path).decode())
     return found

@@ -76,5 +76,5 @@ class Monitor:
             yield Event(*_REPORT.unpack(report))
 
     def close(self) -> None:
-        """Receive no more."""
+        """Close the monitor socket."""
         self._events.close()

@@ -13,7 +13,7 @@ from collections import Counter, OrderedDict
 
 __all__ = ["count", "reject", "rejects"]
 
-_MAX_CAUSES = 1024  # that are remembered, the last ones; each is logged once
+_MAX_CAUSES = 1024  # causes that are remembered, the newest ones; each is logged once
 
 _log = logging.getLogger(__name__)
 _lock = threading.Lock()  # the ZAP handler has a thread of its own

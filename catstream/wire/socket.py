@@ -219,18 +219,18 @@ class ChannelSocket(Generic[Message]):
     def _failed_to_connect(self, event: Event) -> None:
         """A peer failed the handshake; a key that was denied is counted by the ZAP handler already."""
         if not event.stopped and not event.denied:
-            missing = "does not speak ZeroMQ" if self._endpoint.keys is None else "has not the pipeline's keys"
+            missing = "does not speak ZeroMQ" if self._endpoint.keys is None else "lacks the pipeline's keys"
             reject(self.channel.name, "handshake", f"a peer was rejected: it {missing}")
 
     def _raise_if_denied(self, event: Event) -> None:
         if event.denied:
             raise ServiceError(
-                f"{self._endpoint} does not let this key in: it was revoked, was never allowed, or lacks the role "
+                f"{self._endpoint} rejects this key: it was revoked, was never allowed, or lacks the role "
                 f"{self.channel.role}, which {self.channel.name} requires; the pipeline's log says which: "
                 "ask its administrator (catstream keys allow)"
             )
         if event.other_mechanism and self._endpoint.keys is None:
             raise ServiceError(
-                f"the pipeline at {self._endpoint} asks for keys, and none were given: give a folder of keys "
-                "that it lets in (--keys DIR, see catstream keys)"
+                f"the pipeline at {self._endpoint} requires authentication: pass a folder of keys that it allows "
+                "(--keys DIR, see catstream keys)"
             )

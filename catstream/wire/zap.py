@@ -5,7 +5,7 @@ the socket, as a "domain", and the peer's public key; the peer has proved by the
 list of clients is read for each question, so no process has to be restarted if a client is allowed or revoked. A
 connection that is open stays open.
 
-pyzmq's own handler, `zmq.auth`, would not do: see docs/decisions/0023-roles.md.
+pyzmq's own handler, `zmq.auth`, is not used: see docs/decisions/0023-roles.md.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ZapHandler:
         return domain
 
     def unregister(self, domain: bytes) -> None:
-        """Answer for a socket no more: it is closed."""
+        """Unregister a closed socket."""
         with self._lock:
             self._sockets.pop(domain, None)
             if self._thread is not None and not self._sockets:

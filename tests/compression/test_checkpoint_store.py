@@ -100,7 +100,7 @@ def test_if_no_checkpoint_is_valid_learning_starts_anew_and_that_is_reported(kep
         path.write_bytes(b"")
     store = CheckpointStore(kept)
     assert store.load(SETTINGS).seq == 0
-    assert "damaged checkpoints: 2, all is learned anew" in store.trouble
+    assert "damaged checkpoints: 2, everything is learned again" in store.trouble
 
 
 def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, monkeypatch):

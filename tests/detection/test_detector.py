@@ -388,7 +388,7 @@ def test_a_resumed_search_continues_bit_for_bit(scene, learned, likeness):
 
 
 def test_a_model_of_other_features_is_rejected(likeness):
-    with pytest.raises(ProtocolError, match="learn it anew"):
+    with pytest.raises(ProtocolError, match="learn it again"):
         Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START, likeness)
 
 

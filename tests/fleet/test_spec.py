@@ -125,8 +125,8 @@ def test_the_digest_changes_exactly_if_the_stream_must_be_started_anew(change, r
         ("", "it has no streams: add a table for each, for example [streams.cam-1]"),
         ("streams = 3", "streams must be tables [streams.NAME], got 3"),
         ("[streams]\ncam-7 = 3", "the stream cam-7: expected a table with a source, got 3: write [streams.cam-7]"),
-        ('[streams."cam 7"]\nsource="0"', "'cam 7' is no name of a stream: expected 1 to 64 letters"),
-        ('[streams.".."]\nsource="0"', "'..' is no name of a stream"),
+        ('[streams."cam 7"]\nsource="0"', "'cam 7' is not a valid name of a stream: expected 1 to 64 letters"),
+        ('[streams.".."]\nsource="0"', "'..' is not a valid name of a stream"),
         ('naem="a"\n[streams.a]\nsource="0"', "there is no key 'naem', did you mean 'name'? there are name, store"),
         ('every=0\n[streams.a]\nsource="0"', "the fleet site: every must be above 0 and at most 3600 s, got 0"),
         ('nodes=65\n[streams.a]\nsource="0"', "the fleet site: nodes must be from 1 to 64, got 65"),
@@ -193,7 +193,7 @@ def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
         "a: is removed",
         "b: starts again with its changes",
         "c: is unchanged",
-        "d: goes on with its changes",
+        "d: continues with its changes",
         "e: is added",
     ]
 

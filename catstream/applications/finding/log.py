@@ -71,7 +71,7 @@ class SearchLog:
     ----------
     path : of the file; it is continued if it exists
     search : models and options; a file of another search is not continued
-    overwrite : begin anew
+    overwrite : start again from nothing
 
     Raises
     ------
