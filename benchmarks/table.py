@@ -1,6 +1,6 @@
 """The options and the output of every benchmark: tables on the terminal and in a JSON file.
 
-`--json benchmarks/results/NAME.json` is the record that `docs/results.md` shows; `make results` writes the page anew.
+`--json benchmarks/results/NAME.json` is the record that `docs/results.md` shows; `make results` writes the page.
 """
 
 from __future__ import annotations

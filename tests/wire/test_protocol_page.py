@@ -70,7 +70,8 @@ def listed(kind):
     rows = []
     for field in fields(kind):
         meaning = re.sub(r"\s+", " ", meanings[field.name]).replace("None", "nil").rstrip(".")
-        row = f"`{field.name}` ({described(field)}): {meaning[0].lower()}{meaning[1:]}"
+        kind_and_limits = "" if meaning == "name of the object" else f" ({described(field)})"
+        row = f"`{field.name}`{kind_and_limits}: {meaning[0].lower()}{meaning[1:]}"
         rows.append(fill(row, 128, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False) + "\n")
     return "".join(rows)
 
