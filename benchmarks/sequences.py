@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import atexit
 import tempfile
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from catstream.applications.evaluation.datasets import Sequence, find_sequences
-from catstream.applications.loadtest.objects import several
 from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.errors import BoxError, VideoError
+from catstream.tracker import Tracker
 from catstream.video import demo
 from catstream.video.source import open_source
 
@@ -20,6 +21,8 @@ __all__ = ["FIRST", "named", "objects", "rendered", "scratch", "sequences", "vid
 FIRST = "first"  #: name of the object of a sequence, if it is one of several
 
 _QUICK_FRAMES = 8
+_SIDE = 40  # width and height of a patch, pixels
+_MARGIN = 8  # from the edge of the frame, pixels
 
 
 @cache
@@ -71,6 +74,24 @@ def video(sequence: Sequence) -> str:
 
 
 def objects(source: str, box: Box, count: int) -> dict[str, Box]:
-    """Return the boxes of several objects in the first frame of a source, by name: that of its object, and patches."""
+    """Return the boxes of several objects in the first frame of a source, by name: that of its object, and patches.
+
+    Raises
+    ------
+    VideoError
+        If there are not enough patches beside the object that can be tracked.
+    """
     with open_source(source) as frames:
-        return several(next(iter(frames)).image, box, count, FIRST)
+        image = next(iter(frames)).image
+    height, width = image.shape[:2]
+    found = {FIRST: box}
+    for y in range(_MARGIN, height - _SIDE, _SIDE):
+        for x in range(_MARGIN, width - _SIDE, _SIDE):
+            patch = Box(float(x), float(y), float(_SIDE), float(_SIDE))
+            if len(found) < count and not patch.overlap(box):
+                with suppress(BoxError):  # it looks like its surroundings
+                    Tracker().init(image, patch)
+                    found[f"patch-{len(found)}"] = patch
+    if len(found) < count:
+        raise VideoError(f"the first image of {source} has room for {len(found)} objects, not {count}: give fewer")
+    return found

@@ -8,7 +8,9 @@ imports the same catstream and the same libraries as its parent.
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker, spawn
@@ -18,7 +20,7 @@ from typing import Any
 
 from catstream import errors
 
-__all__ = ["SPAWN", "environment", "import_path", "python_command", "service_command"]
+__all__ = ["SPAWN", "environment", "import_path", "python_command", "service_command", "sigint_blocked"]
 
 
 def service_command(*arguments: str) -> list[str]:
@@ -68,6 +70,29 @@ class _Context(SpawnContext):
 
 #: The start method for processes that run a function of this program: worker pools, subscribers of a load test.
 SPAWN = _Context()
+
+
+@contextmanager
+def sigint_blocked() -> Iterator[None]:
+    """Block SIGINT in the processes that are started inside a `with`: on Ctrl-C, their parent ends them in order.
+
+    A Ctrl-C that arrives inside is handled after it. The mask alone does not hold it back: the signal arrives in
+    another thread, and Python handles it in the main one. A process whose start is interrupted would wait for its
+    arguments.
+    """
+    SPAWN.get_context()  # starts the resource tracker now, because its start unblocks the signal
+    received: list[int] = []
+    is_main = threading.current_thread() is threading.main_thread()  # the thread in which Python handles signals
+    handler = signal.signal(signal.SIGINT, lambda number, _: received.append(number)) if is_main else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+            if received:
+                signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager

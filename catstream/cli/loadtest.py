@@ -6,9 +6,8 @@ import json
 import re
 import signal
 import sys
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -18,11 +17,9 @@ from rich.table import Table
 from catstream.cli import INTERRUPTED
 from catstream.errors import CatstreamError
 from catstream.services.options import with_settings
-from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.applications.loadtest.limits import Limit
-    from catstream.applications.loadtest.load_test import Step
     from catstream.applications.loadtest.run import Result
 
 __all__ = ["loadtest"]
@@ -41,13 +38,11 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 
 @click.command()
 @click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Number of pipelines.")
-@click.option("--objects", type=click.IntRange(1), default=1, show_default=True, help="Objects of each pipeline.")
+@click.option("--objects", type=click.IntRange(1, 16), default=1, show_default=True, help="Objects of each pipeline.")
 @click.option(
     "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
 )
-@click.option(
-    "--slow-subscribers", "slow", type=click.IntRange(0), default=0, help="How many of them are slow or frozen."
-)
+@click.option("--slow-subscribers", type=click.IntRange(0), default=0, help="How many of them are slow or frozen.")
 @click.option(
     "--rate",
     type=click.FloatRange(0.5, 1000),
@@ -68,19 +63,11 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and .hgrm.")
 @with_settings
 def loadtest(
-    settings: Settings,
-    streams: int,
-    objects: int,
-    subscribers: int,
-    slow: int,
-    rate: float,
-    duration: float,
-    size: tuple[int, int],
-    chaos: bool,
     find_limit: bool,
     limits: tuple[str, ...],
     json_file: Path | None,
     output: Path | None,
+    **plan: Any,
 ) -> None:
     """Run pipelines under load, and measure latency and losses.
 
@@ -88,8 +75,8 @@ def loadtest(
     loopback interface; a pipeline of its own tracks each stream. The camera
     does not wait: frame i is due at start + i / RATE, and latency counts from
     then. The latency of a skipped frame ends with the track of a newer one.
-    With several objects, the others are patches of the picture; success and
-    latencies are those of the rendered object.
+    With several objects, it is the video of `catstream demo --objects N`;
+    success and latencies are those of the first object.
 
     Slow subscribers read two tracks per second; half of them are frozen
     instead. Chaos kills processes by SIGKILL; --set run.seed=N repeats it.
@@ -123,31 +110,33 @@ def loadtest(
       catstream loadtest --find-limit --size 320x240
     """
     # Imported here so that --help and the other verbs start faster.
-    from catstream.applications.loadtest.figures import to_json
-    from catstream.applications.loadtest.limits import Limit
+    from catstream.applications.loadtest.limits import Limit, violations
     from catstream.applications.loadtest.load_test import run_load_test
     from catstream.applications.loadtest.plan import Plan
-    from catstream.applications.loadtest.report import write_report
-    from catstream.applications.loadtest.run import Status
+    from catstream.applications.loadtest.report import milliseconds, to_json, write_report
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
-    plan = Plan(streams, objects, subscribers, slow, rate, duration, size, chaos, settings)
-    _writable(json_file, output)
+    parameters = Plan(**plan)
+    _check_writable(json_file, output)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console(width=None if sys.stdout.isatty() else 140)
     columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[figures]}")
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("starting", total=1.0, figures="")
 
-        def report_status(news: Status) -> None:
-            progress.update(task, description=news.activity, completed=news.share, figures=news.figures)
+        def report(activity: str, share: float, figures: str) -> None:
+            progress.update(task, description=activity, completed=share, figures=figures)
 
-        def step_done(step: Step) -> None:
+        def done(result: Result) -> None:
             if find_limit:
-                console.print(_step(step))
+                verdict = "; ".join(violations(asked, result)) or "met"
+                console.print(
+                    f"{result.plan.rate:g} frames/s due, {result.followed:.1f} tracked, "
+                    f"p99 {milliseconds(result.track['p99'])} ms: {verdict}"
+                )
 
-        load_test = run_load_test(plan, asked, find=find_limit, report_status=report_status, step_done=step_done)
-    if load_test.steps:
+        load_test = run_load_test(parameters, asked, find=find_limit, report=report, done=done)
+    if load_test.results:
         _print(console, load_test.result, asked)
         if json_file is not None:
             json_file.write_text(json.dumps(to_json(load_test), indent=1) + "\n", encoding="utf-8")
@@ -157,7 +146,7 @@ def loadtest(
             console.print(f"report: {write_report(output / 'report.html', load_test)}", soft_wrap=True)
     if load_test.interrupted:
         console.print(
-            "stopped: these are the figures so far" if load_test.steps else "stopped: there are no measurements yet"
+            "stopped: these are the figures so far" if load_test.results else "stopped: there are no measurements yet"
         )
         sys.exit(INTERRUPTED)
     if load_test.highest_rate:
@@ -170,7 +159,7 @@ def loadtest(
         sys.exit(_FAILED)
 
 
-def _writable(json_file: Path | None, output: Path | None) -> None:
+def _check_writable(json_file: Path | None, output: Path | None) -> None:
     """Check before the run that the results can be written."""
     if output is not None:
         try:
@@ -181,42 +170,20 @@ def _writable(json_file: Path | None, output: Path | None) -> None:
         raise CatstreamError(f"cannot write {str(json_file)!r}: its folder does not exist, make it first")
 
 
-def _step(step: Step) -> str:
-    verdict = f"[red]{'; '.join(step.violations)}[/]" if step.violations else "[green]met[/]"
-    p99 = _ms(step.result.track["p99"])
-    return f"{step.rate:g} frames/s due, {step.followed:.1f} tracked, p99 {p99} ms: {verdict}"
-
-
 def _print(console: Console, result: Result, limits: list[Limit]) -> None:
-    from catstream.applications.loadtest.usage import summary
+    from catstream.applications.loadtest.report import milliseconds, tables
 
-    plan = result.plan
     console.print(
-        f"{plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most {_ms(result.camera_late)} ms late",
+        f"{result.plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most "
+        f"{milliseconds(result.camera_late)} ms late",
     )
-    console.print(_streams(result))
-    if result.usage:
-        console.print(
-            _table(
-                ("process", "cores", "most", "MB", "most"),
-                [
-                    (
-                        name,
-                        *(f"{found[key]:.2f}" for key in ("cores", "cores_most")),
-                        *(f"{found[key] / 1e6:.0f}" for key in ("memory", "memory_most")),
-                    )
-                    for name, found in ((name, summary(readings)) for name, readings in result.usage.items())
-                ],
-            )
-        )
-    if plan.subscribers:
-        console.print(
-            f"subscribers: {plan.subscribers * plan.streams}, {plan.slow * plan.streams} of them slow or frozen; the "
-            f"others received {sum(result.received)} tracks and missed {sum(result.missed)}"
-        )
-    if plan.chaos:
-        rows = [(recovery.kill, *map(_seconds, (recovery.track, recovery.model))) for recovery in result.recoveries]
-        console.print(_table((f"{len(rows)} killed", "s to the next track", "s to the next model"), rows))
+    for each in tables(result):
+        table = Table(box=None, header_style="bold", pad_edge=False)
+        for number, head in enumerate(each.heads):
+            table.add_column(head, justify="right" if number else "left")
+        for row in each.rows:
+            table.add_row(*row)
+        console.print(table)
     if result.other_load > _QUIET_CORES:
         console.print(
             f"other processes kept {result.other_load:.1f} cores busy: run it on a quiet machine for reliable figures"
@@ -224,42 +191,3 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
     for limit in limits:
         mark = "[green]met[/]" if limit.is_met(result) else "[red]broken[/]"
         console.print(f"{mark}: {limit.describe(result)}")
-
-
-def _streams(result: Result) -> Table:
-    from catstream.applications.loadtest.latencies import PERCENTILES
-
-    heads = ("stream", "frames/s", "skipped", *PERCENTILES, "model p50", "p99", "lag", "not stored", "success")
-    rows: list[tuple[object, ...]] = []
-    for number, measures in enumerate(result.streams):
-        stored = "-" if measures.sent is None or measures.stored is None else measures.sent - measures.stored
-        rows.append(
-            (
-                number,
-                f"{measures.rate(result.plan.rate):.1f}",
-                f"{100 * measures.skipped_share:.1f} %",
-                *(_ms(measures.track[name]) for name in PERCENTILES),
-                *(_ms(measures.model[name]) for name in ("p50", "p99")),
-                measures.max_lag,
-                stored,
-                "-" if measures.success is None else f"{measures.success:.3f}",
-            )
-        )
-    return _table(heads, rows)
-
-
-def _table(heads: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> Table:
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for number, head in enumerate(heads):
-        table.add_column(head, justify="right" if number else "left")
-    for row in rows:
-        table.add_row(*map(str, row))
-    return table
-
-
-def _ms(seconds: float) -> str:
-    return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
-
-
-def _seconds(seconds: float | None) -> str:
-    return "none" if seconds is None else f"{seconds:.3f}"

@@ -8,14 +8,13 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
 import psutil
 import pytest
 
-from catstream.applications.evaluation import workers
 from catstream.applications.evaluation.workers import run_tasks
 from catstream.cli import INTERRUPTED, interruptible
+from catstream.services.start import sigint_blocked
 
 EVALUATE = [sys.executable, "-c", "from catstream.cli import main; main()", "evaluate"]
 
@@ -37,17 +36,19 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, 
 
 
 def test_ctrl_c_that_another_thread_receives_interrupts_only_after_all_workers_were_started():
-    submitted = []
+    started = []
+
+    def start_all(other):
+        with sigint_blocked():
+            for worker in range(2):
+                other.submit(signal.raise_signal, signal.SIGINT).result()
+                started.append(worker)
+
     with ThreadPoolExecutor(1) as other:
         other.submit(abs, 0).result()  # the thread exists, and does not block the signal
-
-        def submit(*task):
-            other.submit(signal.raise_signal, signal.SIGINT).result()
-            submitted.append(task)
-
         with pytest.raises(KeyboardInterrupt):
-            workers._submit(SimpleNamespace(submit=submit), abs, [(-1,), (-2,)])
-    assert submitted == [(abs, -1), (abs, -2)]
+            start_all(other)
+    assert started == [0, 1]
 
 
 def test_ctrl_c_ends_no_worker_because_the_caller_does():

@@ -56,7 +56,7 @@ def result() -> Callable[..., Result]:
                     lag=[(100.5, 3)],
                 )
             )
-        facts = {"restarts": 0, "recoveries": [], "usage": {}, "received": [], "missed": [], "frozen": 0.0}
+        facts = {"recoveries": [], "usage": {}, "received": [], "missed": [], "frozen": 0.0}
         return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, "camera_late": 0.001, **others})
 
     return made

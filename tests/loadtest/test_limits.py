@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from catstream.applications.loadtest.chaos import Kill
 from catstream.applications.loadtest.limits import KINDS, Limit, violations
+from catstream.applications.loadtest.load_test import find_highest_rate
 from catstream.applications.loadtest.plan import Plan
 from catstream.applications.loadtest.run import Recovery
-from catstream.applications.loadtest.search import find_highest_rate
-from catstream.errors import SettingsError
+from catstream.errors import ObjectError, SettingsError
 from catstream.settings import Settings
 
 
@@ -58,8 +58,9 @@ def test_a_malformed_limit_is_an_error(text):
 @pytest.mark.parametrize(
     ("facts", "said"),
     [
-        ({"subscribers": 3, "slow": 4}, "4 of 3 subscribers cannot be slow"),
+        ({"subscribers": 3, "slow_subscribers": 4}, "4 of 3 subscribers cannot be slow"),
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
+        ({"objects": 99}, "shows at most 16 objects, not 99"),
         ({"settings": Settings(run={"lockstep": True})}, "leave out lockstep"),
         ({"settings": Settings(run={"endpoint": "run"})}, "leave out endpoint"),
     ],
@@ -67,6 +68,12 @@ def test_a_malformed_limit_is_an_error(text):
 def test_a_contradictory_plan_is_an_error(facts, said):
     with pytest.raises(SettingsError, match=said):
         Plan(**facts)
+
+
+def test_a_plan_has_at_most_as_many_objects_as_the_settings_allow():
+    assert "8 objects" in str(Plan(objects=8))
+    with pytest.raises(ObjectError, match="8 objects are more than 4"):
+        Plan(objects=8, settings=Settings(run={"objects_most": 4}))
 
 
 @given(st.floats(0.5, 1000), st.floats(0.5, 1000))

@@ -10,20 +10,15 @@ from dataclasses import replace
 import pytest
 
 from catstream.applications.loadtest.chaos import Kill
-from catstream.applications.loadtest.figures import to_json
-from catstream.applications.loadtest.limits import Limit, violations
-from catstream.applications.loadtest.load_test import LoadTest, Step
-from catstream.applications.loadtest.report import write_report
+from catstream.applications.loadtest.limits import Limit
+from catstream.applications.loadtest.load_test import LoadTest
+from catstream.applications.loadtest.report import to_json, write_report
 from catstream.applications.loadtest.run import Recovery, Result
 from catstream.applications.loadtest.usage import UsageReading
 
 
-def is_search(*results: Result) -> LoadTest:
-    limits = [Limit("p99", 0.1)]
-    steps = [Step(result, violations(limits, result)) for result in results]
-    return LoadTest(
-        limits, is_search=True, steps=steps, highest_rate=max((s.rate for s in steps if not s.violations), default=None)
-    )
+def search(*results: Result, highest: float | None = None) -> LoadTest:
+    return LoadTest([Limit("p99", 0.1)], is_search=True, results=list(results), highest_rate=highest)
 
 
 def at(rate: float, result: Result) -> Result:
@@ -32,8 +27,9 @@ def at(rate: float, result: Result) -> Result:
 
 
 def test_a_search_shows_the_highest_rate_and_the_violations_of_the_others(result, tmp_path):
-    load_test = is_search(at(25.0, result([0.01] * 50)), at(50.0, result([0.3] * 50)), at(37.5, result([0.02] * 50)))
-    assert (load_test.highest_rate, load_test.result.plan.rate, load_test.violations) == (37.5, 37.5, [])
+    runs = at(25.0, result([0.01] * 50)), at(50.0, result([0.3] * 50)), at(37.5, result([0.02] * 50))
+    load_test = search(*runs, highest=37.5)
+    assert (load_test.result.plan.rate, load_test.violations) == (37.5, [])
     page = write_report(tmp_path / "report.html", load_test).read_text()
     assert "The highest rate that meets the limits: 37.5 frames/s" in page
     assert page.count(">met<") == 2
@@ -50,13 +46,13 @@ def test_a_search_shows_the_highest_rate_and_the_violations_of_the_others(result
 )
 def test_the_report_begins_with_whether_the_rate_was_sustained(result, tmp_path, followed, told):
     run = result([0.01] * 50, [0.01] * 50, followed=followed)
-    page = write_report(tmp_path / "report.html", LoadTest([], False, [Step(run, run.errors)])).read_text()
+    page = write_report(tmp_path / "report.html", LoadTest([], False, [run])).read_text()
     assert told in page
     assert page.index("ustained") < page.index("<h2>Streams</h2>")
 
 
 def test_a_search_without_a_result_is_reported(result, tmp_path):
-    load_test = is_search(result([0.3] * 50))
+    load_test = search(result([0.3] * 50))
     assert load_test.violations == ["no rate meets p99=0.1: the lowest tried was 25"]
     assert "No rate meets the limits" in write_report(tmp_path / "report.html", load_test).read_text()
 
@@ -65,13 +61,12 @@ def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
     run = result(
         [0.01] * 50,
         [0.02] * 50,
-        restarts=1,
         recoveries=[Recovery(Kill(101.0, 1, "trainer"), 0.025, None)],
         usage={"detector 0": [UsageReading(100.5, 0.5, 10**8)], "detector 1": [UsageReading(100.5, 0.7, 10**8)]},
         errors=["stream 1: <it> died"],
     )
     run.plan = replace(run.plan, chaos=True)
-    page = write_report(tmp_path / "report.html", LoadTest([], False, [Step(run, run.errors)])).read_text()
+    page = write_report(tmp_path / "report.html", LoadTest([], False, [run])).read_text()
     for row in ("detector 0", "detector 1", "trainer of stream 1"):
         assert f'<td class="text">{row}</td>' in page
     assert "<td>0.025</td><td>none</td>" in page
@@ -85,7 +80,7 @@ def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
 
 def test_the_json_report_contains_only_valid_json(result):
     run = result([0.01] * 5, recoveries=[Recovery(Kill(101.0, 0, "trainer"), None, None)])
-    text = json.dumps(to_json(LoadTest([Limit("recovery", 1.0)], False, [Step(run, [])])), allow_nan=False)
+    text = json.dumps(to_json(LoadTest([Limit("recovery", 1.0)], False, [run])), allow_nan=False)
     figures = json.loads(text)
     assert figures["chaos"] == [{"stream": 0, "process": "trainer", "to_track": None, "to_model": None}]
     assert figures["limits"] == {"recovery": {"value": 1.0, "met": False}}

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from catstream.applications.loadtest.chaos import Chaos
-from catstream.applications.loadtest.limits import Limit
+from catstream.applications.loadtest.limits import Limit, violations
 from catstream.applications.loadtest.load_test import run_load_test
 from catstream.applications.loadtest.plan import Plan
 from catstream.applications.loadtest.usage import REST, Usage
@@ -86,9 +86,10 @@ def test_chaos_does_not_kill_one_process_so_often_that_the_supervisor_gives_up(s
 def test_no_child_receives_ctrl_c():
     script = """if True:
         import time
-        from catstream.applications.loadtest.children import SPAWN, start
+        from catstream.services.start import SPAWN, sigint_blocked
         child = SPAWN.Process(target=time.sleep, args=(600,))
-        start(child)
+        with sigint_blocked():
+            child.start()
         print(open(f"/proc/{child.pid}/status").read())
         child.kill()
     """
@@ -104,26 +105,25 @@ def test_usage_shows_which_process_is_busy(sleepers):
     while time.process_time() < deadline:
         pass
     usage.read(1.0, {"busy": [busy], "idle": [sleepers[0].pids["trainer"]]})
-    assert usage.readings["busy"][0].cores > 0.27  # the kernel counts in hundredths
     assert usage.readings["idle"][0].cores < usage.readings["busy"][0].cores
     assert usage.readings[REST][0].cores >= 0
     assert 0 < usage.readings["idle"][0].memory < usage.readings["busy"][0].memory
 
 
 def test_an_interrupted_run_returns_its_measurements_and_leaves_no_process():
-    def tell(news):
-        if news.share > 0.05 and "tracks" in news.figures:
+    def tell(_, share, figures):
+        if share > 0.05 and "tracks" in figures:
             raise KeyboardInterrupt
 
     plan = Plan(rate=20.0, duration=20.0, size=(320, 240))
-    load_test = run_load_test(plan, [Limit("p99", 60.0)], find=False, report_status=tell)
+    load_test = run_load_test(plan, [Limit("p99", 60.0)], find=False, report=tell)
     assert load_test.interrupted
     assert load_test.violations == []
     (stream,) = load_test.result.streams
     assert 10 <= stream.frames < plan.frames
     assert stream.frames == len(stream.track)
     assert load_test.result.seconds == pytest.approx(stream.frames / 20)
-    assert stream.sent == stream.stored > stream.frames  # what it learned before counts too
+    assert stream.totals["sent"] == stream.totals["stored"] > stream.frames  # what it learned before counts too
     assert children() == []
 
 
@@ -138,7 +138,7 @@ def test_all_killed_processes_recover():
         if recovery.kill.moment < load_test.result.streams[0].due[200]
     ]
     assert all(recovery.track is not None and recovery.model is not None for recovery in early)
-    assert all(stream.sent == stream.stored for stream in load_test.result.streams)
+    assert all(stream.not_stored == 0 for stream in load_test.result.streams)
     assert children() == []
 
 
@@ -146,7 +146,7 @@ def test_all_killed_processes_recover():
 def test_a_search_ends_with_a_rate_that_meets_the_limits_below_one_that_does_not():
     plan = Plan(rate=30.0, duration=3.0, size=(320, 240))
     load_test = run_load_test(plan, [Limit("p99", 1.0), Limit("skipped", 0.05)], find=True)
-    held = {step.rate for step in load_test.steps if not step.violations}
+    held = {step.plan.rate for step in load_test.results if not violations(load_test.limits, step)}
     assert load_test.highest_rate in held
     assert load_test.result.plan.rate == max(held)
-    assert any(step.violations for step in load_test.steps) or load_test.highest_rate == 1000.0
+    assert any(violations(load_test.limits, step) for step in load_test.results) or load_test.highest_rate == 1000.0

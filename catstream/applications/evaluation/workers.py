@@ -8,23 +8,18 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
-import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from typing import TypeVar
 
 from catstream.errors import ServiceError
 from catstream.services.loop import die_with
-from catstream.services.start import SPAWN
+from catstream.services.start import SPAWN, sigint_blocked
 
 __all__ = ["run_tasks"]
 
 _Result = TypeVar("_Result")
-
-_CTRL_C = {signal.SIGINT}
 
 
 def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], jobs: int) -> Generator[_Result]:
@@ -40,7 +35,9 @@ def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]],
     others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=die_with, initargs=(os.getpid(),)) as pool:
         try:
-            for future in as_completed(_submit(pool, work, tasks)):
+            with sigint_blocked():  # the workers are started here
+                futures = [pool.submit(work, *task) for task in tasks]
+            for future in as_completed(futures):
                 yield future.result()
         except BrokenProcessPool:
             raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
@@ -48,35 +45,3 @@ def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]],
             for worker in set(multiprocessing.active_children()) - others:
                 worker.kill()
             raise
-
-
-def _submit(
-    pool: ProcessPoolExecutor, work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]]
-) -> list[Future[_Result]]:
-    """Submit all tasks. The workers are started here, and inherit the blocked SIGINT."""
-    with _deferred_ctrl_c():
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _CTRL_C)
-        try:
-            return [pool.submit(work, *task) for task in tasks]
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _deferred_ctrl_c() -> Iterator[None]:
-    """Handle a Ctrl-C that arrives inside a `with` after it.
-
-    A mask alone does not hold it back: the signal arrives in another thread, and Python handles it in the main one. A
-    worker whose start is interrupted would not get the data that it waits for.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # Python handles signals in the main thread only
-        return
-    received: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if received:
-            signal.raise_signal(signal.SIGINT)

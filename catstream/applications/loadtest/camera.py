@@ -1,4 +1,4 @@
-"""The camera of a load test: a process that renders the demo video once and sends it to all streams.
+"""The test video of a load test, and the camera: a process that sends it to all streams.
 
 It is a process of its own so that frames are sent on time regardless of other work of the load test.
 """
@@ -6,55 +6,72 @@ It is a process of its own so that frames are sent on time regardless of other w
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from time import monotonic
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from catstream.applications.loadtest.children import SPAWN, start
-from catstream.applications.loadtest.objects import several
+from catstream.applications.loadtest.plan import Plan
 from catstream.box import Box
 from catstream.errors import ServiceError
+from catstream.messages.names import UNNAMED
+from catstream.numerics.arrays import Float64
 from catstream.services.loop import die_with
-from catstream.video import demo
+from catstream.services.start import SPAWN, sigint_blocked
+from catstream.video import crowd, demo
 from catstream.video.broadcast import Broadcast, Schedule, jpeg
 
-__all__ = ["Camera"]
+__all__ = ["Camera", "Video", "render"]
+
+
+class Video(NamedTuple):
+    """The images that are sent, forwards, then backwards, and so on.
+
+    files  JPEG files
+    size   (width, height) in pixels
+    boxes  boxes of all objects in the first image, by name; the first object is the one whose tracks are measured
+    truth  boxes of the first object in all images, float64 (images, 4), NaN if it is absent
+    """
+
+    files: list[bytes]
+    size: tuple[int, int]
+    boxes: dict[str, Box]
+    truth: Float64
+
+
+def render(plan: Plan, images: int, done: Callable[[int], None] = lambda _: None) -> Video:
+    """Render the first images of the demo video of the objects; `done` is called with their number so far."""
+    files, truth = [], []
+    shown: Iterator[tuple[np.ndarray, dict[str, Box | None]]]
+    if plan.objects == 1:
+        shown = ((image, {UNNAMED: box}) for image, box in demo.render(images, plan.size))
+    else:
+        shown = crowd.render(plan.objects, images, plan.size)
+    for image, boxes in shown:
+        files.append(jpeg(image))
+        truth.append(boxes)
+        done(len(files))
+    name, *_ = first = {name: box for name, box in truth[0].items() if box is not None}
+    return Video(files, plan.size, first, np.array([boxes[name] or (np.nan,) * 4 for boxes in truth]))
 
 
 class Camera:
     """Starts the camera process; a context manager.
 
-    Parameters
-    ----------
-    streams : number of streams
-    size : (width, height) of a frame in pixels
-    pictures : number of different images to render; a longer video repeats them backwards, then forwards again
-    objects : number of objects
-
     Attributes
     ----------
-    urls : URL of each stream; set by `render`
-    truth : ground truth box of the object without a name in each image, float64 (pictures, 4), NaN if it is absent; set
-        by `render`
-    boxes : boxes of all objects in the still image that is shown before the start, by name; set by `render`
+    video : the images
+    urls : URL of each stream
     pid : id of the process
     """
 
-    def __init__(self, streams: int, size: tuple[int, int], pictures: int, objects: int = 1) -> None:
-        self._pipe, other = SPAWN.Pipe()
-        arguments = other, streams, size, pictures, objects, os.getpid()
-        self._process = SPAWN.Process(target=_run_camera, args=arguments)
-        self._other = other
-
-    def render(self, done: Callable[[int], None] = lambda _: None) -> None:
-        """Wait until all images are rendered; `done` is called with their number so far."""
-        while isinstance(message := self._receive(), int):
-            done(message)
-        self.urls, truth, self.boxes = message
-        self.truth = np.array([box or (np.nan,) * 4 for box in truth])
+    def __init__(self, video: Video, streams: int) -> None:
+        self.video = video
+        self._pipe, self._other = SPAWN.Pipe()
+        arguments = self._other, video.files, video.size, streams, os.getpid()
+        self._process = SPAWN.Process(target=_send_video, args=arguments, daemon=True)
 
     @property
     def pid(self) -> int:
@@ -78,8 +95,10 @@ class Camera:
         return schedules
 
     def __enter__(self) -> Self:
-        start(self._process)
+        with sigint_blocked():
+            self._process.start()
         self._other.close()
+        self.urls = self._receive()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -94,21 +113,10 @@ class Camera:
             raise ServiceError("the camera of the load test has exited: its error is printed above") from None
 
 
-def _run_camera(
-    pipe: Connection, streams: int, size: tuple[int, int], pictures: int, objects: int, parent: int
-) -> None:
+def _send_video(pipe: Connection, files: list[bytes], size: tuple[int, int], streams: int, parent: int) -> None:
     die_with(parent)
-    files: list[bytes] = []
-    truth: list[Box | None] = []
-    boxes: dict[str, Box] = {}
-    for image, box in demo.render(pictures, size):
-        if box is not None and not truth:
-            boxes = several(image, box, objects)
-        files.append(jpeg(image))
-        truth.append(box)
-        pipe.send(len(files))
     with Broadcast(files, size, streams) as broadcast:
-        pipe.send((broadcast.urls, truth, boxes))
+        pipe.send(broadcast.urls)
         while True:
             asked = pipe.recv()
             pipe.send(broadcast.late if asked is None else broadcast.play(asked))

@@ -43,27 +43,27 @@ class Chaos:
     def __init__(self, seed: int) -> None:
         self.kills: list[Kill] = []
         self._random = random.Random(seed)
-        self._due = monotonic() + _pause(self._random)
+        self._due = monotonic() + self._pause()
 
     def step(self, streams: list[Stream]) -> None:
         """Kill a process if a kill is due."""
         now = monotonic()
         if now < self._due:
             return
-        self._due = now + _pause(self._random)
-        candidates = [(number, name, pid) for number, stream in enumerate(streams) for name, pid in stream.pids.items()]
-        candidates = [victim for victim in candidates if self._may_be_killed(now, *victim[:2])]
+        self._due = now + self._pause()
+        recent = [(kill.stream, kill.process) for kill in self.kills if now - kill.moment < _PER_SECONDS]
+        candidates = [
+            (number, name, pid)
+            for number, stream in enumerate(streams)
+            for name, pid in stream.pids.items()
+            if recent.count((number, name)) < _MAX_KILLS
+        ]
         if candidates:
             number, name, pid = self._random.choice(candidates)
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
                 self.kills.append(Kill(now, number, name))
 
-    def _may_be_killed(self, now: float, stream: int, process: str) -> bool:
-        before = [kill.moment for kill in self.kills if (kill.stream, kill.process) == (stream, process)]
-        return sum(now - moment < _PER_SECONDS for moment in before) < _MAX_KILLS
-
-
-def _pause(generator: random.Random) -> float:
-    """Seconds to the next kill."""
-    return _PAUSE_SECONDS * generator.uniform(0.5, 1.5)
+    def _pause(self) -> float:
+        """Seconds to the next kill."""
+        return _PAUSE_SECONDS * self._random.uniform(0.5, 1.5)

@@ -17,6 +17,7 @@ PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.
 
 _LONGEST = 3_600_000_000  # microseconds
 _DIGITS = 3
+_STEPS = 10  # of the distribution, between one share of the frames and the half of the rest
 
 
 class Latencies:
@@ -44,6 +45,12 @@ class Latencies:
     def figures(self) -> dict[str, float | None]:
         """Return all `PERCENTILES`, None if there are no latencies."""
         return {name: self[name] if len(self) else None for name in PERCENTILES}
+
+    def distribution(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return percentiles as shares from 0 to 1, denser towards 1, and the latencies in seconds."""
+        steps = list(self._histogram.get_percentile_iterator(_STEPS))
+        shares = np.array([step.percentile_level_iterated_to for step in steps]) / 100
+        return shares, np.array([step.value_iterated_to for step in steps]) / 1e6
 
     def write(self, path: Path) -> None:
         """Write the percentile distribution in milliseconds, in the .hgrm format of HdrHistogram's plotter.

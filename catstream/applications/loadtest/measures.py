@@ -33,7 +33,7 @@ class Measures:
     success          share of frames with the object whose overlap is above 0.5; a skipped frame has the last known box
     success_followed the same share of the tracked frames alone; None if there are none
     lag              reports of the number of messages that the compressor had not received: arrival time and number
-    sent, stored     number of features messages at the end; None if the stream has not ended
+    totals           those of the pipeline at its end; empty if the stream has not ended
     """
 
     due: np.ndarray
@@ -44,8 +44,7 @@ class Measures:
     success: float | None
     success_followed: float | None
     lag: list[tuple[float, int]] = field(default_factory=list)
-    sent: int | None = None
-    stored: int | None = None
+    totals: dict[str, int] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
@@ -69,6 +68,11 @@ class Measures:
     def max_lag(self) -> int:
         return max((behind for _, behind in self.lag), default=0)
 
+    @property
+    def not_stored(self) -> int | None:
+        """Number of features messages that are in no coreset tree at the end; None if the stream has not ended."""
+        return self.totals["sent"] - self.totals["stored"] if self.totals else None
+
 
 def measure(
     observations: Observations, schedule: Schedule, frames: int, truth: np.ndarray, end: float, totals: dict[str, int]
@@ -88,13 +92,8 @@ def measure(
     tracks = [
         (moment, track, schedule.number(track.pts)) for moment, track in observations.tracks if track.pts is not None
     ]
-    numbers = np.array([number for *_, number in tracks], int)
-    to_track, without_track = latencies_to_answer(due, numbers, np.array([moment for moment, *_ in tracks]), end)
-    models = _models(observations, schedule)
-    to_model, _ = latencies_to_answer(
-        due, np.array([number for _, number in models], int), np.array([at for at, _ in models]), end
-    )
-
+    to_track, without_track = latencies_to_answer(due, [(moment, number) for moment, _, number in tracks], end)
+    to_model, _ = latencies_to_answer(due, _models(observations, schedule), end)
     boxes = np.full((frames, 4), np.nan)
     followed = np.zeros(frames, bool)
     for _, track, number in tracks:
@@ -114,33 +113,31 @@ def measure(
             for moment, health in observations.health
             if health.process == "detector" and schedule.start <= moment <= end
         ],
-        sent=totals.get("sent"),
-        stored=totals.get("stored"),
+        totals=totals,
     )
 
 
-def latencies_to_answer(
-    due: np.ndarray, numbers: np.ndarray, moments: np.ndarray, end: float
-) -> tuple[np.ndarray, int]:
+def latencies_to_answer(due: np.ndarray, answers: list[tuple[float, int]], end: float) -> tuple[np.ndarray, int]:
     """Return the seconds from each frame's due time to the first answer for this frame or a newer one.
 
     Parameters
     ----------
     due : due times, float64 (frames,)
-    numbers, moments : frame number and arrival time of each answer, int and float64 (answers,)
+    answers : arrival time and frame number of each answer
     end : arrival time that is assumed for frames without an answer
 
     Returns
     -------
     float64 (frames,), and the number of frames without an answer
 
-    >>> latencies_to_answer(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0, 2]), np.array([0.5, 2.5]), end=9.0)
+    >>> latencies_to_answer(np.array([0.0, 1.0, 2.0, 3.0]), [(0.5, 0), (2.5, 2)], end=9.0)
     (array([0.5, 1.5, 0.5, 6. ]), 1)
     """
-    frames = len(due)
-    first = np.full(frames, np.inf)
-    known = numbers >= 0
-    np.minimum.at(first, np.minimum(numbers[known], frames - 1), moments[known])
+    first = np.full(len(due), np.inf)
+    for moment, number in answers:
+        if number >= 0:
+            place = min(number, len(due) - 1)
+            first[place] = min(first[place], moment)
     first = np.minimum.accumulate(first[::-1])[::-1]
     return np.minimum(first, end) - due, int(np.isinf(first).sum())
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from catstream.errors import SettingsError
-from catstream.messages.names import check_count
+from catstream.messages.names import check_count, counted
 from catstream.settings import Settings
-from catstream.video import demo
+from catstream.video import crowd, demo
 
 __all__ = ["Plan"]
 
@@ -16,15 +16,15 @@ __all__ = ["Plan"]
 class Plan:
     """The parameters of one run.
 
-    streams      number of pipelines, each of three processes
-    objects      number of objects that each pipeline tracks
-    subscribers  number of subscribers to the tracks of each stream
-    slow         number of those that are slow; half of these are frozen instead
-    rate         frames per second of each stream, whether or not the pipeline keeps up
-    duration     seconds
-    size         (width, height) of a frame in pixels
-    chaos        whether random processes are killed during the run
-    settings     settings of all pipelines; their seed is used for the chaos too
+    streams           number of pipelines, each of three processes
+    objects           number of objects that each pipeline tracks, those of `catstream demo`
+    subscribers       number of subscribers to the tracks of each stream
+    slow_subscribers  number of those that are slow; half of these are frozen instead
+    rate              frames per second of each stream, whether or not the pipeline keeps up
+    duration          seconds
+    size              (width, height) of a frame in pixels
+    chaos             whether random processes are killed during the run
+    settings          settings of all pipelines; their seed is used for the chaos too
 
     Raises
     ------
@@ -37,7 +37,7 @@ class Plan:
     streams: int = 1
     objects: int = 1
     subscribers: int = 0
-    slow: int = 0
+    slow_subscribers: int = 0
     rate: float = 25.0
     duration: float = 10.0
     size: tuple[int, int] = demo.SIZE
@@ -45,13 +45,18 @@ class Plan:
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
-        if self.slow > self.subscribers:
+        if self.slow_subscribers > self.subscribers:
             raise SettingsError(
-                f"{self.slow} of {self.subscribers} subscribers cannot be slow: give more, or fewer slow ones"
+                f"{self.slow_subscribers} of {self.subscribers} subscribers cannot be slow: "
+                "give more, or fewer slow ones"
             )
         if self.frames < 1:
             raise SettingsError(
                 f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: give a higher rate or more seconds"
+            )
+        if self.objects > (most := len(crowd.NAMES)):
+            raise SettingsError(
+                f"the video of a load test shows at most {most} objects, not {self.objects}: give fewer"
             )
         check_count(self.objects, self.settings.run.objects_most)
         if self.settings.run.lockstep:
@@ -60,14 +65,14 @@ class Plan:
             raise SettingsError("each stream of a load test has an endpoint of its own: leave out endpoint")
 
     def __str__(self) -> str:
-        streams = f"{self.streams} streams" if self.streams > 1 else "1 stream"
         objects = f", {self.objects} objects" if self.objects > 1 else ""
-        return f"{streams} of {self.size[0]}x{self.size[1]} pixels{objects}, {self.rate:g} frames/s due in each"
+        size = f"{self.size[0]}x{self.size[1]} pixels"
+        return f"{counted(self.streams, 'stream')} of {size}{objects}, {self.rate:g} frames/s due in each"
 
     @property
     def frozen(self) -> int:
         """Number of the slow subscribers that are frozen."""
-        return self.slow // 2
+        return self.slow_subscribers // 2
 
     @property
     def frames(self) -> int:

@@ -1,28 +1,190 @@
-"""Writes the report of a load test as one HTML file with figures and plots."""
+"""The results of a load test: tables of text, an HTML file with plots, and JSON."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from html import escape
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from catstream.applications.evaluation.provenance import provenance
 from catstream.applications.html.page import table, write_page
 from catstream.applications.html.plots import Axis, plot
 from catstream.applications.loadtest.latencies import PERCENTILES, Latencies
+from catstream.applications.loadtest.limits import violations
 from catstream.applications.loadtest.load_test import LoadTest
 from catstream.applications.loadtest.measures import Measures
 from catstream.applications.loadtest.run import Result
 from catstream.applications.loadtest.usage import REST, summary
 from catstream.messages.names import counted
 
-__all__ = ["write_report"]
+__all__ = ["Table", "milliseconds", "tables", "to_json", "write_report"]
 
 _STREAMS = 6  # maximum number of curves in a plot
 _SUSTAINED = 0.01  # share of skipped frames up to which a rate counts as sustained
 _POINTS = 200  # maximum number of points of a curve over time
+_MODEL = ("p50", "p99")  # percentiles of the model latency that are shown
+
+Curves = dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+class Table(NamedTuple):
+    """A table of text.
+
+    note   explanation of the columns
+    means  number of rows at the end that summarise the others
+    """
+
+    title: str
+    heads: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    note: str = ""
+    means: int = 0
+
+
+def tables(result: Result) -> Iterator[Table]:
+    """Yield the tables of a run: streams, processes and, if there were any, subscribers and kills."""
+    streams = [
+        (
+            str(number),
+            f"{each.rate(result.plan.rate):.1f}",
+            f"{100 * each.skipped_share:.1f} %",
+            *_latencies(each.track, each.model),
+            str(each.max_lag),
+            "-" if each.not_stored is None else str(each.not_stored),
+            _share(each.success),
+            _share(each.success_followed),
+        )
+        for number, each in enumerate(result.streams)
+    ]
+    together = [("all", "", "", *_latencies(result.track, result.model), *[""] * 4)] if len(streams) > 1 else []
+    yield Table(
+        "Streams",
+        (
+            *("stream", "frames/s", "skipped", *PERCENTILES, *(f"model {name}" for name in _MODEL)),
+            *("lag", "not stored", "success", "of tracked"),
+        ),
+        streams + together,
+        "Latencies in milliseconds. Lag: maximum number of messages that the compressor had not yet received. Not "
+        "stored: features messages that were not in the coreset trees at the end. Success: share of frames with an "
+        "overlap with the ground truth above 0.5; a skipped frame has the last known box. Of tracked: the same over "
+        "the frames that were not skipped.",
+        len(together),
+    )
+    used = {name: summary(readings) for name, readings in result.usage.items()}
+    processes = [
+        (
+            name,
+            *(f"{use[key]:.2f}" for key in ("cores", "cores_most")),
+            *(f"{use[key] / 1e6:.0f}" for key in ("memory", "memory_most")),
+        )
+        for name, use in used.items()
+    ]
+    yield Table("Processes", ("process", "cores", "most", "MB", "most"), processes)
+    if plan := result.plan.subscribers and result.plan:
+        yield Table(
+            "Subscribers",
+            ("of each stream", "slow", "frozen", "for s", "received, least", "most", "missed", "most"),
+            [
+                (
+                    *map(str, (plan.subscribers, plan.slow_subscribers - plan.frozen, plan.frozen)),
+                    f"{result.frozen:.0f}",
+                    *(str(pick(result.received, default=0)) for pick in (min, max)),
+                    *(str(value) for value in (sum(result.missed), max(result.missed, default=0))),
+                )
+            ],
+            "Frames whose tracks each of the fast subscribers received, and frames that they missed in total.",
+        )
+    if result.plan.chaos:
+        yield Table(
+            f"Chaos: {len(result.recoveries)} processes killed, {result.restarts} restarted",
+            ("killed", "s to the next track", "s to the next model"),
+            [(str(each.kill), _seconds(each.track), _seconds(each.model)) for each in result.recoveries],
+        )
+
+
+def milliseconds(seconds: float) -> str:
+    """Format a duration in milliseconds."""
+    return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
+
+
+def _latencies(track: Latencies, model: Latencies) -> tuple[str, ...]:
+    return *(milliseconds(track[name]) for name in PERCENTILES), *(milliseconds(model[name]) for name in _MODEL)
+
+
+def _seconds(seconds: float | None) -> str:
+    return "none" if seconds is None else f"{seconds:.3f}"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def to_json(load_test: LoadTest) -> dict[str, object]:
+    """Return the figures of the decisive run, those of the search steps, and the provenance.
+
+    Units are seconds, bytes, and shares from 0 to 1.
+    """
+    result = load_test.result
+    plan = {each.name: getattr(result.plan, each.name) for each in fields(result.plan) if each.name != "settings"}
+    return {
+        **provenance(result.plan.settings),
+        "plan": plan,
+        "seconds": result.seconds,
+        "interrupted": load_test.interrupted,
+        "latency": {"track": result.track.figures(), "model": result.model.figures()},
+        "streams": [_stream(measures, result.plan.rate) for measures in result.streams],
+        "processes": {name: summary(readings) for name, readings in result.usage.items()},
+        "subscribers": {
+            "quick": len(result.received),
+            "received": sum(result.received),
+            "missed": result.missed,
+            "frozen_seconds": round(result.frozen, 3),
+        },
+        "chaos": [
+            {
+                "stream": recovery.kill.stream,
+                "process": recovery.kill.process,
+                "to_track": recovery.track,
+                "to_model": recovery.model,
+            }
+            for recovery in result.recoveries
+        ],
+        "restarts": result.restarts,
+        "camera_late": round(result.camera_late, 6),
+        "limits": {limit.name: {"value": limit.value, "met": limit.is_met(result)} for limit in load_test.limits},
+        "violations": load_test.violations,
+        "highest_rate": load_test.highest_rate,
+        "steps": [
+            {
+                "rate": step.plan.rate,
+                "followed": step.followed,
+                "track": step.track.figures(),
+                "violations": violations(load_test.limits, step),
+            }
+            for step in load_test.results
+        ],
+    }
+
+
+def _stream(measures: Measures, rate: float) -> dict[str, object]:
+    return {
+        "frames": measures.frames,
+        "frames_per_second": measures.rate(rate),
+        "skipped": measures.skipped,
+        "without_track": measures.without_track,
+        "track": measures.track.figures(),
+        "model": measures.model.figures(),
+        "lag": measures.max_lag,
+        "sent": measures.totals.get("sent"),
+        "stored": measures.totals.get("stored"),
+        "success": measures.success,
+        "success_followed": measures.success_followed,
+    }
 
 
 def write_report(path: Path, load_test: LoadTest) -> Path:
@@ -34,36 +196,38 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
         If the file cannot be written.
     """
     result = load_test.result
-    plan = result.plan
-    about = (
-        f"{plan}, {result.seconds:.1f} s{', interrupted' if load_test.interrupted else ''}. Latency counts from the "
-        "due time of a frame; the latency of a skipped frame ends with the track of a newer one."
-    )
+    streams, *others = tables(result)
     return write_page(
         path,
         "load test",
         [
             "<h1>Load test</h1>",
             _verdict(result),
-            f'<p class="about">{about}</p>',
+            f'<p class="about">{result.plan}, {result.seconds:.1f} s{", interrupted" * load_test.interrupted}. Latency '
+            "counts from the due time of a frame; that of a skipped frame ends with the track of a newer one.</p>",
             *(f'<p class="bad">{escape(error)}</p>' for error in result.errors),
-            _limits(load_test),
-            _steps(load_test),
-            "<h2>Streams</h2>",
-            _streams(result),
-            _plots(result),
-            "<h2>Processes</h2>",
-            _processes(result),
-            _subscribers(result),
-            _chaos(result),
+            *(
+                f'<p class="{"good" if limit.is_met(result) else "bad"}">{escape(limit.describe(result))}</p>'
+                for limit in load_test.limits
+            ),
+            _html(_steps(load_test)) if load_test.is_search else "",
+            _html(streams),
+            f'<div class="plots">{"".join(_plots(result))}</div>',
+            *map(_html, others),
             "<h2>Reliability</h2>",
             '<p class="about">The precision of the latencies is the largest delay that the camera itself caused: '
-            f"{_ms(result.camera_late)} ms. Other processes of this machine kept {result.other_load:.2f} cores busy; "
-            "on a quiet machine it is close to 0.</p>",
+            f"{milliseconds(result.camera_late)} ms. Other processes of this machine kept {result.other_load:.2f} "
+            "cores busy; on a quiet machine it is close to 0.</p>",
             "<h2>Settings that are not the default</h2>",
-            f"<pre>{escape(chr(10).join(plan.settings.changed()) or 'none')}</pre>",
+            f"<pre>{escape(chr(10).join(result.plan.settings.changed()) or 'none')}</pre>",
         ],
     )
+
+
+def _html(shown: Table) -> str:
+    rows = [[escape(cell) for cell in row] for row in shown.rows]
+    note = f'<p class="about">{shown.note}</p>' if shown.note else ""
+    return f"<h2>{shown.title}</h2>{table(shown.heads, rows, means=shown.means)}{note}"
 
 
 def _verdict(result: Result) -> str:
@@ -80,127 +244,65 @@ def _verdict(result: Result) -> str:
     )
 
 
-def _limits(load_test: LoadTest) -> str:
-    lines = []
-    for limit in load_test.limits:
-        style, word = ("good", "met") if limit.is_met(load_test.result) else ("bad", "broken")
-        lines.append(f'<li class="{style}">{word}: {escape(limit.describe(load_test.result))}</li>')
-    return f"<ul>{''.join(lines)}</ul>" if lines else ""
-
-
-def _steps(load_test: LoadTest) -> str:
-    if not load_test.is_search:
-        return ""
-    rows = []
-    for step in load_test.steps:
-        style, verdict = ("bad", "; ".join(step.violations)) if step.violations else ("good", "met")
-        latencies = [_ms(step.result.track[name]) for name in PERCENTILES]
-        rows.append(
-            [
-                f"{step.rate:g} frames/s",
-                f'<span class="{style}">{escape(verdict)}</span>',
-                f"{step.followed:.1f}",
-                *latencies,
-            ]
-        )
-    heads = ["due", "limits", "tracked", *(f"{name} ms" for name in PERCENTILES)]
+def _steps(load_test: LoadTest) -> Table:
     if load_test.highest_rate:
         title = f"The highest rate that meets the limits: {load_test.highest_rate:g} frames/s"
     else:
         title = "Interrupted before a rate was found" if load_test.interrupted else "No rate meets the limits"
-    return f'<h2>{title}</h2><p class="about">The runs, in this order.</p>{table(heads, rows, texts=2)}'
-
-
-def _streams(result: Result) -> str:
-    heads = ["stream", "frames", "frames/s", "skipped", *(f"track {name}" for name in PERCENTILES)]
-    heads += [f"model {name}" for name in ("p50", "p99")] + ["lag", "not stored", "success", "success of tracked"]
     rows = [
-        [
-            number,
-            measures.frames,
-            f"{measures.rate(result.plan.rate):.1f}",
-            f"{100 * measures.skipped_share:.1f} %",
-            *(_ms(measures.track[name]) for name in PERCENTILES),
-            *(_ms(measures.model[name]) for name in ("p50", "p99")),
-            measures.max_lag,
-            "-" if measures.sent is None or measures.stored is None else measures.sent - measures.stored,
-            _share(measures.success),
-            _share(measures.success_followed),
-        ]
-        for number, measures in enumerate(result.streams)
+        (
+            f"{step.plan.rate:g} frames/s",
+            f"{step.followed:.1f}",
+            *(milliseconds(step.track[name]) for name in PERCENTILES),
+            "; ".join(violations(load_test.limits, step)) or "met",
+        )
+        for step in load_test.results
     ]
-    several = len(rows) > 1
-    if several:
-        latencies = [_ms(result.track[name]) for name in PERCENTILES] + [
-            _ms(result.model[name]) for name in ("p50", "p99")
-        ]
-        rows.append(["all", sum(stream.frames for stream in result.streams), "", "", *latencies, "", "", "", ""])
-    note = (
-        '<p class="about">Latencies in milliseconds. Lag: maximum number of messages that the compressor had not yet '
-        "received. Success: share of frames with an overlap with the ground truth above 0.5; a skipped frame has the "
-        "last known box. Success of tracked: the same over the frames that were not skipped. Not stored: features "
-        "messages that were not in the coreset trees at the end.</p>"
-    )
-    return table(heads, rows, means=several) + note
+    return Table(title, ("due", "tracked", *(f"{name} ms" for name in PERCENTILES), "limits"), rows, "In this order.")
 
 
-def _plots(result: Result) -> str:
-    shown = list(enumerate(result.streams))[:_STREAMS]
-    start = min(measures.due[0] for _, measures in shown)
+def _plots(result: Result) -> Iterator[str]:
+    shown = {f"stream {number}": measures for number, measures in enumerate(result.streams[:_STREAMS])}
+    start = min(measures.due[0] for measures in shown.values())
     seconds = Axis.upto(result.seconds, "seconds")
-    over_time, lag, rates = {}, {}, {}
-    for number, measures in shown:
-        when = measures.due - start
-        over_time[f"stream {number}"] = _thinned(when, 1000 * measures.track.seconds)
-        rates[f"stream {number}"] = _rate(measures, when, result.plan.rate)
-        reports = np.array(measures.lag, float).reshape(-1, 2)
-        lag[f"stream {number}"] = reports[:, 0] - start, reports[:, 1]
-    parts = [
-        _percentiles("From frame to track", [measures.track for _, measures in shown]),
-        _percentiles("From frame to the model trained on it", [measures.model for _, measures in shown]),
-        _lines("Latency to the track over time", seconds, "ms", over_time),
-        _lines("Frames tracked", seconds, "frames/s", rates, minimum=result.plan.rate),
-        _lines("Lag of the compressor", seconds, "messages", lag, minimum=5),
-    ]
-    for title, unit, column, scale in (("Processor", "cores", 1, 1.0), ("Memory", "MB", 2, 1e-6)):
-        kinds = _kinds(result, column, scale, start)
-        if title == "Memory":  # that of all other programs would set the scale
-            kinds.pop(REST, None)
-        parts.append(_lines(title, seconds, unit, kinds))
-    return f'<div class="plots">{"".join(parts)}</div>'
+    yield _percentiles("From frame to track", {name: measures.track for name, measures in shown.items()})
+    yield _percentiles("From frame to the model trained on it", {name: each.model for name, each in shown.items()})
+    latencies = {name: _peaks(each.due - start, 1000 * each.track.seconds) for name, each in shown.items()}
+    yield _lines("Latency to the track over time", seconds, "ms", latencies)
+    rates = {name: _rate(each, each.due - start, result.plan.rate) for name, each in shown.items()}
+    yield _lines("Frames tracked", seconds, "frames/s", rates, minimum=result.plan.rate)
+    reports = {name: np.array(each.lag, float).reshape(-1, 2) for name, each in shown.items()}
+    lag = {name: (each[:, 0] - start, each[:, 1]) for name, each in reports.items()}
+    yield _lines("Lag of the compressor", seconds, "messages", lag, minimum=5)
+    yield _lines("Processor", seconds, "cores", _used(result, 1, start))
+    memory = {name: (xs, ys / 1e6) for name, (xs, ys) in _used(result, 2, start).items()}
+    memory.pop(REST, None)  # that of all other programs would set the scale
+    yield _lines("Memory", seconds, "MB", memory)
 
 
-def _percentiles(title: str, streams: Iterable[Latencies]) -> str:
+def _percentiles(title: str, streams: Mapping[str, Latencies]) -> str:
     """Plot latency by percentile on a logarithmic axis: each tick to the right is a tenth of the remaining frames."""
-    streams = list(streams)
-    nines = max(1, math.ceil(math.log10(max(map(len, streams)))))  # the highest percentile is that of one frame
+    nines = max(
+        1, math.ceil(math.log10(max(map(len, streams.values()))))
+    )  # the highest percentile is that of one frame
     ticks = tuple((float(nine), f"{100 - 100 / 10**nine:g} %") for nine in range(nines + 1))
     curves = {}
-    for number, latencies in enumerate(streams):
-        ordered = 1000 * np.sort(latencies.seconds)
-        above = 1 - np.arange(len(ordered)) / len(ordered)  # share of the frames with this latency or a longer one
-        curves[f"stream {number}"] = _thinned(-np.log10(above), ordered)
+    for name, latencies in streams.items():
+        shares, values = latencies.distribution()
+        curves[name] = -np.log10(np.maximum(1 - shares, 10.0**-nines)), 1000 * values
     most = max(float(ys.max()) for _, ys in curves.values())
     return plot(title, Axis("share of frames that waited less", nines, ticks), Axis.upto(most, "ms"), curves)
 
 
-def _lines(
-    title: str, x: Axis, unit: str, curves: dict[str, tuple[np.ndarray, np.ndarray]], minimum: float = 1.0
-) -> str:
+def _lines(title: str, x: Axis, unit: str, curves: Curves, minimum: float = 1.0) -> str:
     most = max((float(ys.max()) for _, ys in curves.values() if len(ys)), default=0.0)
     return plot(title, x, Axis.upto(max(most, minimum), unit), curves)
 
 
-def _thinned(xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce a curve to the maximum of each of `_POINTS` intervals, so that no peak is lost."""
-    if len(xs) <= _POINTS:
-        return xs, ys
-    places = np.linspace(xs[0], xs[-1], _POINTS)
-    stretch = np.searchsorted(places, xs)
-    most = np.full(_POINTS, np.nan)
-    np.fmax.at(most, stretch, ys)
-    known = np.isfinite(most)
-    return places[known], most[known]
+def _peaks(xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce a curve to the maximum of each of `_POINTS` parts, so that no peak is lost."""
+    begins = np.unique(np.linspace(0, len(xs), _POINTS, endpoint=False).astype(int))
+    return xs[begins], np.maximum.reduceat(ys, begins)
 
 
 def _rate(measures: Measures, when: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
@@ -210,59 +312,11 @@ def _rate(measures: Measures, when: np.ndarray, rate: float) -> tuple[np.ndarray
     return np.arange(len(share)) + 0.5, rate * share
 
 
-def _kinds(result: Result, column: int, scale: float, start: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return the readings of each kind of process, summed over the streams."""
-    kinds: dict[str, list[np.ndarray]] = {}
+def _used(result: Result, column: int, start: float) -> Curves:
+    """Return a column of the readings of each kind of process, summed over the streams."""
+    kinds: dict[str, dict[float, float]] = {}
     for name, readings in result.usage.items():
-        kinds.setdefault(name.rstrip(" 0123456789"), []).append(np.array(readings, float))
-    moments = np.unique([reading.moment for readings in result.usage.values() for reading in readings])
-    added = {}
-    for kind, several in kinds.items():
-        total = np.zeros(len(moments))
-        for series in several:
-            total[np.searchsorted(moments, series[:, 0])] += scale * series[:, column]
-        added[kind] = moments - start, total
-    return added
-
-
-def _processes(result: Result) -> str:
-    rows = []
-    for name, readings in result.usage.items():
-        found = summary(readings)
-        cores, memory = (found["cores"], found["cores_most"]), (found["memory"], found["memory_most"])
-        rows.append([escape(name), *(f"{value:.2f}" for value in cores), *(f"{value / 1e6:.0f}" for value in memory)])
-    return table(["process", "cores, mean", "most", "MB, mean", "most"], rows)
-
-
-def _subscribers(result: Result) -> str:
-    plan = result.plan
-    if not plan.subscribers:
-        return ""
-    received, missed = result.received or [0], result.missed or [0]
-    return (
-        f'<h2>Subscribers</h2><p class="about">{plan.subscribers} to each stream, of which {plan.slow} are slow; '
-        f"{plan.frozen} of these were frozen for {result.frozen:.0f} s. The fast ones received the tracks of "
-        f"{min(received)} to {max(received)} frames each, and missed those of {sum(missed)} in total, "
-        f"{max(missed)} at most.</p>"
-    )
-
-
-def _chaos(result: Result) -> str:
-    if not result.plan.chaos:
-        return ""
-    rows = [[str(recovery.kill), _seconds(recovery.track), _seconds(recovery.model)] for recovery in result.recoveries]
-    heads = ["killed", "s to the next track", "s to the next model"]
-    title = f"Chaos: {len(rows)} processes killed, {result.restarts} restarted"
-    return f"<h2>{title}</h2>{table(heads, rows)}"
-
-
-def _ms(seconds: float) -> str:
-    return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
-
-
-def _seconds(seconds: float | None) -> str:
-    return "none" if seconds is None else f"{seconds:.3f}"
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
+        kind = kinds.setdefault(name.rstrip(" 0123456789"), {})
+        for reading in readings:
+            kind[reading.moment] = kind.get(reading.moment, 0.0) + reading[column]
+    return {kind: (np.array([*sums]) - start, np.array([*sums.values()])) for kind, sums in kinds.items()}

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
 import threading
-from time import monotonic
+from contextlib import suppress
 
 from catstream.box import Box
-from catstream.errors import CatstreamError
+from catstream.client.control import control
+from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 
 __all__ = ["Stream"]
 
-_STOP_SECONDS = 30.0  # time-out for a pipeline to end in order
-_RETRY_SECONDS = 3.0  # a detector that was killed before the signal is restarted, and signalled again after this time
+_STOP_SECONDS = 30.0  # time-out for a pipeline to start, to answer `stop`, and to end after it
 
 
 class Stream(threading.Thread):
@@ -27,7 +24,7 @@ class Stream(threading.Thread):
     endpoint : endpoint of the pipeline, once it is `ready`
     ready : event that is set when the processes are started or the pipeline has failed
     error : the error of a failed pipeline, else None
-    totals, restarts : as in `Pipeline`, set at the end
+    totals : as in `Pipeline`, set at the end
     """
 
     def __init__(self, number: int, url: str, boxes: dict[str, Box], settings: Settings) -> None:
@@ -36,10 +33,9 @@ class Stream(threading.Thread):
         self.endpoint = ""
         self.error: CatstreamError | None = None
         self.totals: dict[str, int] = {}
-        self.restarts = 0
         self._url, self._boxes, self._settings = url, boxes, settings
         self._pipeline: Pipeline | None = None
-        self._signalled: set[int] = set()
+        self._ends = False
 
     def run(self) -> None:
         try:
@@ -48,10 +44,10 @@ class Stream(threading.Thread):
                 self.ready.set()
                 for _ in pipeline:
                     pass
-                self.totals, self.restarts = pipeline.totals, pipeline.restarts
+                self.totals = pipeline.totals
         except CatstreamError as error:
-            # A detector that is signalled while it resumes exits without an end message.
-            self.error = None if self._signalled else error
+            # A restarted detector that is stopped while it repeats frames ends without its last message.
+            self.error = None if self._ends else error
         finally:
             self._pipeline = None
             self.ready.set()
@@ -62,17 +58,17 @@ class Stream(threading.Thread):
         pipeline = self._pipeline
         return pipeline.pids if pipeline is not None else {}
 
-    def ask_to_stop(self) -> None:
-        """Send SIGTERM to the detector: it ends the run once all features that it sent are stored."""
-        pid = self.pids.get("detector")
-        if pid is not None and pid not in self._signalled:  # a second signal could kill it during its shutdown
-            self._signalled.add(pid)
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGTERM)
-
     def stop(self) -> None:
-        """End the pipeline in order, which may take some seconds."""
-        deadline = monotonic() + _STOP_SECONDS
-        while self.is_alive() and monotonic() < deadline:
-            self.ask_to_stop()
-            self.join(_RETRY_SECONDS)
+        """End the run as if its source had ended; `join` waits until everything learned is stored."""
+        self.ready.wait(_STOP_SECONDS)
+        self._ends = True
+        if self.is_alive() and self.endpoint:
+            with (
+                suppress(CommandRejectedError, SilenceError),  # it has ended by itself
+                control(self.endpoint, timeout=_STOP_SECONDS, keys=self._settings.run.keys) as pipeline,
+            ):
+                pipeline.stop()
+
+    def join(self, timeout: float | None = _STOP_SECONDS) -> None:
+        """Wait until the pipeline has ended, which may take some seconds."""
+        super().join(timeout)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import MutableSequence
-from time import monotonic
+from contextlib import ExitStack
+from time import monotonic, sleep
 from typing import Any, Self
 
-from catstream.applications.loadtest.children import SPAWN, start
-from catstream.applications.loadtest.listening import rounds
 from catstream.client.subscription import GapCounter
 from catstream.messages.kinds import End
 from catstream.services.loop import die_with
+from catstream.services.start import SPAWN, sigint_blocked
 from catstream.wire.channels import TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
@@ -50,7 +50,7 @@ class Subscribers:
             for begin in range(first, first + size, _PER_PROCESS):
                 numbers = range(begin, min(begin + _PER_PROCESS, first + size))
                 arguments = (endpoint, keys, numbers, pace, self._received, self._missed, os.getpid())
-                self._groups[-1].append(SPAWN.Process(target=_read_until_end, args=arguments))
+                self._groups[-1].append(SPAWN.Process(target=_read_until_end, args=arguments, daemon=True))
             first += size
 
     @property
@@ -89,17 +89,17 @@ class Subscribers:
         return list(self._missed[: self._quick])
 
     def __enter__(self) -> Self:
-        for group in self._groups:
-            for process in group:
-                start(process)
+        with sigint_blocked():
+            for group in self._groups:
+                for process in group:
+                    process.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         for group in self._groups:
             for process in group:
-                if process.pid is not None:
-                    process.kill()
-                    process.join()
+                process.kill()
+                process.join()
 
 
 def _read_until_end(
@@ -114,13 +114,24 @@ def _read_until_end(
     """Run some of the subscribers until the pipeline ends."""
     die_with(parent)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    readers = {number: Subscriber(TRACKS, Endpoint.parse(endpoint, keys)) for number in numbers}
-    gaps = {number: GapCounter() for number in numbers}
-    last = dict.fromkeys(numbers, 0)  # number of the last frame: the tracks of all objects in it have the same
-    most, pause = pace
-    for number, message in rounds(readers, pause, most):
-        gaps[number].take(message.seq)
-        missed[number] = gaps[number].missed
-        if not isinstance(message, End) and message.seq != last[number]:
-            received[number] += 1
-            last[number] = message.seq
+    with ExitStack() as stack:
+        readers = {
+            number: stack.enter_context(Subscriber(TRACKS, Endpoint.parse(endpoint, keys))) for number in numbers
+        }
+        gaps = {number: GapCounter() for number in numbers}
+        last = dict.fromkeys(numbers, 0)  # number of the last frame: the tracks of all objects in it have the same
+        most, pause = pace
+        while readers:
+            for number, reader in list(readers.items()):
+                for _ in range(most):
+                    if (message := reader.receive(0)) is None:
+                        break
+                    gaps[number].take(message.seq)
+                    missed[number] = gaps[number].missed
+                    if isinstance(message, End):
+                        del readers[number]
+                        break
+                    if message.seq != last[number]:
+                        received[number] += 1
+                        last[number] = message.seq
+            sleep(pause)

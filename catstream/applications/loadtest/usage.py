@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from statistics import fmean
 from typing import NamedTuple
 
 import psutil
@@ -15,7 +15,7 @@ REST = "everything else"
 
 
 class UsageReading(NamedTuple):
-    """Processor and memory use of a process since the previous reading.
+    """Processor and memory use of a group of processes since the previous reading.
 
     moment  time of the reading by `time.monotonic`
     cores   mean number of busy cores
@@ -35,37 +35,37 @@ class Usage:
 
     def __init__(self) -> None:
         self.readings: dict[str, list[UsageReading]] = {}
-        self._cpu_seconds: dict[int, float] = {}  # processor time by process id
-        self._moment: float | None = None
+        self._processes: dict[int, psutil.Process] = {}  # psutil keeps the processor time of the previous reading in it
 
-    def read(self, moment: float, pids: Mapping[str, Iterable[int]]) -> None:
-        """Add a reading of each group; the first call only initialises the processor times."""
-        before, self._moment = self._moment, moment
-        # psutil gives the percentage of all cores since its previous call.
-        cores, memory = psutil.cpu_percent() / 100 * psutil.cpu_count(), psutil.virtual_memory().used
-        for name, numbers in pids.items():
-            busy, resident = 0.0, 0
-            for pid in numbers:
-                with suppress(psutil.Error):  # the process has just ended
-                    process = psutil.Process(pid)
-                    seconds = sum(process.cpu_times()[:2])
-                    busy += seconds - self._cpu_seconds.get(pid, 0.0)
-                    self._cpu_seconds[pid] = seconds
-                    resident += process.memory_info().rss
-            if before is not None and moment > before:
-                reading = UsageReading(moment, busy / (moment - before), resident)
+    def read(self, moment: float, groups: Mapping[str, Iterable[int]]) -> None:
+        """Add a reading of groups of process ids; the first call only starts the measurement."""
+        is_first = not self._processes
+        cores, memory = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1), psutil.virtual_memory().used
+        for name, pids in groups.items():
+            used = [self._of(pid) for pid in pids]
+            reading = UsageReading(moment, sum(busy for busy, _ in used), sum(resident for _, resident in used))
+            cores, memory = cores - reading.cores, memory - reading.memory
+            if not is_first:
                 self.readings.setdefault(name, []).append(reading)
-                cores, memory = cores - reading.cores, memory - resident
-        if before is not None and moment > before:
+        if not is_first:
             self.readings.setdefault(REST, []).append(UsageReading(moment, max(0.0, cores), max(0, memory)))
+
+    def _of(self, pid: int) -> tuple[float, int]:
+        """Return busy cores and memory of a process; nothing if it has just ended."""
+        try:
+            process = self._processes.get(pid) or psutil.Process(pid)
+            self._processes[pid] = process
+            return process.cpu_percent() / 100, process.memory_info().rss
+        except psutil.Error:
+            return 0.0, 0
 
 
 def summary(readings: Sequence[UsageReading]) -> dict[str, float]:
     """Return mean and maximum of busy cores and of memory in bytes."""
-    cores, memory = [reading.cores for reading in readings], [reading.memory for reading in readings]
+    _, cores, memory = zip(*readings, strict=True)
     return {
-        "cores": sum(cores) / len(cores),
+        "cores": fmean(cores),
         "cores_most": max(cores),
-        "memory": sum(memory) / len(memory),
+        "memory": fmean(memory),
         "memory_most": max(memory),
     }
