@@ -61,7 +61,6 @@ IMPORTERS = {
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/parquet.py"],
     "supervision": ["catstream/sinks/adapters.py"],
-    "motmetrics": ["catstream/applications/evaluation/multiple.py"],
     "av": ["catstream/video"],
     "zmq": [
         "catstream/wire/context.py",
@@ -94,7 +93,6 @@ SLOW = {
     "filterpy",
     "pyarrow",
     "supervision",
-    "motmetrics",
     "fsspec",
     "ray",
     "s3fs",

@@ -13,7 +13,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from catstream.box import Box
 from catstream.cli.track import track
-from catstream.errors import require_extra
 
 __all__ = ["demo"]
 
@@ -37,7 +36,7 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool, live
     changes, a similar flower crosses it, a pagoda occludes it, and it leaves the
     picture and returns. With --objects, several flowers and other objects with
     names cross and occlude one another. Their accuracy is measured as MOTA, IDF1
-    and HOTA, which needs an extra: pip install "catstream[mot]".
+    and HOTA.
 
     The source demo:SEED is a part of the video as a live source, which needs no
     camera and never ends. SEED is a number; demo:SEED?size=640x480&rate=10
@@ -92,8 +91,6 @@ def _several(output: Path, objects: int, frames: int | None, render_only: bool) 
     from catstream.video.crowd import FRAMES, write
     from catstream.video.results import read_tracks
 
-    if not render_only:
-        require_extra("mot")
     console, frames = Console(), frames or FRAMES
     video, truth = _rendered(console, frames, lambda done: write(output, objects, frames, done=done))
     if render_only:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,29 @@ def noisy_case(seed):
 )
 def test_hota_is_that_of_trackeval(seed, expected):
     assert hota(*noisy_case(seed)) == pytest.approx(expected, rel=1e-9)  # by TrackEval 1.3.0
+
+
+def by_motmetrics(truth, found):
+    """MOTA, IDF1 and the identity switches by py-motmetrics."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of pandas and motmetrics, about their own code
+        import motmetrics
+
+        accumulator = motmetrics.MOTAccumulator(auto_id=True)
+        for true, boxes in zip(truth, found, strict=True):
+            true, boxes = ({ord(name): box for name, box in each.items() if box} for each in (true, boxes))
+            overlaps = np.array([[box.overlap(other) for other in boxes.values()] for box in true.values()])
+            distances = np.where(overlaps >= 0.5, 1 - overlaps, np.nan).reshape(len(true), len(boxes))
+            accumulator.update(list(true), list(boxes), distances)
+        names = ["mota", "idf1", "num_switches"]
+        return motmetrics.metrics.create().compute(accumulator, metrics=names).iloc[0].tolist()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_mota_idf1_and_switches_are_those_of_motmetrics(seed):
+    case = noisy_case(seed)
+    scores = score_multiple(*case)
+    assert [scores.mota, scores.idf1, scores.switches] == pytest.approx(by_motmetrics(*case))
 
 
 def test_an_exchange_of_two_names_is_counted_as_two_switches():
