@@ -23,8 +23,8 @@ from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
 from catstream.run.state import TREES
 from catstream.settings import Settings
+from catstream.sinks.formats import CsvSink
 from catstream.video.demo import write
-from catstream.video.results import read_tracks
 
 _REST = 200  # frames after the last kill: a fast pipeline continues until the kill takes effect
 TRACK = [sys.executable, "-P", "-c", "from catstream.cli import main; main()", "track"]
@@ -44,7 +44,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     seconds = [watched(resumed, out, chance.randrange(most)) for _ in range(moments - 1)]
     seconds.append(watched(resumed, out, None))
 
-    rows = [(track.frame, track.object) for track in read_tracks(out, video.stem)]
+    rows = [(track.frame, track.object) for track in CsvSink.tracks(out / f"{video.stem}.csv")]
     lost, twice = frames * len(boxes) - len(set(rows)), len(rows) - len(set(rows))
     stored = CheckpointStore(kept / TREES).load(Settings()).seq
     columns = ("killed", "frames", "objects", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")

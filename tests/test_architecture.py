@@ -59,7 +59,7 @@ IMPORTERS = {
     "fsspec": ["catstream/fleet/objects.py"],
     "s3fs": ["catstream/fleet/objects.py"],  # fsspec imports it
     "ray": ["catstream/fleet"],
-    "pyarrow": ["catstream/sinks/parquet.py"],
+    "pyarrow": ["catstream/sinks/made.py"],
     "supervision": ["catstream/sinks/adapters.py"],
     "av": ["catstream/video"],
     "zmq": [

@@ -162,7 +162,7 @@ def test_the_page_of_the_command_line_shows_every_command_and_option():
 
 
 def test_every_file_that_track_writes_is_explained():
-    from catstream.video.results import result_files
+    from catstream.sinks.results import result_files
 
     for of, objects in (("docs/tutorial.md", [""]), ("docs/how-to/several-objects.md", ["anna"])):
         for name in [*result_files("NAME", objects), "NAME.mp4"]:

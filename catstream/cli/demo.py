@@ -88,8 +88,8 @@ def _one(output: Path, frames: int | None, render_only: bool) -> None:
 def _several(output: Path, objects: int, frames: int | None, render_only: bool) -> None:
     """The demo with several objects."""
     from catstream.applications.evaluation.multiple import score_multiple
+    from catstream.sinks.formats import CsvSink
     from catstream.video.crowd import FRAMES, write
-    from catstream.video.results import read_tracks
 
     console, frames = Console(), frames or FRAMES
     video, truth = _rendered(console, frames, lambda done: write(output, objects, frames, done=done))
@@ -98,7 +98,7 @@ def _several(output: Path, objects: int, frames: int | None, render_only: bool) 
     tracks = output / "tracks"
     _track(video, tracks, [word for name, box in truth[0].items() for word in ("--box", f"{name}={box}")])
     found: list[dict[str, Box | None]] = [{} for _ in truth]
-    for each in read_tracks(tracks, "crowd"):
+    for each in CsvSink.tracks(tracks / "crowd.csv"):
         found[each.frame][each.object] = each.box
     scores = score_multiple(truth, found)
     console.print(

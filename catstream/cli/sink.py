@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import click
@@ -15,7 +15,7 @@ from catstream.messages.kinds import Run
 from catstream.messages.names import counted, listed
 from catstream.services.options import with_part
 from catstream.settings import Settings
-from catstream.sinks.sink import check_writable, open_sink
+from catstream.sinks.sink import check_writable, open_files, with_logs
 from catstream.wire.channels import TRAINING
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
@@ -35,7 +35,7 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
     """Write the tracks of a running pipeline to FILES, until it ends or Ctrl-C.
 
     The extension of a file selects its format; the file must not exist. Each
-    track is written when it arrives, and stays in the file however the command
+    track is written when it arrives, and stays written however the command
     ends. The pipeline does not wait; missed tracks are counted. For complete
     files use `catstream track --write`. If another run starts at the same
     endpoint, because the first one was killed, the command ends.
@@ -44,13 +44,16 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
     FILES
       .ndjson    one JSON object for each track, one per line; also .jsonl
       -          the same, on standard output
-      .json      one array of such objects, closed at the end
       .csv       a row for each track: frame, seconds, state, box, score, model version, object
       .txt       MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1
-      .sqlite    the table tracks, in write-ahead mode: it can be read meanwhile
-      .parquet   written at the end, from the rows in FILE.parquet.sqlite
       .mp4       the frames of a file or folder (--source) with their tracks, with
                  the --start, --end and --stride of the pipeline; written at the end
+      .json      one array of the JSON objects
+      .sqlite    the table tracks
+      .parquet   the same table; needs pip install "catstream[parquet]"
+
+    The last three are made at the end from an .ndjson file of the same name, to
+    which the tracks are written until then; it is kept.
 
     \b
     EXAMPLES
@@ -59,7 +62,7 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
       catstream sink - | jq .box
       catstream sink walk.mp4 --source recorded/walk.avi --endpoint run
     """
-    for path in files:
+    for path in with_logs(files):
         check_writable(path)
     interrupts = Interrupts()
     interrupts.install()
@@ -68,7 +71,7 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             place = wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
-            sinks = [stack.enter_context(closing(open_sink(path, source, part))) for path in files]
+            sinks = stack.enter_context(open_files(files, source, part))
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in tracks:
                 max_repeats = max_repeats or _max_repeats(place)

@@ -119,12 +119,15 @@ def track(
     --write FILE, may be repeated; each file contains every object and frame
       .ndjson .jsonl   one JSON object per line, with the fields of a track
       -                the same, on standard output
-      .json            one array of such objects
       .csv             as OUTPUT/NAME.csv
       .txt             MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1
-      .sqlite          the table tracks; it can be read during the run
-      .parquet         needs pip install "catstream[parquet]"
       .mp4             the frames with their tracks drawn in
+      .json            one array of the JSON objects
+      .sqlite          the table tracks
+      .parquet         the same table; needs pip install "catstream[parquet]"
+
+    The last three are made at the end, from an .ndjson file of the same name,
+    which is kept: --resume continues from it.
 
     Existing files are not replaced without --overwrite.
 
@@ -195,7 +198,7 @@ def track(
         if boxes:
             raise click.UsageError(f"{_complete(pipeline, resume, output)}: no frame is left for a box")
         if not files.complete:
-            with files.opened(resume=True):  # creates new files, and closes those that were not closed
+            with files.opened(resume=True):  # creates new files, and those that are made at the end
                 pass
         console.print(_complete(pipeline, resume, output), highlight=False)
         return

@@ -13,7 +13,7 @@ from itertools import groupby
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED
 
-__all__ = ["FIRST", "by_frame", "in_order", "objects_of", "whole_frames"]
+__all__ = ["FIRST", "in_order", "objects_of", "whole_frames"]
 
 #: Stands for the objects of the frame before the first one: an object without a name is written last.
 FIRST = frozenset({UNNAMED})
@@ -29,21 +29,15 @@ def in_order(tracks: Mapping[str, Track], before: Container[str]) -> list[Track]
     return sorted(tracks.values(), key=lambda track: track.object in before)
 
 
-def by_frame(tracks: Iterable[Track]) -> Iterator[list[Track]]:
-    """Yield the tracks of each frame together."""
-    for _, group in groupby(tracks, key=lambda track: track.frame):
-        yield list(group)
-
-
 def whole_frames(tracks: Iterable[Track]) -> Iterator[list[Track]]:
     """Yield the tracks of each frame together, except for a last frame that may be incomplete."""
     before: frozenset[str] = FIRST
     waiting: list[Track] = []
-    for frame in by_frame(tracks):
+    for _, frame in groupby(tracks, key=lambda track: track.frame):
         if waiting:
             yield waiting
             before = objects_of(waiting)
-        waiting = frame
+        waiting = list(frame)
     if waiting and before <= objects_of(waiting):
         yield waiting
 

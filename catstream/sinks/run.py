@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import sys
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import partial
-from itertools import takewhile
 from pathlib import Path
-from typing import NamedTuple
 
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import ObjectPosition, Position, Track
 from catstream.messages.names import UNNAMED
 from catstream.messages.storage import is_writable, name_fits
-from catstream.sinks.frames import FIRST, by_frame, in_order, objects_of, whole_frames
-from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, file_exists, is_closed, open_sink, reader
-from catstream.video import results
+from catstream.sinks import results
+from catstream.sinks.formats import CsvSink, StdoutSink
+from catstream.sinks.frames import FIRST, in_order, objects_of, whole_frames
+from catstream.sinks.results import ResultsWriter
+from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, exists, open_files, reader, with_logs
 from catstream.video.frames import RATE
-from catstream.video.results import ResultsWriter
 
 __all__ = ["RunFiles"]
 
@@ -29,9 +27,10 @@ __all__ = ["RunFiles"]
 class RunFiles:
     """The files to which a run writes its tracks.
 
-    A resumed run continues after the last frame that all files hold whole, see `catstream.sinks.frames`. Rows after it,
-    which a power cut left in some of the files, are removed. New files, and formats that do not hold all tracks (video,
-    MOT text), start at the first frame again, with the tracks from another file.
+    A resumed run continues after the last frame that one file holds whole, see `catstream.sinks.frames`: an NDJSON file
+    if there is one, else the table of the results or a CSV file. All files are written again with the tracks of this
+    file, and take the place of the earlier ones when they have them all. So it does not matter where a crash has cut
+    the others, and a file or a format may be new.
 
     name    of the results files: that of the source
     source  of the frames of a video
@@ -80,14 +79,14 @@ class RunFiles:
                 f"results of {self.name!r} are in {str(self.output)!r} already ({', '.join(existing)}), of this source "
                 "or of another of that name: replace them all with --overwrite, or give another folder"
             )
-        for count, file in enumerate(self.files):
-            if file in self.files[:count]:
-                raise VideoError(f"{file} is named twice: give each file once")
+        if twice := [file for count, file in enumerate(self.files) if file in self.files[:count]]:
+            raise VideoError(f"{twice[0]} is named twice: give each file once")
+        for file in with_logs(self.files):
             check_writable(file, may_exist=True)
-            if file_exists(file) and not overwrite and file not in known:
+            if exists(file) and not overwrite and file not in with_logs(known):
                 raise VideoError(f"{file} exists already: replace it with --overwrite, or give another name")
         files = [file for file in self.files if file != STDOUT]
-        if resumable and self.output is None and files and not any(map(reader, files)):
+        if resumable and files and not self._logs():
             raise VideoError(
                 f"{files[0]} does not hold all tracks, so the run could not be resumed: add a file that does, "
                 "--write tracks.ndjson or --output FOLDER"
@@ -97,24 +96,23 @@ class RunFiles:
     def complete(self) -> bool:
         """Whether all files exist and are complete."""
         files = [file for file in self.files if file != STDOUT]
-        return all(is_closed(file) for file in [*files, *([self._video_file()] if self.video else [])])
+        return all(file.exists() for file in [*files, *([self._video_file()] if self.video else [])])
 
     def position(self) -> Position | None:
-        """Return the position of the last frame that all files hold; None if no file holds tracks."""
-        if self.output is None and not any(map(reader, self.files)):
+        """Return the position of the last frame that the files hold; None if no file holds all tracks."""
+        if not self._logs():
             return None
-        earlier = self._earlier()
-        frames = _common(earlier)
+        frames = 0
         boxes: dict[str, Box | None] = {}
         objects: list[str] = []
-        for tracks in _frames(earlier):
-            objects = [track.object for track in tracks]
+        for tracks in self._earlier():
+            frames, objects = tracks[0].frame + 1, [track.object for track in tracks]
             boxes |= {track.object: track.box for track in tracks if track.box is not None}
         return Position(frames, max(frames - 1, 0), {name: ObjectPosition(boxes.get(name)) for name in objects})
 
     def names(self) -> list[str]:
         """Return the names of the objects in the files, in the order in which they appeared."""
-        return list(dict.fromkeys(track.object for tracks in _frames(self._earlier()) for track in tracks))
+        return list(dict.fromkeys(track.object for tracks in self._earlier() for track in tracks))
 
     @contextmanager
     def opened(self, *, resume: bool = False) -> Iterator[Callable[[Mapping[str, Track], float], None]]:
@@ -130,43 +128,38 @@ class RunFiles:
         VideoError
             If a file cannot be written; also later, from the function and at the end.
         """
-        earlier = self._earlier() if resume else []
-        keep = _common(earlier) if resume else None
-        rows: list[ResultsWriter] = []
-        sinks: list[Sink] = []
-        restarted: list[Callable[[Sequence[Track]], None]] = []  # write to the files that start at frame 0 again
+        for file in [] if resume else [*self._discarded(), *with_logs(self.files)]:
+            discard(file)
+        files = [*self.files, *([self._video_file()] if self.video else [])]
         with ExitStack() as stack:
+            rows: list[ResultsWriter] = []
             if self.output is not None:
-                new = not (self.output / results.table_file(self.name)).exists()
-                discard(self._video_file())
-                if not resume:
-                    self._discard_objects(self.output)
-                writer = stack.enter_context(ResultsWriter(self.output, self.name, keep=keep))
-                rows.append(writer)
-                restarted += [partial(writer.write, seconds=float("nan"))] if new else []
-            for file in (*self.files, *([self._video_file()] if self.video else [])):
-                new = reader(file) is None or not file_exists(file)
-                if not resume:
-                    discard(file)
-                sink = stack.enter_context(
-                    closing(open_sink(file, self.source, self.part, image_rate=self.rate, keep=keep))
-                )
-                sinks.append(sink)
-                restarted += [sink.write] if new and file != STDOUT else []
+                rows.append(stack.enter_context(ResultsWriter(self.output, self.name, again=resume)))
+            sinks = stack.enter_context(open_files(files, self.source, self.part, image_rate=self.rate, again=resume))
+
+            def add(tracks: Sequence[Track], seconds: float, sinks: Sequence[Sink]) -> None:
+                for writer in rows:
+                    writer.write(tracks, seconds)
+                for sink in sinks:
+                    sink.write(tracks)
+
             before = FIRST
-            for tracks in _frames(earlier):
-                before = objects_of(tracks)
-                for write_again in restarted:
-                    write_again(tracks)
+            if resume:
+                repeated = [sink for sink in sinks if not isinstance(sink, StdoutSink)]
+                seconds = results.read_seconds(self.output, self.name) if self.output is not None else {}
+                for tracks in self._earlier():
+                    add(tracks, seconds.get(tracks[0].frame, math.nan), repeated)
+                    before = objects_of(tracks)
+                for each in rows:
+                    each.publish()
+                for sink in repeated:
+                    sink.publish()
 
             def write(tracks: Mapping[str, Track], seconds: float) -> None:
                 nonlocal before
                 ordered = in_order(tracks, before)
                 before = objects_of(ordered)
-                for writer in rows:
-                    writer.write(ordered, seconds)
-                for sink in sinks:
-                    sink.write(ordered)
+                add(ordered, seconds, sinks)
 
             yield write
 
@@ -179,64 +172,28 @@ class RunFiles:
         files = results.result_files(self.name, [*(self.objects or [UNNAMED]), *sorted(left)])
         return [*(self.output / file for file in files), self._video_file()]
 
-    def _discard_objects(self, folder: Path) -> None:
-        """Remove the files of objects that are to be replaced, and those of an earlier run."""
-        earlier = {track.object for track in results.read_tracks(folder, self.name)}
-        earlier |= results.objects_of(folder, self.name)
-        for name in {*self.objects, *earlier} - ({UNNAMED} & {*self.objects}):  # which the writer replaces itself
-            for file in results.object_files(self.name, name):
-                discard(folder / file)
+    def _discarded(self) -> list[Path]:
+        """Return the results files that a new run removes: the video, and the files of objects of an earlier run."""
+        if self.output is None:
+            return []
+        earlier = {track.object for track in CsvSink.tracks(self.output / results.table_file(self.name))}
+        names = {*self.objects, *earlier, *results.objects_of(self.output, self.name)}
+        names -= {UNNAMED} & {*self.objects}  # these files are replaced by those of this run
+        files = [file for name in names for file in results.object_files(self.name, name)]
+        return [self._video_file(), *(self.output / file for file in files)]
 
     def _video_file(self) -> Path:
         return (self.output or Path()) / f"{self.name}.mp4"
 
-    def _earlier(self) -> list[_Earlier]:
-        """Return the existing files that hold all tracks."""
-        found: list[_Earlier] = []
-        if self.output is not None and (self.output / results.table_file(self.name)).exists():
-            read = partial(results.read_tracks, self.output, self.name)
-            found.append(_Earlier(read, _frames_before(read, self._complete_rows(self.output, read))))
-        for file in self.files:
-            format_reader = reader(file)
-            if format_reader is not None and file_exists(file):
-                read = partial(format_reader, file)
-                found.append(_Earlier(read, _frames_before(read)))
-        return found
+    def _logs(self) -> list[tuple[Path, Callable[[Path], Iterator[Track]]]]:
+        """Return the files that hold all tracks, and the functions that read them: NDJSON first, it has all fields."""
+        logs = [(file, read) for file in with_logs(self.files) if (read := reader(file)) is not None]
+        table = [] if self.output is None else [(self.output / results.table_file(self.name), CsvSink.tracks)]
+        return sorted([*table, *logs], key=lambda log: log[1] == CsvSink.tracks)
 
-    def _complete_rows(self, folder: Path, read: Callable[[], Iterator[Track]]) -> int:
-        """Return the number of frames of which the files of all objects in the table have a row."""
-        first: dict[str, int] = {}
-        for tracks in whole_frames(read()):
-            for track in tracks:
-                first.setdefault(track.object, track.frame)
-        # Rows before the first frame of an object can be written again: they have no box.
-        rows = [max(results.complete_rows(folder, self.name, name), frame) for name, frame in first.items()]
-        return min(rows, default=0)
-
-
-class _Earlier(NamedTuple):
-    """A file with the tracks of the earlier part of a run.
-
-    read    yields its tracks
-    frames  number of the last whole frame that it holds, plus one
-    """
-
-    read: Callable[[], Iterator[Track]]
-    frames: int
-
-
-def _frames_before(read: Callable[[], Iterator[Track]], end: int = sys.maxsize) -> int:
-    """Return the number of the last whole frame before `end`, plus one."""
-    return max((tracks[0].frame + 1 for tracks in whole_frames(read()) if tracks[0].frame < end), default=0)
-
-
-def _common(earlier: Sequence[_Earlier]) -> int:
-    """Return the number of the last whole frame that all files hold, plus one."""
-    return min((file.frames for file in earlier), default=0)
-
-
-def _frames(earlier: Sequence[_Earlier]) -> Iterator[list[Track]]:
-    """Yield the tracks of each frame that all files hold."""
-    if earlier:
-        end = _common(earlier)
-        yield from takewhile(lambda tracks: tracks[0].frame < end, by_frame(earlier[0].read()))
+    def _earlier(self) -> Iterator[list[Track]]:
+        """Yield the tracks of each frame that the earlier part of this run has written whole."""
+        for file, read in self._logs():
+            if file.exists():
+                return whole_frames(read(file))
+        return iter(())

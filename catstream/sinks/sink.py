@@ -1,36 +1,38 @@
 """The file formats of tracks, selected by the suffix of the file.
 
 tracks.ndjson    a JSON object on each line, with the fields of `Track`; also tracks.jsonl, and - for standard output
-tracks.json      one array of such objects
 tracks.csv       a row for each object and frame, as in the results of `catstream track`
 tracks.txt       MOT text, as the tools of MOTChallenge read it
-tracks.sqlite    a table in a database that other programs may read meanwhile
-tracks.parquet   a column store, written when it is closed
 walk.mp4         the video with the tracks drawn in
+tracks.json      and .sqlite, .parquet: made at the end from tracks.ndjson, see `catstream.sinks.made`
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from catstream.errors import VideoError, require_extra
 from catstream.messages.kinds import Track
 from catstream.messages.storage import why_not_writable
-from catstream.sinks import parquet
-from catstream.sinks.csv import CsvSink
-from catstream.sinks.json import JsonSink, NdjsonSink, StdoutSink
-from catstream.sinks.mot import MotSink
-from catstream.sinks.sqlite import SqliteSink
+from catstream.sinks.formats import CsvSink, MotSink, NdjsonSink, StdoutSink
+from catstream.sinks.lines import LineSink
+from catstream.sinks.made import MADE, make
 from catstream.sinks.video import VideoSink
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 
-__all__ = ["STDOUT", "SUFFIXES", "Sink", "check_writable", "discard", "file_exists", "is_closed", "open_sink", "reader"]
+__all__ = ["STDOUT", "SUFFIXES", "Sink", "check_writable", "discard", "exists", "open_files", "reader", "with_logs"]
 
 #: Stands for standard output in place of a file.
 STDOUT = Path("-")
+
+_FORMATS: dict[str, type[LineSink]] = {".ndjson": NdjsonSink, ".jsonl": NdjsonSink, ".csv": CsvSink, ".txt": MotSink}
+
+#: The suffixes of all formats.
+SUFFIXES = (*_FORMATS, ".mp4", *MADE)
 
 
 class Sink(Protocol):
@@ -39,37 +41,15 @@ class Sink(Protocol):
     def write(self, tracks: Sequence[Track]) -> None:
         """Add the tracks of a frame; raise VideoError if they cannot be written."""
 
+    def publish(self) -> None:
+        """Take the place of a file that is written again; raise VideoError if that is impossible."""
+
     def close(self) -> None:
         """Complete the file; raise VideoError if it cannot be written. The tracks written before remain."""
 
 
-class _Format(NamedTuple):
-    """A file format.
-
-    create  opens a sink: `create(path, keep)`, see `open_sink`
-    tracks  reads the tracks of a file; None if the format does not hold all fields
-    """
-
-    create: Callable[[Path, int | None], Sink]
-    tracks: Callable[[Path], Iterator[Track]] | None
-
-
-_FORMATS = {
-    ".ndjson": _Format(NdjsonSink, NdjsonSink.tracks),
-    ".jsonl": _Format(NdjsonSink, NdjsonSink.tracks),
-    ".json": _Format(JsonSink, JsonSink.tracks),
-    ".csv": _Format(CsvSink, CsvSink.tracks),
-    ".txt": _Format(MotSink, None),
-    ".sqlite": _Format(SqliteSink, SqliteSink.tracks),
-    ".parquet": _Format(parquet.ParquetSink, parquet.ParquetSink.tracks),
-}
-
-#: The suffixes of all formats.
-SUFFIXES = (*_FORMATS, ".mp4")
-
-
 def check_writable(path: Path, *, may_exist: bool = False) -> None:
-    """Raise VideoError if a sink cannot be opened.
+    """Raise VideoError if a file cannot be written, or if it exists and may not.
 
     Parameters
     ----------
@@ -79,7 +59,7 @@ def check_writable(path: Path, *, may_exist: bool = False) -> None:
         return
     if path.suffix not in SUFFIXES:
         raise VideoError(f"{path}: the name of a file for tracks ends with {', '.join(SUFFIXES)}, or is - for stdout")
-    if not may_exist and file_exists(path):
+    if not may_exist and path.exists():
         raise VideoError(f"{path} exists already: give another name, or remove it")
     if path.suffix == ".parquet":
         require_extra("parquet")
@@ -87,61 +67,74 @@ def check_writable(path: Path, *, may_exist: bool = False) -> None:
         raise VideoError(reason)
 
 
-def file_exists(path: Path) -> bool:
-    """Return whether a file exists, or one that belongs to it."""
-    return path != STDOUT and any(file.exists() for file in _files(path))
+def exists(path: Path) -> bool:
+    """Return whether a file exists; standard output is none."""
+    return path != STDOUT and path.exists()
 
 
-def is_closed(path: Path) -> bool:
-    """Return whether a file exists and is complete: no file that belongs to it is left beside it."""
-    return path.exists() and not any(file.exists() for file in _files(path)[1:])
+def with_logs(paths: Sequence[Path]) -> list[Path]:
+    """Return the files, and the NDJSON files from which some of them are made, each once."""
+    return list(dict.fromkeys([*paths, *map(_log, paths)]))
 
 
 def reader(path: Path) -> Callable[[Path], Iterator[Track]] | None:
     """Return the function that reads the tracks of such a file; None if the format does not hold them all."""
-    return _FORMATS[path.suffix].tracks if path.suffix in _FORMATS and path != STDOUT else None
+    form = _FORMATS.get(path.suffix)
+    return form.tracks if form in (NdjsonSink, CsvSink) else None
 
 
-def open_sink(
-    path: Path,
+@contextmanager
+def open_files(
+    paths: Sequence[Path],
     source: str | None = None,
     part: slice = ALL_FRAMES,
     *,
     image_rate: float = RATE,
-    keep: int | None = None,
-) -> Sink:
-    """Open a file for tracks in the format of its suffix.
+    again: bool = False,
+) -> Iterator[list[Sink]]:
+    """Open files for tracks, each in the format of its suffix; at the end close them, and make the other formats.
 
     Parameters
     ----------
     source, part, image_rate : those of the pipeline; the frames of a video are read again from there
-    keep : continue an existing file after its tracks of the frames before this one, if its format holds all tracks;
-        None for a new file
+    again : whether existing files are written again, see `LineFile`; otherwise a file must not exist
 
     Raises
     ------
     VideoError
-        If a new file exists already or cannot be written, its suffix is unknown, or the source cannot be read.
+        If a file exists already or cannot be written, its suffix is unknown, or the source cannot be read.
     """
-    check_writable(path, may_exist=keep is not None)
+    for path in with_logs(paths):
+        check_writable(path, may_exist=again)
+        if again and path.suffix not in _FORMATS:  # these are there only if they are complete
+            discard(path)
+    with ExitStack() as stack:
+        logs = dict.fromkeys(map(_log, paths))
+        sinks = [stack.enter_context(closing(_open(path, source, part, image_rate, again))) for path in logs]
+        try:
+            yield sinks
+        finally:
+            stack.close()
+            for path in paths:
+                if path.suffix in MADE:
+                    make(path, _log(path))
+
+
+def _open(path: Path, source: str | None, part: slice, image_rate: float, again: bool) -> Sink:
     if path == STDOUT:
         return StdoutSink(path)
     if path.suffix == ".mp4":
         if source is None:
             raise VideoError(f"{path} needs the frames: give their source (--source)")
         return VideoSink(path, source, part, image_rate)
-    form = _FORMATS[path.suffix]
-    if form.tracks is None and keep is not None:
-        discard(path)
-        keep = None
     try:
-        return form.create(path, keep)
+        return _FORMATS[path.suffix](path, again=again)
     except OSError as error:
         raise VideoError(f"cannot write {path} ({error.strerror}): give a path that you may write to") from None
 
 
 def discard(path: Path) -> None:
-    """Remove a file for tracks and the files that belong to it, if they exist.
+    """Remove a file for tracks, if it exists.
 
     Raises
     ------
@@ -149,16 +142,12 @@ def discard(path: Path) -> None:
         If it cannot be removed.
     """
     try:
-        for file in _files(path) if path != STDOUT else ():
-            file.unlink(missing_ok=True)
+        if path != STDOUT:
+            path.unlink(missing_ok=True)
     except OSError as error:
         raise VideoError(f"cannot replace {path} ({error.strerror}): give another name") from None
 
 
-def _files(path: Path) -> list[Path]:
-    """Return a file for tracks and the files beside it that hold some of the tracks until it is closed."""
-    if path.suffix == ".sqlite":
-        return [path, *(path.with_name(path.name + end) for end in ("-wal", "-shm"))]
-    if path.suffix == ".parquet":
-        return [path, *_files(parquet.database_of(path))]
-    return [path]
+def _log(path: Path) -> Path:
+    """Return the file to which tracks are written during a run: of a format that is made at the end, an NDJSON file."""
+    return path.with_suffix(".ndjson") if path.suffix in MADE else path

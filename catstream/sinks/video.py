@@ -53,6 +53,9 @@ class VideoSink:
                 self._frame = self._read(track.frame)
             self._tracks.append(track)
 
+    def publish(self) -> None:
+        """Do nothing: a video gets its name when it is closed."""
+
     def close(self) -> None:
         """Finish the video."""
         try:

@@ -59,7 +59,6 @@ def written(folder, errors):
     with open_source(str(folder / "walk.mp4")) as shown:
         assert sum(1 for _ in shown) == len(frames)
     assert (folder / "t.parquet").stat().st_size > 0
-    assert not (folder / "tracks.sqlite-wal").exists()
     return frames
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.video.results import ResultsWriter, complete_rows
+from catstream.sinks.results import ResultsWriter, read_seconds
 
 BOX = Box(1, 2, 3.5, 4.25)
 
@@ -79,9 +78,11 @@ def test_each_object_with_a_name_has_its_own_files_with_a_row_for_every_frame(tm
 
 def test_a_file_of_something_else_that_has_the_name_of_an_object_file_is_kept(tmp_path, caplog):
     (tmp_path / "walk-2.txt").write_text("dear to somebody")
-    for keep in (None, 1):
-        with ResultsWriter(tmp_path, "walk", keep=keep) as results:
-            results.write([named("2", keep or 0), named("anna", keep or 0)], 0.01)
+    for again in (False, True):
+        with ResultsWriter(tmp_path, "walk", again=again) as results:
+            for frame in range(1 + again):
+                results.write([named("2", frame), named("anna", frame)], 0.01)
+            results.publish()
     assert (tmp_path / "walk-2.txt").read_text() == "dear to somebody"
     assert "the boxes of 2 are in walk.csv only" in caplog.text
     assert len(rows(tmp_path / "walk-anna.txt")) == 2
@@ -90,11 +91,11 @@ def test_a_file_of_something_else_that_has_the_name_of_an_object_file_is_kept(tm
 
 def test_an_object_that_begins_under_a_name_too_long_for_a_file_is_in_the_table(tmp_path, caplog):
     source, name = "walk" * 45, "a" * 64
-    for keep in (None, 1):
-        with ResultsWriter(tmp_path, source, keep=keep) as results:
-            results.write([named(name, keep or 0)], 0.01)
+    for again in (False, True):
+        with ResultsWriter(tmp_path, source, again=again) as results:
+            results.write([named(name, 0)], 0.01)
+            results.publish()
     assert f"the boxes of {name} are in {source}.csv only" in caplog.text
-    assert complete_rows(tmp_path, source, name) == sys.maxsize
     assert [file.name for file in tmp_path.iterdir()] == [f"{source}.csv"]
 
 
@@ -113,7 +114,7 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
     results.write([track(0)], 0.01)
     full(tmp_path / file)
     for last in (lambda: results.write([track(1)], 0.01), results.close):  # which tries it once more
-        with pytest.raises(VideoError, match=r"cannot write results to .* any more: No space left on device$"):
+        with pytest.raises(VideoError, match=rf"cannot write to .*/{file} any more: No space left on device$"):
             last()
     assert len((tmp_path / file).read_text().splitlines()) == 1 + (file == "walk.csv")
 
@@ -131,3 +132,15 @@ def test_a_path_that_cannot_be_written_is_an_error_at_once(tmp_path):
     (tmp_path / "out" / "walk.csv").mkdir(parents=True)
     with pytest.raises(VideoError, match="cannot write results"):
         ResultsWriter(tmp_path / "out", "walk")
+
+
+def test_processing_times_are_read_back_except_for_damaged_rows(tmp_path):
+    with ResultsWriter(tmp_path, "walk") as results:
+        results.write([named("anna", 0)], 0.25)
+        results.write([named("anna", 1), named("ben", 1)], 0.5)
+        results.write([named("ben", 2)], 0.75)
+    assert read_seconds(tmp_path, "walk") == {0: 0.25, 1: 0.5, 2: 0.75}
+    file = tmp_path / "walk-ben_time.value"
+    file.write_bytes(file.read_bytes().removesuffix(b"00\n"))
+    assert read_seconds(tmp_path, "walk") == {0: 0.25, 1: 0.5}
+    assert read_seconds(tmp_path / "none", "walk") == {}
