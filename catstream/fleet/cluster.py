@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from catstream.errors import FleetError, require_extra
 from catstream.fleet.life import Node
 
-__all__ = ["NAMESPACE", "connect", "disconnect", "is_local", "nodes"]
+__all__ = ["NAMESPACE", "actor_name", "actors", "connect", "disconnect", "fleets", "is_local", "nodes"]
 
 #: Namespace of the named actors of all fleets.
 NAMESPACE = "catstream"
@@ -85,6 +85,32 @@ def is_local() -> bool:
 
     host: str = ray.get_runtime_context().gcs_address.rpartition(":")[0]
     return host in ("127.0.0.1", "localhost", "::1")
+
+
+def actor_name(fleet: str, kind: str, stream: str = "") -> str:
+    """The name of an actor: of the controller, or of a stream.
+
+    >>> actor_name("site", "stream", "cam-7"), actor_name("site", "controller")
+    ('site/stream/cam-7', 'site/controller')
+    """
+    return "/".join(filter(None, (fleet, kind, stream)))
+
+
+def actors(fleet: str) -> set[str]:
+    """The streams of a fleet that have an actor."""
+    prefix = actor_name(fleet, "stream") + "/"
+    return {name.removeprefix(prefix) for name in _names() if name.startswith(prefix)}
+
+
+def fleets() -> list[str]:
+    """The fleets that have a controller."""
+    return sorted(name.removesuffix("/controller") for name in _names() if name.endswith("/controller"))
+
+
+def _names() -> list[str]:
+    from ray.util import list_named_actors
+
+    return [each["name"] for each in list_named_actors(all_namespaces=True) if each["namespace"] == NAMESPACE]
 
 
 def nodes() -> list[Node]:

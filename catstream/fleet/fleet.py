@@ -26,8 +26,8 @@ from typing import Any, Self
 from catstream.client.registry import REGISTRY_PORT
 from catstream.errors import CatstreamError, FleetError, require_extra
 from catstream.fleet import cluster
-from catstream.fleet.cluster import NAMESPACE
-from catstream.fleet.controller import Controller, actor_name
+from catstream.fleet.cluster import NAMESPACE, actor_name
+from catstream.fleet.controller import Controller
 from catstream.fleet.local import LocalCluster
 from catstream.fleet.merge import Merged, merge_streams
 from catstream.fleet.spec import FleetSpec, StreamSpec
@@ -42,7 +42,6 @@ __all__ = ["Fleet"]
 _ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
 _DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
 _TURN_SECONDS = 0.2
-_CONTROLLER = "/controller"  # how the names of the controllers end
 
 
 class Fleet:
@@ -133,9 +132,7 @@ class Fleet:
                     self.is_owner = not detach
                 self._start_controller(spec)
                 models = _models(spec.streams.values())
-                lines: list[str] = self._ask(
-                    "apply", spec.to_json(), models, self._origin, replace_other=replace, may_wait=wait
-                )
+                lines: list[str] = self._ask("apply", spec, models, self._origin, replace_other=replace, may_wait=wait)
             except BaseException:
                 if self._local is not None and began:
                     self.is_owner = False  # there is nothing to be stored
@@ -184,7 +181,7 @@ class Fleet:
         object : str
             Name of the object; "" also means the only object of each stream.
         """
-        spec = FleetSpec.from_json(self._ask("spec"))
+        spec: FleetSpec = self._ask("spec")
         for name in names:
             if name not in spec.streams:
                 raise FleetError(f"there is no stream {name!r}: the streams are {', '.join(spec.streams) or 'none'}")
@@ -325,15 +322,10 @@ class Fleet:
 
     def _only_fleet(self) -> str:
         """The name of the only fleet of the connected cluster."""
-        from ray.util import list_named_actors
-
-        actors = [each["name"] for each in list_named_actors(all_namespaces=True) if each["namespace"] == NAMESPACE]
-        names: list[str] = sorted(each.removesuffix(_CONTROLLER) for each in actors if each.endswith(_CONTROLLER))
-        if len(names) != 1:
-            listed = f"say which (--name), there are {', '.join(names)}"
-            known = listed if names else "start one with catstream fleet up"
-            raise FleetError(f"{len(names)} fleets run on the cluster at {self._address}: {known}")
-        return names[0]
+        if len(names := cluster.fleets()) == 1:
+            return names[0]
+        known = f"say which (--name), there are {', '.join(names)}" if names else "start one with catstream fleet up"
+        raise FleetError(f"{len(names)} fleets run on the cluster at {self._address}: {known}")
 
 
 def _home() -> Path:

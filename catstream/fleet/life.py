@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 __all__ = [
     "EVENTS",
+    "PAUSE_SECONDS",
     "SILENT_SECONDS",
     "STATES",
     "TABLE",
@@ -21,11 +22,11 @@ __all__ = [
     "Order",
     "Seen",
     "State",
+    "Step",
     "Wanted",
     "diagram",
+    "diff",
     "event",
-    "objection",
-    "shortage",
 ]
 
 State = Literal["absent", "pending", "working", "stopping"]
@@ -72,6 +73,7 @@ TABLE: dict[tuple[State, Event], tuple[State, Action]] = {
 
 #: Seconds after which an actor in a state counts as silent: a busy machine may be slow to answer.
 SILENT_SECONDS: dict[State, float] = {"working": 120.0, "stopping": 30.0}
+PAUSE_SECONDS = 5.0  # between two starts of one actor, at least: one may die each time, or be superseded
 _ADOPTED_SECONDS = 30.0  # within which an actor that an earlier controller started says what it was started for
 
 #: Label that Ray gives to each node: its id.
@@ -150,7 +152,7 @@ class Seen:
     """An actor, as its controller sees it.
 
     state       its state
-    since       moment at which the state began
+    since       moment at which the state began; of one that is absent, the moment of its last start
     answered    moment of its last answer
     order       what it was started for; None for one that an earlier controller started and that has not reported yet
     node        id of the node that it reported from; "" if it has not reported since it was placed
@@ -158,33 +160,58 @@ class Seen:
     """
 
     state: State
-    since: float = 0.0
+    since: float = float("-inf")
     answered: float = 0.0
     order: Order | None = None
     node: str = ""
     happened: Event | Literal[""] = ""
 
 
-def event(wanted: Wanted | None, seen: Seen | None, nodes: Collection[Node], now: float) -> Event | None:
-    """What happens to a stream now; None for nothing.
+class Step(NamedTuple):
+    """What happens to a stream, its state after that, and what is to be done."""
+
+    event: Event
+    after: State
+    action: Action
+
+
+def diff(
+    wanted: Mapping[str, Wanted], seen: Mapping[str, Seen], nodes: Collection[Node], now: float
+) -> dict[str, Step]:
+    """What makes the actors those that should run, by stream.
 
     Parameters
     ----------
-    wanted : the stream as it should run; None if it should not
-    seen : its actor; None if there is none
+    wanted : the streams that should run
+    seen : the actors; none is the same as one that is absent
     nodes : of the cluster
     now : the time, by the clock of `Seen`
 
     Examples
     --------
+    >>> diff({"gate": Wanted("a1")}, {}, [], 0.0)
+    {'gate': Step(event='wanted', after='pending', action='start')}
+    >>> diff({}, {"roof": Seen("working", 0.0, 0.0)}, [], 0.0)
+    {'roof': Step(event='unwanted', after='stopping', action='stop')}
+    """
+    steps = {}
+    for name in sorted(wanted.keys() | seen.keys()):
+        actor = seen.get(name, Seen("absent"))
+        happened = event(wanted.get(name), actor, nodes, now)
+        if happened is not None and (actor.state, happened) in TABLE:
+            steps[name] = Step(happened, *TABLE[actor.state, happened])
+    return steps
+
+
+def event(wanted: Wanted | None, seen: Seen, nodes: Collection[Node], now: float) -> Event | None:
+    """What happens to a stream now; None for nothing. The parameters are those of `diff`.
+
     >>> anywhere = Wanted("a1")
-    >>> event(anywhere, None, [], 0.0)
-    'wanted'
     >>> event(anywhere, Seen("working", node="1", order=anywhere.order([])), [Node("n1", "1", draining=True)], 0.0)
     'unwanted'
     """
-    if seen is None:
-        return "wanted" if wanted is not None else None
+    if seen.state == "absent":
+        return "wanted" if wanted is not None and now - seen.since >= PAUSE_SECONDS else None
     if seen.happened == "gone":
         return "gone"
     last = seen.since if seen.state == "stopping" else seen.answered
@@ -205,42 +232,6 @@ def _is_as_wanted(wanted: Wanted, seen: Seen, nodes: Collection[Node], now: floa
     if node is None:
         return seen.order.selector == order.selector
     return wanted.fits(node) and wanted.target(nodes) in (None, node)
-
-
-def objection(name: str, wanted: Wanted, nodes: Collection[Node]) -> str:
-    """Why a stream can run on no node, even if no other stream ran; empty if it can.
-
-    >>> objection("cam-7", Wanted("a1", 4.0), [Node("n1", "1", cores=2.0)])
-    'cam-7 needs 4 cores, and the largest node that it may run on, n1, has 2'
-    >>> objection("cam-7", Wanted("a1", labels={"site": "north"}), [Node("n1", "1")])
-    'cam-7 needs a node with site=north, and there is none: there are n1'
-    """
-    alive = [node for node in nodes if node.alive]
-    fitting = [node for node in alive if wanted.fits(node)]
-    if not fitting:
-        labels = ", ".join(f"{key}={value}" for key, value in wanted.labels.items())
-        needed = f"a node with {labels}" if labels else "a node that is not drained"
-        return f"{name} needs {needed}, and there is none: there are {', '.join(node.name for node in alive) or 'none'}"
-    largest = max(fitting, key=lambda node: node.cores)
-    if largest.cores < wanted.cores:
-        return (
-            f"{name} needs {wanted.cores:g} cores, and the largest node that it may run on, {largest.name}, has "
-            f"{largest.cores:g}"
-        )
-    return ""
-
-
-def shortage(wanted: Collection[Wanted], nodes: Collection[Node]) -> str:
-    """Why streams cannot all run at the same time; empty if they can, as far as the sums of cores say.
-
-    >>> shortage([Wanted("a", 1.0)] * 20, [Node("n1", "1", cores=2.0)])
-    'the 20 streams need 20 cores, and the nodes have 2'
-    """
-    needed = sum(each.cores for each in wanted)
-    there = sum(node.cores for node in nodes if node.alive and not node.draining)
-    if needed <= there + 1e-6:
-        return ""
-    return f"the {len(wanted)} streams need {needed:g} cores, and the nodes have {there:g}"
 
 
 def diagram() -> str:

@@ -1,4 +1,4 @@
-"""Objects in a folder or an S3 bucket: created exclusively, with time limits, and without a credential in a message.
+"""Objects in a folder or an S3 bucket: created exclusively and never changed, without a credential in a message.
 
 fsspec finds the credentials of S3 in the environment, in ~/.aws or in the machine's role, and the address of another
 server in AWS_ENDPOINT_URL. They are not part of the URL, which is shown in messages.
@@ -11,15 +11,15 @@ import errno
 import logging
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import urlsplit
 
 from catstream.errors import FleetError, StoreError, require_extra
 from catstream.messages import storage
 
-__all__ = ["FsspecObjects"]
+__all__ = ["Objects"]
 
 _SECONDS = 10  # limit of a whole call
 _CONNECT_SECONDS = 3
@@ -31,11 +31,12 @@ _CODE = re.compile(r"\w{1,64}")
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS}
 
-_T = TypeVar("_T")
 
-
-class FsspecObjects:
+class Objects:
     """The objects below a folder or a prefix of a bucket.
+
+    Every method raises StoreError if the store cannot be reached or is full; a call that creates an object may
+    nevertheless have created it.
 
     Parameters
     ----------
@@ -43,99 +44,88 @@ class FsspecObjects:
     """
 
     def __init__(self, url: str) -> None:
-        scheme, root = _parse(url)
+        scheme, self._root = _parse(url)
         self._local = scheme == "file"
-        self._url = root if self._local else f"s3://{root}"
-        self._root = root
+        self._url = self._root if self._local else f"s3://{self._root}"
         self._fs = _local() if self._local else _s3()
         #: Argument of each call of fsspec: it limits calls over a network, which run in a thread of fsspec.
         self._limit: dict[str, Any] = {} if self._local else {"timeout": _SECONDS}
+        self._checked = False
 
     def __repr__(self) -> str:
-        return f"FsspecObjects({self._url!r})"
+        return f"Objects({self._url!r})"
 
     def make(self) -> None:
-        """Create the folder of the store. A bucket has to exist."""
+        """Create the folder of the store, and check it. A bucket has to exist."""
         if self._local:
-            self._call("", "created", lambda path: Path(path).mkdir(parents=True, exist_ok=True))
-
-    def check(self) -> None:
-        """Check that the store is there and that it creates objects exclusively.
-
-        Raises
-        ------
-        StoreError
-            If it does not.
-        """
-        if self._local:
-            if not Path(self._root).is_dir():
-                raise StoreError(f"the store {self._url} is not a folder on this machine: is its file system mounted?")
-            return
-        for _ in range(2):  # the first time, the object does not exist yet
-            try:
-                self.create(_PROBE, b"")
-            except FileExistsError:
-                return
-        raise StoreError(
-            f"the server of the store {self._url} ignores If-None-Match, so that two processes could write the state "
-            "of one stream: use a server that supports it, such as AWS S3 or a current MinIO"
-        )
+            with self._path("", "created") as path:
+                Path(path).mkdir(parents=True, exist_ok=True)
+        self._check()
 
     def create(self, name: str, data: bytes) -> None:
-        """Create an object; see `catstream.fleet.states.Objects`."""
+        """Create an object; FileExistsError if there is one of this name."""
+        if not self._checked:
+            self._check()
+        self._create(name, data)
 
-        def created(path: str) -> None:
+    def read(self, name: str) -> bytes:
+        """Return the content of an object; FileNotFoundError if there is none."""
+        with self._path(name, "read", FileNotFoundError) as path:
+            content: bytes = self._fs.cat_file(path, **self._limit)
+            return content
+
+    def names(self, folder: str) -> list[str]:
+        """Return the names of all objects below a folder, without the name of the folder."""
+        with self._path(folder, "listed") as path:
+            return [found[len(path) + 1 :] for found in self._fs.find(path, **self._limit)]
+
+    def remove(self, name: str) -> None:
+        """Remove an object, if it exists, and its folder if that is empty then."""
+        with contextlib.suppress(FileNotFoundError), self._path(name, "removed", FileNotFoundError) as path:
+            self._fs.rm_file(path, **self._limit)
+            if self._local:
+                with contextlib.suppress(OSError):  # it is not empty
+                    Path(path).parent.rmdir()
+
+    def tidy(self, folder: str) -> None:
+        """Remove the old parts of files that killed processes left in a folder. S3 keeps no part of an object."""
+        if self._local:
+            with self._path(folder, "tidied") as path:
+                for each in {found.parent for found in Path(path).rglob(".*.part")}:
+                    storage.remove_parts(each, _ABANDONED_SECONDS)
+
+    def _check(self) -> None:
+        """Raise StoreError if the store is not there, or does not create objects exclusively."""
+        if self._local and not Path(self._root).is_dir():
+            raise StoreError(f"the store {self._url} is not a folder on this machine: is its file system mounted?")
+        if not self._local and not (self._exists_already(_PROBE) or self._exists_already(_PROBE)):
+            raise StoreError(
+                f"the server of the store {self._url} ignores If-None-Match, so that two processes could write the "
+                "state of one stream: use a server that supports it, such as AWS S3 or a current MinIO"
+            )
+        self._checked = True
+
+    def _exists_already(self, name: str) -> bool:
+        """Whether an object cannot be created because it exists; otherwise it is created."""
+        try:
+            self._create(name, b"")
+        except FileExistsError:
+            return True
+        return False
+
+    def _create(self, name: str, data: bytes) -> None:
+        with self._path(name, "written", FileExistsError) as path:
             if self._local:
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
                 storage.create_atomically(path, data)
             else:
                 self._fs.pipe_file(path, data, mode="create", **self._limit)
 
-        self._call(name, "written", created, passed=FileExistsError)
-
-    def read(self, name: str) -> bytes:
-        """Return the content of an object."""
-        read: Callable[[str], bytes] = lambda path: self._fs.cat_file(path, **self._limit)  # noqa: E731
-        return self._call(name, "read", read, passed=FileNotFoundError)
-
-    def names(self, folder: str) -> list[str]:
-        """Return the names of all objects below a folder, without the name of the folder."""
-        found = self._call(folder, "listed", lambda path: self._fs.find(path, **self._limit))
-        start = len(f"{self._root}/{folder}/")
-        return [path[start:] for path in found]
-
-    def remove(self, name: str) -> None:
-        """Remove an object, if it exists, and its folder if that is empty then."""
-
-        def removed(path: str) -> None:
-            self._fs.rm_file(path, **self._limit)
-            if self._local:
-                with contextlib.suppress(OSError):  # it is not empty
-                    Path(path).parent.rmdir()
-
-        with contextlib.suppress(FileNotFoundError):
-            self._call(name, "removed", removed, passed=FileNotFoundError)
-
-    def tidy(self, folder: str) -> None:
-        """Remove the old parts of files that killed processes left. S3 keeps no part of an object."""
-
-        def tidied(path: str) -> None:
-            for each in {found.parent for found in Path(path).rglob(".*.part")}:
-                storage.remove_parts(each, _ABANDONED_SECONDS)
-
-        if self._local:
-            self._call(folder, "tidied", tidied)
-
-    def _call(
-        self,
-        name: str,
-        what: str,
-        function: Callable[[str], _T],
-        passed: type[OSError] | tuple[type[OSError], ...] = (),
-    ) -> _T:
-        """Call a function with the path of an object; every error except those of the type `passed` is a StoreError."""
+    @contextlib.contextmanager
+    def _path(self, name: str, what: str, passed: type[OSError] | tuple[()] = ()) -> Iterator[str]:
+        """The path of an object; in the block, every error except those of the type `passed` becomes a StoreError."""
         try:
-            return function(f"{self._root}/{name}")
+            yield f"{self._root}/{name}"
         except Exception as error:
             code = _code(error)
             if code == "ConditionalRequestConflict":  # another process creates the same object at this moment

@@ -23,15 +23,17 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-import math
 import re
 import reprlib
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import Meta
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, FleetError
@@ -40,15 +42,38 @@ from catstream.run.job import Job
 from catstream.settings import Settings
 from catstream.video.source import is_live
 
-__all__ = ["FleetSpec", "StreamSpec"]
+__all__ = ["FleetSpec", "StreamSpec", "check_fleet_name", "from_json", "to_json"]
+
+_T = TypeVar("_T")
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
-_REGISTRY = re.compile(r"[A-Za-z0-9_.-]+:[0-9]{1,5}")
 _STREAM_HEADER = re.compile(r"\s*\[\s*streams\s*\.\s*[\"']?([\w.-]+)")
-_MOST_NODES = 64  # on one machine
-_FLEET_KEYS = ("name", "store", "every", "nodes", "registry", "keys")
-_EVERY = 5.0
-_LONGEST_EVERY = 3600.0
+_HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]
+_CORES = Annotated[float, Meta(gt=0, le=4096)]
+
+#: The type of each key of a fleet, and what its value must be.
+_FLEET: dict[str, tuple[Any, str]] = {
+    "name": (str, "a text"),
+    "store": (str, "a text"),
+    "every": (Annotated[float, Meta(gt=0, le=3600)], "a number of seconds above 0 and at most 3600"),
+    "nodes": (Annotated[int, Meta(ge=1, le=64)], "a whole number from 1 to 64"),
+    "registry": (_HOST_AND_PORT, "HOST:PORT of a node, as in 10.0.0.1:5690"),
+    "keys": (str, "a text"),
+    "streams": (dict[str, Any], "tables [streams.NAME]"),
+}
+
+#: The same of a stream.
+_STREAM: dict[str, tuple[Any, str]] = {
+    "source": (str, "a text"),
+    "box": (Any, ""),
+    "boxes": (dict[str, Any], "a table, for example { anna = [120, 80, 64, 48] }"),
+    "model": (str, "a text"),
+    "models": (dict[str, str], 'a table of texts, for example { anna = "anna.safetensors" }'),
+    "settings": (dict[str, Any], 'a table, for example { "coreset.size" = 128 }'),
+    "cores": (_CORES, "a number above 0 (catstream fleet status shows what it uses)"),
+    "labels": (dict[str, str], 'a table of texts, for example { site = "north" }'),
+    "follow": (str | list[Annotated[str, Meta(min_length=1)]], 'names of objects, for example ["anna"]'),
+}
 
 #: Settings that the fleet sets for each stream.
 _OWN_SETTINGS = ("run.endpoint", "run.keys")
@@ -83,15 +108,15 @@ class StreamSpec:
     source: str = field(repr=False)  # it may contain a password
     boxes: dict[str, Box] = field(default_factory=dict)
     models: dict[str, Path] = field(default_factory=dict)
-    settings: dict[str, object] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
     cores: float = 1.0
     labels: dict[str, str] = field(default_factory=dict)
     follow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_fleet_name(self.name, "stream")
-        with _errors_about(self.name):
-            if not isinstance(self.source, str) or not self.source.strip():
+        check_fleet_name(self.name, "stream")
+        with _errors_in(f"the stream {self.name}"):
+            if not self.source.strip():
                 raise FleetError(
                     "it has no source: give a text as `catstream track` takes it, for example "
                     'source = "rtsp://camera/1"'
@@ -103,27 +128,29 @@ class StreamSpec:
                 if name in self.settings:
                     raise FleetError(f"the fleet sets {name} itself: remove it from the settings")
             Job(self.source, self.boxes, self.models, settings=Settings.from_values(self.settings))
-            if not (math.isfinite(self.cores) and self.cores > 0):
-                raise FleetError(
-                    f"cores must be a number above 0, got {self.cores:g}: catstream fleet status shows what it uses"
-                )
+            _checked({"cores": self.cores}, _STREAM)
 
     @classmethod
     def parse(cls, name: str, table: Mapping[str, object], folder: Path) -> StreamSpec:
         """Make a stream from the table of a file in `folder`; the docstring of the module shows one."""
-        _check_fleet_name(name, "stream")
-        with _errors_about(name):
+        check_fleet_name(name, "stream")
+        with _errors_in(f"the stream {name}"):
             if not isinstance(table, Mapping):
                 raise FleetError(f"expected a table with a source, got {reprlib.repr(table)}: write [streams.{name}]")
-            _check_keys(table, _READERS)
+            values: dict[str, Any] = {"source": ""} | _checked(table, _STREAM)
             for one, several in (("box", "boxes"), ("model", "models")):
-                if one in table and several in table:
+                if one in values and several in values:
                     raise FleetError(f"it has both {one} and {several}: write all objects in {several}")
-            fields: dict[str, Any] = {"source": ""}
-            for key, value in table.items():
-                target, read = _READERS[key]
-                fields[target] = read(key, value, folder)
-        return cls(name, **fields)
+                values.setdefault(several, {UNNAMED: values.pop(one)} if one in values else {})
+            source, follow = values["source"], values.get("follow", ())
+            if source.strip() and not is_live(source) and "://" not in source:
+                values["source"] = str(folder / source)  # its node has another working folder
+            values["boxes"] = boxes_by_name(values["boxes"])
+            values["models"] = {check_name(each): folder / file for each, file in values["models"].items()}
+            values["settings"] = _flat(values.get("settings", {}))
+            names = [follow] if isinstance(follow, str) else follow
+            values["follow"] = tuple(dict.fromkeys(map(check_name, names)))
+        return cls(name, **values)
 
     @property
     def digest(self) -> str:
@@ -137,13 +164,6 @@ class StreamSpec:
         boxes = {name: list(map(float, box)) for name, box in self.boxes.items()}
         parts = [self.source, boxes, models, Settings.from_values(self.settings).changed()]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-
-    def table(self) -> dict[str, object]:
-        """The stream as the table of a file, with every path as it is; `parse` reads it."""
-        table: dict[str, object] = {"source": self.source, "settings": self.settings, "labels": self.labels}
-        table |= {"boxes": {name: list(box) for name, box in self.boxes.items()}, "follow": list(self.follow)}
-        table |= {"models": {name: str(file) for name, file in self.models.items()}, "cores": self.cores}
-        return {key: value for key, value in table.items() if value not in ({}, [], None)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,23 +181,16 @@ class FleetSpec:
 
     name: str
     store: str = ""
-    every: float = _EVERY
+    every: float = 5.0
     nodes: int = 1
     registry: str = ""
     keys: str = ""
     streams: dict[str, StreamSpec] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_fleet_name(self.name, "fleet")
-        if not 0 < self.every <= _LONGEST_EVERY:
-            raise FleetError(f"the fleet {self.name}: every must be above 0 and at most 3600 s, got {self.every:g}")
-        if self.registry and not _REGISTRY.fullmatch(self.registry):
-            raise FleetError(
-                f"the fleet {self.name}: registry must be HOST:PORT of a node, as in 10.0.0.1:5690, got "
-                f"{self.registry!r}"
-            )
-        if not 1 <= self.nodes <= _MOST_NODES:
-            raise FleetError(f"the fleet {self.name}: nodes must be from 1 to {_MOST_NODES}, got {self.nodes}")
+        check_fleet_name(self.name, "fleet")
+        with _errors_in(f"the fleet {self.name}"):
+            _checked({each.name: getattr(self, each.name) for each in fields(self)}, _FLEET)
 
     @classmethod
     def load(cls, path: Path) -> FleetSpec:
@@ -203,13 +216,13 @@ class FleetSpec:
                 raise FleetError(
                     'it has no streams: add a table for each, for example [streams.cam-1] with source = "demo:1"'
                 )
-            return cls._of({"name": path.stem} | tables, path.parent.absolute())
-
-    def to_json(self) -> str:
-        """The spec as JSON text with absolute paths. It contains the sources with their passwords."""
-        streams = {name: stream.table() for name, stream in self.streams.items()}
-        own = {name: getattr(self, name) for name in _FLEET_KEYS}
-        return json.dumps(own | {"streams": streams})
+            values, folder = {"name": path.stem} | _checked(tables, _FLEET), path.parent.absolute()
+            if (store := values.get("store")) and "://" not in store:
+                values["store"] = str(folder / store)
+            if keys := values.get("keys"):
+                values["keys"] = str(folder / keys)
+            streams = {name: StreamSpec.parse(name, table, folder) for name, table in values["streams"].items()}
+            return cls(**values | {"streams": streams})
 
     def changes(self, new: FleetSpec) -> list[str]:
         """Describe the change of each stream if another spec takes the place of this one, a line for each."""
@@ -224,134 +237,46 @@ class FleetSpec:
                 lines.append(f"{name}: {'is unchanged' if before == after else 'continues with its changes'}")
         return lines
 
-    @classmethod
-    def from_json(cls, text: str) -> FleetSpec:
-        """Read the text that `to_json` wrote; raise FleetError if it is damaged."""
+
+def to_json(stored: object) -> bytes:
+    """A spec, or what contains one, as JSON. It contains the sources with their passwords."""
+    return msgspec.json.encode(stored, enc_hook=str)
+
+
+def from_json(data: bytes, kind: type[_T]) -> _T:
+    """Read what `to_json` wrote; raise FleetError if it is damaged."""
+    try:
+        return msgspec.json.decode(data, type=kind, dec_hook=lambda part, value: part(value))
+    except (msgspec.DecodeError, RecursionError, CatstreamError):
+        raise FleetError("the stored streams of the fleet are damaged: apply the fleet file again") from None
+
+
+def _checked(values: Mapping[str, object], kinds: Mapping[str, tuple[Any, str]]) -> dict[str, Any]:
+    """The values of keys; FleetError if there is no such key, or its value has another type."""
+    checked = {}
+    for key, value in values.items():
+        if key not in kinds:
+            near = difflib.get_close_matches(key, kinds, n=1)
+            meant = f", did you mean {near[0]!r}?" if near else ":"
+            raise FleetError(f"there is no key {key!r}{meant} there are {', '.join(kinds)}")
+        kind, meaning = kinds[key]
         try:
-            tables = json.loads(text)
-        except (ValueError, RecursionError):
-            tables = None
-        if not isinstance(tables, dict) or "name" not in tables:
-            raise FleetError("the stored spec of the fleet is damaged: apply the fleet file again")
-        return cls._of(tables, Path("/"))
-
-    @classmethod
-    def _of(cls, tables: Mapping[str, Any], folder: Path) -> FleetSpec:
-        _check_keys(tables, (*_FLEET_KEYS, "streams"))
-        store, streams = _text("store", tables.get("store", ""), folder), tables.get("streams", {})
-        if not isinstance(streams, Mapping):
-            raise FleetError(f"streams must be tables [streams.NAME], got {reprlib.repr(streams)}")
-        return cls(
-            _text("name", tables["name"], folder),
-            store if not store or "://" in store else str(folder / store),
-            _number("every", tables.get("every", _EVERY), folder),
-            _count("nodes", tables.get("nodes", 1)),
-            _text("registry", tables.get("registry", ""), folder),
-            _path("keys", tables.get("keys", ""), folder),
-            {name: StreamSpec.parse(name, table, folder) for name, table in streams.items()},
-        )
+            checked[key] = msgspec.convert(value, kind)
+        except msgspec.ValidationError:
+            raise FleetError(f"{key} must be {meaning}, got {reprlib.repr(value)}") from None
+    return checked
 
 
-# --- values of a file ------------------------------------------------------------------------------
-
-
-def _text(key: str, value: object, _: Path) -> str:
-    if not isinstance(value, str):
-        raise FleetError(f"{key} must be a text, got {reprlib.repr(value)}")
-    return value
-
-
-def _path(key: str, value: object, folder: Path) -> str:
-    text = _text(key, value, folder)
-    return str(folder / text) if text else ""
-
-
-def _number(key: str, value: object, _: Path) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise FleetError(f"{key} must be a number, got {reprlib.repr(value)}")
-    return float(value)
-
-
-def _count(key: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise FleetError(f"{key} must be a whole number, got {reprlib.repr(value)}")
-    return value
-
-
-def _source(key: str, value: object, folder: Path) -> str:
-    """A source; the path of a file or folder is made absolute, because its node has another working folder."""
-    source = _text(key, value, folder)
-    return source if not source.strip() or is_live(source) or "://" in source else str(folder / source)
-
-
-def _table(key: str, value: object, _: Path) -> dict[str, Any]:
-    if not isinstance(value, Mapping):
-        raise FleetError(f"{key} must be a table, for example {_TABLES[key]}, got {reprlib.repr(value)}")
-    return dict(value)
-
-
-_TABLES = {
-    "boxes": "{ anna = [120, 80, 64, 48] }",
-    "models": '{ anna = "anna.safetensors" }',
-    "labels": '{ site = "north" }',
-    "settings": '{ "coreset.size" = 128 }',
-}
-
-
-def _box(_: str, value: object, folder: Path) -> dict[str, Box]:
-    return _boxes("boxes", {UNNAMED: value}, folder)
-
-
-def _boxes(key: str, value: object, folder: Path) -> dict[str, Box]:
-    return boxes_by_name(_table(key, value, folder))
-
-
-def _model(key: str, value: object, folder: Path) -> dict[str, Path]:
-    return {UNNAMED: folder / _text(key, value, folder)}
-
-
-def _models(key: str, value: object, folder: Path) -> dict[str, Path]:
-    files = _table(key, value, folder)
-    return {check_name(name): folder / _text(f"models.{name}", file, folder) for name, file in files.items()}
-
-
-def _settings(key: str, value: object, folder: Path) -> dict[str, object]:
+def _flat(settings: Mapping[str, object]) -> dict[str, object]:
     """Settings by full name: `{ coreset = { size = 128 } }` is `{ "coreset.size" = 128 }`."""
     flat: dict[str, object] = {}
-    for name, each in _table(key, value, folder).items():
+    for name, each in settings.items():
         flat |= {f"{name}.{short}": one for short, one in each.items()} if isinstance(each, Mapping) else {name: each}
     return flat
 
 
-def _labels(key: str, value: object, folder: Path) -> dict[str, str]:
-    return {name: _text(f"labels.{name}", each, folder) for name, each in _table(key, value, folder).items()}
-
-
-def _follow(key: str, value: object, _: Path) -> tuple[str, ...]:
-    names = [value] if isinstance(value, str) else value
-    if not isinstance(names, list | tuple) or not all(isinstance(name, str) and name for name in names):
-        raise FleetError(f'{key} must be names of objects, for example ["anna"], got {reprlib.repr(value)}')
-    return tuple(dict.fromkeys(check_name(name) for name in names))
-
-
-#: The field of a stream that each key of its table gives, and the function that reads it.
-_READERS: dict[str, tuple[str, Callable[[str, object, Path], Any]]] = {
-    "source": ("source", _source),
-    "box": ("boxes", _box),
-    "boxes": ("boxes", _boxes),
-    "model": ("models", _model),
-    "models": ("models", _models),
-    "settings": ("settings", _settings),
-    "cores": ("cores", _number),
-    "labels": ("labels", _labels),
-    "follow": ("follow", _follow),
-}
-
-
-# --- errors ----------------------------------------------------------------------------------------
-
-
-def _check_fleet_name(name: object, kind: str) -> None:
+def check_fleet_name(name: object, kind: str) -> None:
+    """Raise FleetError if something may not be the name of a fleet or of a stream."""
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise FleetError(
             f"{reprlib.repr(name)} is not a valid name of a {kind}: expected 1 to 64 letters, digits, '_', '-' and "
@@ -359,23 +284,9 @@ def _check_fleet_name(name: object, kind: str) -> None:
         )
 
 
-def _check_keys(table: Mapping[str, object], known: Collection[str]) -> None:
-    for key in table:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            meant = f", did you mean {near[0]!r}?" if near else ":"
-            raise FleetError(f"there is no key {key!r}{meant} there are {', '.join(known)}")
-
-
-@contextmanager
-def _errors_about(stream: str) -> Iterator[None]:
-    """Turn the errors of catstream into one that names the stream."""
-    with _errors_in(f"the stream {stream}"):
-        yield
-
-
 @contextmanager
 def _errors_in(place: str) -> Iterator[None]:
+    """Turn the errors of catstream into one that names the place."""
     try:
         yield
     except CatstreamError as error:

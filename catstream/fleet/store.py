@@ -1,31 +1,249 @@
-"""The store of a fleet: states of streams, the fleet's spec and merged models, in a folder or an S3 bucket.
+"""The store of a fleet, a folder or an S3 bucket: states of streams, the fleet's spec, and merged models.
 
     streams/NAME/    states of a stream
     models/OBJECT/   merged models of an object
-    fleet/           specs of the fleet
+    fleet/           desired streams of the fleet
 
-Of each, the newest two are kept, as `catstream.fleet.states` describes. A state contains the source of its stream,
-which may contain a password: files are readable by their owner only, and a bucket has to be private.
+Below each of these folders, only the newest holder decides what comes next:
+
+    <token>/claim     the claim of a holder; the token is one higher than that of every earlier claim
+    <token>/<n>       its states, every few seconds: n = 1, 2, 3 ...
+    <token>/removed   the stream was removed by the holder: nobody reads the states of lower tokens any more
+
+    claim   create the claim of the highest token + 1; this fails if another process has it already: try the next one
+    write   create the next state under the own token, then list the folder: if there is a claim with a higher token,
+            this holder was superseded, and has to stop
+    read    take the newest undamaged state of the highest token that has one
+
+A holder that was paused or cut off may go on writing under its own token: as soon as the newer holder has written one
+state, nobody reads the older ones any more. Before that, its states continue the one that the newer holder began from,
+and are as good as any. What can fail besides:
+
+    the answer to a claim is lost   The caller claims again, and gets the next token; a claim without states is passed.
+    the answer to a write is lost   The caller writes the next state, under the next number.
+    a write ends half way           The state is damaged, and is passed over.
+
+A holder removes all states but the newest two, and the older claims that have no state any more. Of a stream that was
+removed, a claim stays, so that a holder that comes back later finds that it was superseded. See
+docs/decisions/0078-fencing-by-name.md.
+
+A state contains the source of its stream, which may contain a password: files are readable by their owner only, and a
+bucket has to be private.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
-import re
 import socket
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
-from catstream.errors import FencedError, FleetError
-from catstream.fleet.objects import FsspecObjects
-from catstream.fleet.states import Claim, Generation, Listing, States
+import numpy as np
+
+from catstream.errors import FencedError, ProtocolError, StoreError
+from catstream.fleet.objects import Objects
+from catstream.fleet.spec import check_fleet_name
+from catstream.messages import storage
 from catstream.messages.names import UNNAMED, check_name
 
-__all__ = ["Claim", "Generation", "Store"]
+__all__ = ["Claim", "Generation", "Listing", "States", "Store"]
 
-_STREAM = re.compile(r"(?!\.+$)[A-Za-z0-9._-]{1,64}")
+_CLAIM, _REMOVED = "claim", "removed"
+_DIGITS = 8  # of a token and of the number of a state in their names
+_KEPT = 2  # newest states
+_ATTEMPTS = 20  # to claim, or to read the newest state, while other processes change the folder
+_LONGEST_HOLDER = 200
 _NO_NAME = "-"  # folder of the object without a name: no name begins with a dash
-_ATTEMPTS = 5
+
+
+class _Place(NamedTuple):
+    """The place of a state: the token of its writer, and its number."""
+
+    token: int
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """What is below the folder of a stream.
+
+    claims   tokens of the claims
+    states   places of the states
+    removed  highest token under which the stream was removed; 0 if it never was
+    """
+
+    claims: set[int]
+    states: set[_Place]
+    removed: int
+
+    @classmethod
+    def of(cls, names: Iterable[str]) -> Listing:
+        """The listing of these names, each without the folder; names of other things are passed over.
+
+        >>> Listing.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
+        Listing(claims={1}, states={_Place(token=1, number=7)}, removed=0)
+        """
+        claims, states, removed = set[int](), set[_Place](), 0
+        for name in names:
+            token, _, rest = name.partition("/")
+            if token.isdecimal() and rest.isdecimal():
+                states.add(_Place(int(token), int(rest)))
+            elif token.isdecimal() and rest == _CLAIM:
+                claims.add(int(token))
+            elif token.isdecimal() and rest == _REMOVED:
+                removed = max(removed, int(token))
+        return cls(claims, states, removed)
+
+    def newest(self, after: int = 0) -> list[_Place]:
+        """The places of the states that may be read, those of holders with a token above `after`, newest first."""
+        return sorted((place for place in self.states if place.token > max(after, self.removed)), reverse=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Generation:
+    """A state of a stream in the store.
+
+    token   of the holder that wrote it
+    files   contents by name
+    facts   JSON: frame, time and whatever else the writer added
+    """
+
+    token: int
+    files: dict[str, bytes] = field(repr=False)
+    facts: dict[str, Any]
+
+
+class States:
+    """The states below a folder of the store."""
+
+    def __init__(self, objects: Objects, folder: str) -> None:
+        self._objects = objects
+        self.folder = folder
+
+    def newest(self, after: int = 0) -> Generation | None:
+        """Return the newest state; None if there is none of a holder with a token above `after`."""
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(FileNotFoundError):  # removed by the holder since the folder was listed
+                states = (self._read(place) for place in self.listed().newest(after))
+                return next((state for state in states if state is not None), None)
+        raise self._busy("read")
+
+    def claim(self, holder: str) -> Claim:
+        """Become the holder, whose name is for messages."""
+        for _ in range(_ATTEMPTS):
+            found = self.listed()
+            token = max([0, *found.claims, *(place.token for place in found.states)]) + 1
+            with contextlib.suppress(FileExistsError):  # another process claims at this moment
+                self._objects.create(self._name(token, _CLAIM), holder[:_LONGEST_HOLDER].encode())
+                with contextlib.suppress(StoreError):  # the next claim does it
+                    self._objects.tidy(self.folder)
+                return Claim(self, token, holder, self.newest())
+        raise self._busy("claimed")
+
+    def clear(self, holder: str) -> None:
+        """Remove all states. Their holder, if there is one, is superseded."""
+        if self.listed().newest():
+            token = self.claim(holder).token
+            with contextlib.suppress(FileExistsError):
+                self._objects.create(self._name(token, _REMOVED), b"")
+            self.remove_up_to(token, kept=0)
+
+    def listed(self) -> Listing:
+        """What is below the folder now."""
+        return Listing.of(self._objects.names(self.folder))
+
+    def holder(self, token: int) -> str:
+        """The name of the holder with a token, for messages."""
+        with contextlib.suppress(FileNotFoundError, StoreError, UnicodeDecodeError):
+            return self._objects.read(self._name(token, _CLAIM)).decode()
+        return "another process"
+
+    def create(self, place: _Place, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
+        """Create a state."""
+        arrays = {name: np.frombuffer(content, np.uint8) for name, content in files.items()}
+        self._objects.create(self._name(*place), storage.encode(arrays, {"facts": dict(facts)}))
+
+    def remove_up_to(self, token: int, kept: int) -> None:
+        """Remove the states up to a token but the newest ones, and the claims below it that have none any more."""
+        found = self.listed()
+        before = sorted(place for place in found.states if place.token <= token)
+        stay = before[len(before) - kept :]
+        for place in before[: len(before) - kept]:
+            self._objects.remove(self._name(*place))
+        for old in sorted(found.claims - {place.token for place in stay}):
+            if old < token:
+                for rest in (_REMOVED, _CLAIM):
+                    self._objects.remove(self._name(old, rest))
+
+    def _name(self, token: int, rest: str | int) -> str:
+        return f"{self.folder}/{token:0{_DIGITS}}/{rest if isinstance(rest, str) else f'{rest:0{_DIGITS}}'}"
+
+    def _read(self, place: _Place) -> Generation | None:
+        """A state; None if it is damaged."""
+        name = self._name(*place)
+        try:
+            arrays, header = storage.decode(self._objects.read(name), name)
+            return Generation(place.token, {key: each.tobytes() for key, each in arrays.items()}, dict(header["facts"]))
+        except (ProtocolError, KeyError, TypeError, ValueError):
+            return None
+
+    def _busy(self, what: str) -> StoreError:
+        return StoreError(f"{self.folder} could not be {what}: other processes change it all the time; try again later")
+
+
+class Claim:
+    """The right to write the states of a stream, until another process claims it.
+
+    token   higher than that of every earlier claim
+    state   the state to continue from; None if there is none
+    """
+
+    def __init__(self, states: States, token: int, holder: str, state: Generation | None) -> None:
+        self.token, self.state = token, state
+        self._states, self._holder = states, holder
+        self._number = 0
+        self._fenced: FencedError | None = None
+
+    def __repr__(self) -> str:
+        return f"Claim({self._states.folder!r}, token={self.token})"
+
+    def write(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
+        """Write a state, and remove states that are no longer needed.
+
+        Parameters
+        ----------
+        files : contents by name
+        facts : JSON about the state: frame, time ...
+
+        Raises
+        ------
+        FencedError
+            If another process has claimed the stream. Every later call raises it too.
+        StoreError
+            If the store cannot be reached or is full. The caller goes on, and writes a newer state later.
+        """
+        if self._fenced is not None:
+            raise self._fenced
+        self._number += 1  # whatever becomes of this state, its number is not used again
+        with contextlib.suppress(FileExistsError):  # the answer was lost, and the request sent again
+            self._states.create(_Place(self.token, self._number), files, facts)
+        self._check()
+        with contextlib.suppress(StoreError):  # they are removed after the next write
+            self._states.remove_up_to(self.token, _KEPT)
+
+    def _check(self) -> None:
+        """Raise FencedError if there is a higher claim, or this one was removed."""
+        claims = self._states.listed().claims
+        if self.token in claims and max(claims) == self.token:
+            return
+        newer = self._states.holder(max(claims, default=0))
+        self._fenced = FencedError(
+            f"{self._states.folder} was claimed by {newer} after {self._holder} (token {self.token}): "
+            f"{self._holder} may not write it any more, and has to stop"
+        )
+        raise self._fenced
 
 
 class Store:
@@ -44,11 +262,10 @@ class Store:
     """
 
     def __init__(self, url: str) -> None:
-        self._objects = FsspecObjects(url)
-        self._checked = False
+        self._objects = Objects(url)
 
     def __repr__(self) -> str:
-        return repr(self._objects).replace("FsspecObjects", "Store")
+        return repr(self._objects).replace("Objects", "Store")
 
     def check(self) -> None:
         """Check that the store can be used; a folder is created, if it does not exist.
@@ -59,8 +276,6 @@ class Store:
             If it cannot.
         """
         self._objects.make()
-        self._objects.check()
-        self._checked = True
 
     def claim(self, stream: str, holder: str) -> Claim:
         """Become the only process that may write the states of a stream.
@@ -74,7 +289,7 @@ class Store:
         StoreError
             If the store cannot be reached or is full. The call may be repeated.
         """
-        return self._writable(_streams(stream)).claim(holder)
+        return self._states(_streams(stream)).claim(holder)
 
     def newest(self, stream: str) -> Generation | None:
         """Return the newest state of a stream; None if there is none."""
@@ -92,14 +307,14 @@ class Store:
         """Remove the states of a stream. A process that still holds it can write no more."""
         self._states(_streams(stream)).clear(_this_process())
 
-    def put_fleet(self, text: str) -> None:
-        """Store the spec of the fleet."""
-        self._put("fleet", {"fleet": text.encode()}, {})
+    def put_fleet(self, data: bytes) -> None:
+        """Store the desired streams of the fleet."""
+        self._put("fleet", {"fleet": data}, {})
 
-    def get_fleet(self) -> str | None:
-        """Return the newest spec of the fleet; None if there is none."""
+    def get_fleet(self) -> bytes | None:
+        """Return the newest desired streams of the fleet; None if there are none."""
         found = self._states("fleet").newest()
-        return found.files["fleet"].decode() if found else None
+        return found.files["fleet"] if found else None
 
     def put_model(self, name: str, data: bytes, facts: Mapping[str, Any]) -> None:
         """Store the merged model of an object.
@@ -122,30 +337,17 @@ class Store:
 
     def _put(self, folder: str, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
         """Write where there is no lasting holder. Of two processes at once, both write, one after the other."""
-        for attempt in range(_ATTEMPTS):
-            try:
-                self._writable(folder).claim(_this_process()).write(files, facts)
-                return
-            except FencedError:
-                if attempt == _ATTEMPTS - 1:
-                    raise
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(FencedError):
+                return self._states(folder).claim(_this_process()).write(files, facts)
+        raise StoreError(f"{folder} could not be written: other processes change it all the time; try again later")
 
     def _states(self, folder: str) -> States:
         return States(self._objects, folder)
 
-    def _writable(self, folder: str) -> States:
-        """The states of a folder, in a store that was checked."""
-        if not self._checked:
-            self._objects.check()
-            self._checked = True
-        return self._states(folder)
-
 
 def _streams(name: str) -> str:
-    if not _STREAM.fullmatch(name):
-        raise FleetError(
-            f"{name[:80]!r} is not the name of a stream: expected 1 to 64 letters, digits, dots, dashes and underscores"
-        )
+    check_fleet_name(name, "stream")
     return f"streams/{name}"
 
 

@@ -34,8 +34,7 @@ from catstream.errors import (
 )
 from catstream.fleet.life import Order
 from catstream.fleet.spec import StreamSpec
-from catstream.fleet.states import Claim, Generation
-from catstream.fleet.store import Store
+from catstream.fleet.store import Claim, Generation, Store
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline

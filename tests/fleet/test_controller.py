@@ -13,9 +13,11 @@ import pytest
 from catstream.client.registry import Registry
 from catstream.errors import FleetError, SilenceError, StoreError
 from catstream.fleet import controller as module
-from catstream.fleet.controller import Controller, Record
+from catstream.fleet import life
+from catstream.fleet.controller import Controller
+from catstream.fleet.desired import Desired
 from catstream.fleet.life import Node
-from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
 from catstream.fleet.store import Store
 from catstream.fleet.stream import Report
 from catstream.messages.kinds import StreamStatus
@@ -125,7 +127,7 @@ def spec(tmp_path):
 def made(ray, spec, monkeypatch, folder):  # noqa: ARG001  the module finds it as Ray
     """Starts a controller."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))  # no other fleet is found
-    monkeypatch.setattr(module, "_FIRST_PAUSE", 0.0)
+    monkeypatch.setattr(life, "PAUSE_SECONDS", 0.0)
     controllers = []
 
     def make():
@@ -140,7 +142,7 @@ def made(ray, spec, monkeypatch, folder):  # noqa: ARG001  the module finds it a
 @pytest.fixture
 def site(made, spec):
     site = made()
-    site.apply(spec.to_json(), origin="vm:/a/fleet.toml")
+    site.apply(spec, origin="vm:/a/fleet.toml")
     site._turn()
     return site
 
@@ -172,7 +174,7 @@ def test_a_controller_that_starts_again_touches_no_stream_that_runs(site, ray, m
     again = made()
     again._turn()
     assert (ray.actors, ray.started) == (actors, ["gate", "roof"])
-    assert again.apply(spec.to_json()) == ["gate: is unchanged", "roof: is unchanged"]
+    assert again.apply(spec) == ["gate: is unchanged", "roof: is unchanged"]
     assert states(again) == {"gate": "running", "roof": "running"}
 
 
@@ -245,8 +247,8 @@ def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, sp
     for _ in range(4):
         site._turn()
     assert store.newest("gate") is None
-    assert Record.from_json(store.get_fleet()).pins == {}
-    assert not any("gate" in str(known) for known in (site._last, site._restarts, site._pauses, site._actors))
+    assert from_json(store.get_fleet(), Desired).pins == {}
+    assert "gate" not in site._streams
     site.add(GATE)
     site._turn()
     assert "label_selector" not in ray.actors["site/stream/gate"].options
@@ -295,7 +297,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
 
 def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_is_back(made, spec, monkeypatch):
     before = made()
-    before.apply(spec.to_json())
+    before.apply(spec)
     before.end()
     with monkeypatch.context() as patch:
         patch.setattr(Store, "get_fleet", lambda _: (_ for _ in ()).throw(StoreError("the store cannot be reached")))
@@ -303,7 +305,7 @@ def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_i
         with pytest.raises(StoreError, match="cannot be reached"):
             again.ready()
         with pytest.raises(StoreError, match="cannot be reached"):
-            again.apply(spec.to_json())
+            again.apply(spec)
     with Registry("site", timeout=0.5) as registry, pytest.raises(SilenceError):
         registry.streams()  # an empty answer would be the end of each stream for those who follow it
     again._begin()
@@ -312,7 +314,7 @@ def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_i
 
 
 def test_streams_of_another_file_are_replaced_only_if_that_is_said(site, spec):
-    other = replace(spec, streams={"lake": StreamSpec("lake", "demo:3")}).to_json()
+    other = replace(spec, streams={"lake": StreamSpec("lake", "demo:3")})
     with pytest.raises(FleetError, match=r"runs the streams of vm:/a/fleet.toml, not of vm:/b/fleet.toml.*--replace"):
         site.apply(other, origin="vm:/b/fleet.toml")
     assert sorted(site.status().streams) == ["gate", "roof"]
@@ -321,7 +323,7 @@ def test_streams_of_another_file_are_replaced_only_if_that_is_said(site, spec):
 
 
 def test_too_many_streams_are_refused_before_they_start_unless_they_may_wait(site, spec):
-    many = replace(spec, streams={f"cam-{n}": StreamSpec(f"cam-{n}", "demo:1") for n in range(20)}).to_json()
+    many = replace(spec, streams={f"cam-{n}": StreamSpec(f"cam-{n}", "demo:1") for n in range(20)})
     with pytest.raises(FleetError, match="the 20 streams need 20 cores, and the nodes have 4"):
         site.apply(many)
     with pytest.raises(FleetError, match="lake needs 4 cores, and the largest node that it may run on, n1, has 2"):
@@ -355,7 +357,7 @@ def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):
     assert (site.close(), ray.actors) == (0, {})
 
 
-@pytest.mark.parametrize("text", ["{", "{}", '{"spec": "{}", "origin": "", "pins": {}, "draining": []}'])
-def test_a_damaged_desired_state_is_an_error(text):
+@pytest.mark.parametrize("data", [b"{", b"{}", b'{"spec": "{}", "origin": "", "pins": {}, "draining": []}'])
+def test_a_damaged_desired_state_is_an_error(data):
     with pytest.raises(FleetError, match="damaged"):
-        Record.from_json(text)
+        from_json(data, Desired)

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 
 from catstream.fleet import life
-from catstream.fleet.life import TABLE, Node, Seen, Wanted, event, objection, shortage
+from catstream.fleet.desired import objection, shortage
+from catstream.fleet.life import TABLE, Node, Seen, Step, Wanted, diff, event
 
 IDS = st.sampled_from(["1", "2", "3"])
 LABELS = st.sampled_from([{}, {"site": "north"}])
@@ -89,7 +90,7 @@ def test_a_stream_that_is_not_wanted_ends(actor, nodes):
 
 @given(WANTED, seen(), NODES)
 def test_a_stream_is_started_only_if_there_is_no_actor_of_it(wanted, actor, nodes):
-    assert event(wanted, None, nodes, 0.0) == "wanted"
+    assert event(wanted, Seen("absent"), nodes, 0.0) == "wanted"
     assert event(wanted, actor, nodes, 0.0) != "wanted"
     assert [before for before, (_, action) in TABLE.items() if action == "start"] == [("absent", "wanted")]
 
@@ -137,6 +138,22 @@ def test_one_that_an_earlier_controller_started_may_say_for_what():
     adopted = Seen("pending", since=0.0)
     assert event(Wanted("a1"), adopted, [], 5.0) is None
     assert event(Wanted("a1"), adopted, [], 60.0) == "unwanted"
+
+
+def test_one_that_is_gone_at_once_is_started_again_after_a_pause():
+    wanted = Wanted("a1")
+    assert event(wanted, Seen("absent", since=10.0), [], 10.0 + life.PAUSE_SECONDS / 2) is None
+    assert event(wanted, Seen("absent", since=10.0), [], 10.0 + life.PAUSE_SECONDS) == "wanted"
+
+
+@given(st.dictionaries(IDS, WANTED), st.dictionaries(IDS, seen()), NODES)
+def test_the_difference_is_that_of_each_stream_by_the_table(wanted, actors, nodes):
+    steps = diff(wanted, actors, nodes, 0.0)
+    for name in wanted.keys() | actors.keys():
+        actor = actors.get(name, Seen("absent"))
+        happened = event(wanted.get(name), actor, nodes, 0.0)
+        known = (actor.state, happened) in TABLE
+        assert steps.get(name) == (Step(happened, *TABLE[actor.state, happened]) if known else None)
 
 
 def test_why_streams_cannot_run_is_said():

@@ -19,7 +19,7 @@ from hypothesis.stateful import (
 )
 
 from catstream.errors import FencedError, StoreError
-from catstream.fleet.states import Claim, States
+from catstream.fleet.store import Claim, States
 
 FOLDER = "streams/cam-7"
 PROCESSES = st.integers(0, 2)

@@ -13,8 +13,7 @@ from catstream.errors import StoreError
 from catstream.fleet import stream as module
 from catstream.fleet.life import Order
 from catstream.fleet.spec import StreamSpec
-from catstream.fleet.states import Claim
-from catstream.fleet.store import Store
+from catstream.fleet.store import Claim, Store
 from catstream.fleet.stream import Place, Stream
 
 FRAMES = 60

@@ -1,0 +1,133 @@
+"""The desired state of a fleet, which is in the store, and the changes that a person makes to it. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+
+from catstream.errors import FleetError
+from catstream.fleet.life import Node, Wanted
+from catstream.fleet.spec import FleetSpec, StreamSpec
+
+__all__ = ["Desired", "objection", "shortage"]
+
+
+@dataclass(frozen=True, slots=True)
+class Desired:
+    """The desired state of a fleet. A method that changes it returns the changed one, and raises FleetError.
+
+    spec      the streams
+    origin    machine and file that the streams came from
+    pins      name of the node that each stream was moved to
+    draining  names of the nodes that streams leave
+    """
+
+    spec: FleetSpec
+    origin: str = ""
+    pins: dict[str, str] = field(default_factory=dict)
+    draining: frozenset[str] = frozenset()
+
+    def applied(self, spec: FleetSpec, origin: str, *, replace_other: bool) -> Desired:
+        """With the streams of a file, whose machine and path are the origin."""
+        if spec.store != self.spec.store:
+            raise FleetError(
+                f"the fleet {self.spec.name} keeps its state in {self.spec.store!r}, and the file says "
+                f"{spec.store!r}: end it first (catstream fleet down), and copy the state"
+            )
+        if origin and self.origin not in ("", origin) and self.spec.streams and not replace_other:
+            raise FleetError(
+                f"the fleet {self.spec.name} runs the streams of {self.origin}, not of {origin}: give this one "
+                "another name (--name), or replace the streams (--replace)"
+            )
+        return replace(self, spec=spec, origin=origin or self.origin)
+
+    def added(self, stream: StreamSpec) -> Desired:
+        """With one more stream, or with a change of the one of its name."""
+        return replace(self, spec=replace(self.spec, streams=self.spec.streams | {stream.name: stream}))
+
+    def removed(self, names: Collection[str]) -> Desired:
+        """Without streams, of which nothing is left."""
+        for name in names:
+            self.check_stream(name)
+        streams = {name: each for name, each in self.spec.streams.items() if name not in names}
+        pins = {name: node for name, node in self.pins.items() if name in streams}
+        return replace(self, spec=replace(self.spec, streams=streams), pins=pins)
+
+    def moved(self, name: str, node: str, nodes: Collection[Node]) -> Desired:
+        """With a stream on a node, where it runs whenever the node lives."""
+        self.check_stream(name)
+        _check_node(node, nodes)
+        desired = replace(self, pins=self.pins | {name: node})
+        if reason := objection(name, desired.wanted(name), [each for each in nodes if each.name == node]):
+            raise FleetError(reason)
+        return desired
+
+    def drained(self, node: str, nodes: Collection[Node], *, undo: bool) -> Desired:
+        """With a node that streams leave; `undo` takes that back."""
+        _check_node(node, nodes)
+        return replace(self, draining=self.draining - {node} if undo else self.draining | {node})
+
+    def wanted(self, name: str) -> Wanted:
+        """A stream as it should run."""
+        spec = self.spec.streams[name]
+        return Wanted(spec.digest, spec.cores, spec.labels, self.pins.get(name, ""))
+
+    def check_stream(self, name: str) -> None:
+        """Raise FleetError if there is no such stream."""
+        if name not in self.spec.streams:
+            known = ", ".join(self.spec.streams) or "none"
+            raise FleetError(f"there is no stream {name!r} in the fleet {self.spec.name}: there are {known}")
+
+    def check_fits(self, nodes: Collection[Node]) -> None:
+        """Raise FleetError if the nodes cannot run all streams."""
+        wanted = {name: self.wanted(name) for name in self.spec.streams}
+        reasons = [reason for name, each in wanted.items() if (reason := objection(name, each, nodes))]
+        if reasons := reasons or list(filter(None, [shortage(wanted.values(), nodes)])):
+            raise FleetError(
+                "nothing was changed: "
+                + "\n".join(reasons)
+                + "\nGive streams fewer cores (catstream fleet status shows what they use), add nodes, or let streams "
+                "wait for nodes that join later (catstream fleet up --wait)"
+            )
+
+
+def _check_node(name: str, nodes: Collection[Node]) -> None:
+    known = [node.name for node in nodes]
+    if name not in known:
+        raise FleetError(f"there is no node {name!r} in the fleet: there are {', '.join(known)}")
+
+
+def objection(name: str, wanted: Wanted, nodes: Collection[Node]) -> str:
+    """Why a stream can run on no node, even if no other stream ran; empty if it can.
+
+    >>> objection("cam-7", Wanted("a1", 4.0), [Node("n1", "1", cores=2.0)])
+    'cam-7 needs 4 cores, and the largest node that it may run on, n1, has 2'
+    >>> objection("cam-7", Wanted("a1", labels={"site": "north"}), [Node("n1", "1")])
+    'cam-7 needs a node with site=north, and there is none: there are n1'
+    """
+    alive = [node for node in nodes if node.alive]
+    fitting = [node for node in alive if wanted.fits(node)]
+    if not fitting:
+        labels = ", ".join(f"{key}={value}" for key, value in wanted.labels.items())
+        needed = f"a node with {labels}" if labels else "a node that is not drained"
+        return f"{name} needs {needed}, and there is none: there are {', '.join(node.name for node in alive) or 'none'}"
+    largest = max(fitting, key=lambda node: node.cores)
+    if largest.cores < wanted.cores:
+        return (
+            f"{name} needs {wanted.cores:g} cores, and the largest node that it may run on, {largest.name}, has "
+            f"{largest.cores:g}"
+        )
+    return ""
+
+
+def shortage(wanted: Collection[Wanted], nodes: Collection[Node]) -> str:
+    """Why streams cannot all run at the same time; empty if they can, as far as the sums of cores say.
+
+    >>> shortage([Wanted("a", 1.0)] * 20, [Node("n1", "1", cores=2.0)])
+    'the 20 streams need 20 cores, and the nodes have 2'
+    """
+    needed = sum(each.cores for each in wanted)
+    there = sum(node.cores for node in nodes if node.alive and not node.draining)
+    if needed <= there + 1e-6:
+        return ""
+    return f"the {len(wanted)} streams need {needed:g} cores, and the nodes have {there:g}"
