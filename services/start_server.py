@@ -17,12 +17,18 @@ locked in the copy. If a library has started a thread, the server starts each pr
 
 The kernel kills these processes when the server ends, and the server ends with its program, however that ended. If the
 server is killed, its processes are restarted like any that died, by a new server.
+
+Several programs can share a server, such as the streams of a fleet on one node (`share_start_server`). It ends with a
+process that outlives them; if one of the programs ends, the server kills the processes of that one. A program finds the
+server by the name of its socket, and both check that the other is of the same user.
 """
 
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
+import hashlib
 import json
 import logging
 import os
@@ -34,6 +40,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -47,7 +54,16 @@ from catstream.services.process_log import ProcessLog
 from catstream.services.process_title import set_process_title
 from catstream.services.start import environment, import_path, python_command, service_command
 
-__all__ = ["NAMES", "Request", "StartServer", "StartedProcess", "main", "start_server", "start_server_lines"]
+__all__ = [
+    "NAMES",
+    "Request",
+    "StartServer",
+    "StartedProcess",
+    "main",
+    "share_start_server",
+    "start_server",
+    "start_server_lines",
+]
 
 #: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
@@ -55,7 +71,10 @@ NAMES = ("detector", "compressor", "trainer")
 _ANSWER = struct.Struct("=i")  # the process id, 0 if it could not be started; the exit code, or minus the signal
 #: Beginnings of the environment variables that libraries read when they are imported.
 _READ_BY_IMPORTS = ("LD_", "MKL_", "NPY_", "NUMBA_", "OMP_", "OPENBLAS_", "OPENCV_", "PYTHON", "XDG_CACHE_HOME")
+_CREDENTIALS = struct.Struct("=iii")  # process, user and group of the other end of a Unix socket
 _END_SECONDS = 5.0  # limit for the end of a process that was killed
+_SHARED_SECONDS = 2.0  # limit to connect to a shared server, which another program may be starting
+_PAUSE_SECONDS = 0.01  # between two attempts
 _log = logging.getLogger(__name__)
 
 
@@ -156,34 +175,37 @@ class StartedProcess:
 class StartServer:
     """A start server, as its program sees it.
 
+    Parameters
+    ----------
+    shared_with : process id of the process with which a shared server ends; None for a server of this program alone
+
     Attributes
     ----------
-    log : what it logged: that kernels are compiled, that it cannot fork
+    log : what it logged: that kernels are compiled, that it cannot fork; a shared one logs to the standard error of the
+        program that has started it
+
+    Raises
+    ------
+    OSError
+        If a shared server cannot be used.
     """
 
-    def __init__(self) -> None:
-        self._program, self._imports = os.getpid(), _imports()
+    def __init__(self, shared_with: int | None = None) -> None:
+        self._program, self._imports, self.shared_with = os.getpid(), _imports(), shared_with
         self._processes: WeakSet[StartedProcess] = WeakSet()
         self.log = ProcessLog("start server", cast(BinaryIO, tempfile.TemporaryFile()))  # noqa: SIM115
-        self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            self._process = subprocess.Popen(
-                python_command(
-                    f"from catstream.services.start_server import main; main({theirs.fileno()}, {self._program})"
-                ),
-                env=environment(),
-                cwd="/",
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,  # a reader of the program's output would wait for the server's end
-                stderr=self.log.fileno(),
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,  # Ctrl-C is for the program, which then ends its processes in order
-            )
+        self._process: subprocess.Popen[bytes] | None = None
+        if shared_with is None:
+            self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with theirs:
+                self._process = _start(theirs, self._program, self.log.fileno())
+        else:
+            self._requests = _connected(shared_with)
 
     @property
     def pid(self) -> int:
-        """Its process id."""
-        return self._process.pid
+        """Its process id; 0 for a shared one."""
+        return self._process.pid if self._process is not None else 0
 
     @property
     def is_owned(self) -> bool:
@@ -193,7 +215,11 @@ class StartServer:
     @property
     def is_usable(self) -> bool:
         """Whether it runs, and has imported what this program would import now."""
-        return self.is_owned and self._imports == _imports() and self._process.poll() is None
+        if self._process is not None:
+            runs = self._process.poll() is None
+        else:
+            runs = not select.select([self._requests], [], [], 0)[0]  # it sends nothing: that would be its end
+        return self.is_owned and self._imports == _imports() and runs
 
     @property
     def is_idle(self) -> bool:
@@ -227,10 +253,11 @@ class StartServer:
         return process
 
     def close(self) -> None:
-        """End the server, and its processes with it."""
+        """End the server, and its processes with it; a shared server only ends the processes of this program."""
         self._requests.close()
-        self._process.kill()  # it may be in a long import
-        self._process.wait()
+        if self._process is not None:
+            self._process.kill()  # it may be in a long import
+            self._process.wait()
         self.log.close()
 
 
@@ -239,8 +266,69 @@ def _imports() -> tuple[list[str], dict[str, str]]:
     return import_path(), {name: value for name, value in environment().items() if name.startswith(_READ_BY_IMPORTS)}
 
 
+def _start(requests: socket.socket, program: int, log: int | None, first: str = "") -> subprocess.Popen[bytes]:
+    """Start the process of a server, which runs the statement `first` before anything else."""
+    return subprocess.Popen(
+        python_command(
+            f"{first}from catstream.services.start_server import main; main({requests.fileno()}, {program})"
+        ),
+        env=environment(),
+        cwd="/",
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,  # a reader of the program's output would wait for the server's end
+        stderr=log,
+        pass_fds=[requests.fileno()],
+        start_new_session=True,  # Ctrl-C is for the program, which then ends its processes in order
+    )
+
+
+def _connected(program: int) -> socket.socket:
+    """A connection to the server that ends with a program and has imported what this process would; it may be new."""
+    os.close(os.pidfd_open(program))  # it lives, and the server will see its end
+    began = Path(f"/proc/{program}/stat").read_text().rpartition(") ")[2].split()[19]
+    key = json.dumps([os.getuid(), program, began, _imports()])
+    name = f"\0catstream-start-{hashlib.sha256(key.encode()).hexdigest()}"  # the kernel removes it with the server
+    deadline = time.monotonic() + _SHARED_SECONDS
+    while True:
+        requests = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            requests.connect(name)
+            if _user(requests) != os.getuid():
+                raise PermissionError(errno.EPERM, "the start server is of another user")
+            return requests
+        except ConnectionRefusedError:  # nobody listens
+            requests.close()
+            if time.monotonic() > deadline:
+                raise
+        except OSError:
+            requests.close()
+            raise
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+            try:
+                listener.bind(name)
+            except OSError:  # another program has bound it, and will listen
+                time.sleep(_PAUSE_SECONDS)
+                continue
+            listener.listen()
+            # The server is no child of this process, whose end may be that of all its children.
+            _start(listener, program, None, "import os; os.fork() and os._exit(0); ").wait()
+
+
+def _user(channel: socket.socket) -> int:
+    """The user at the other end of a Unix socket."""
+    credentials = channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    return int(_CREDENTIALS.unpack(credentials)[1])
+
+
 _servers: list[StartServer] = []
+_shared_with: int | None = None
 _lock = threading.Lock()
+
+
+def share_start_server(program: int) -> None:
+    """Let this process share one start server with all others that name the same program; it ends with that program."""
+    global _shared_with
+    _shared_with = program
 
 
 def start_server() -> StartServer:
@@ -252,7 +340,11 @@ def start_server() -> StartServer:
                 _servers.remove(server)
         usable = next((server for server in _servers if server.is_usable), None)
         if usable is None:
-            usable = StartServer()
+            try:
+                usable = StartServer(_shared_with)
+            except OSError as error:  # an old kernel, or a stranger
+                _log.warning("this program has a start server of its own: %s", error)
+                usable = StartServer()
             _servers.append(usable)
         return usable
 
@@ -283,13 +375,15 @@ class _Server:
 
     Parameters
     ----------
-    requests : socket of the requests, which the program closes when it ends
-    program : process id of the program
+    requests : socket of the requests, which the program closes when it ends; for a shared server, one that listens
+    program : process id of the program with which it ends
     """
 
     def __init__(self, requests: socket.socket, program: int) -> None:
         self._requests = requests
-        self._answers: dict[int, socket.socket] = {}  # of the processes that run, by process id
+        self._is_shared = bool(requests.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
+        self._clients = {} if self._is_shared else {requests.fileno(): requests}
+        self._processes: dict[int, tuple[socket.socket, int]] = {}  # answers and client of those that run, by id
         self._ended, ended = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(ended)
         signal.signal(signal.SIGCHLD, lambda *_: None)  # wakes `poll` up
@@ -315,8 +409,14 @@ class _Server:
             if self._ended in ready:
                 os.read(self._ended, 4096)
                 self._reap()
-            elif self._requests.fileno() in ready:
-                data, descriptors, _, _ = socket.recv_fds(self._requests, 16, 4)
+            elif client := next((self._clients[each] for each in ready if each in self._clients), None):
+                try:
+                    data, descriptors, _, _ = socket.recv_fds(client, 16, 4)
+                except ConnectionError:
+                    data, descriptors = b"", []
+                if not data and self._is_shared:
+                    self._lose(client)
+                    continue
                 if not data:
                     return None
                 file, log, watchdog, answers = descriptors
@@ -325,14 +425,34 @@ class _Server:
                 if request.name in to_import:
                     to_import.remove(request.name)
                     _import(request.name)
-                if self._start(request, log, watchdog, answers):
+                if self._start(request, log, watchdog, answers, client):
                     return request, watchdog
+            elif self._is_shared and self._requests.fileno() in ready:
+                self._accept()
             elif ready:
                 return None
             else:
                 _import(to_import.pop(0))
 
-    def _start(self, request: Request, log: int, watchdog: int, answers: int) -> bool:
+    def _accept(self) -> None:
+        """Accept a program that shares this server."""
+        client, _ = self._requests.accept()
+        if _user(client) != os.getuid():
+            client.close()
+            return
+        self._clients[client.fileno()] = client
+        self._poll.register(client, select.POLLIN)
+
+    def _lose(self, client: socket.socket) -> None:
+        """Kill the processes of a program that has ended."""
+        for pid, (_, owner) in self._processes.items():
+            if owner == client.fileno():
+                os.kill(pid, signal.SIGKILL)
+        self._poll.unregister(client)
+        del self._clients[client.fileno()]
+        client.close()
+
+    def _start(self, request: Request, log: int, watchdog: int, answers: int, client: socket.socket) -> bool:
         """Start a process, and send its process id; returns whether this is the new process."""
         channel = socket.socket(fileno=answers)
         try:
@@ -347,7 +467,7 @@ class _Server:
                 channel.close()
                 self._leave(log, request)
                 return True
-            self._answers[pid] = channel
+            self._processes[pid] = channel, client.fileno()
             if not _answer(channel, pid):  # the program no longer wants it
                 os.kill(pid, signal.SIGKILL)
         os.close(log)
@@ -366,7 +486,8 @@ class _Server:
         """Keep nothing of the server in the process that it has forked."""
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        for channel in (self._requests, *self._answers.values()):
+        answers = (channel for channel, _ in self._processes.values())
+        for channel in (self._requests, *self._clients.values(), *answers):
             channel.close()
         for descriptor in self._descriptors:
             os.close(descriptor)
@@ -384,11 +505,12 @@ class _Server:
 
     def _reap(self) -> None:
         """Send the exit codes of the processes that have ended."""
-        while self._answers:
+        while self._processes:
             pid, status = os.waitpid(-1, os.WNOHANG)
             if not pid:
                 return
-            with self._answers.pop(pid) as channel:
+            channel, _ = self._processes.pop(pid)
+            with channel:
                 _answer(channel, os.waitstatus_to_exitcode(status))
 
 

@@ -29,7 +29,7 @@ from sequences import rendered, scratch, sequences
 from table import Table, publish
 
 from catstream.applications.evaluation.datasets import Sequence, find_sequences
-from catstream.fleet.merge import merge_models
+from catstream.fleet.merge import joined, merge_in_pairs
 from catstream.run.learned import Learned
 from catstream.settings import Settings
 from catstream.video.sprite import cut_out_dahlia, load_photograph
@@ -70,7 +70,8 @@ def measured(task: tuple[Scene, int, int]) -> tuple[str, Row]:
     models = [model_of(one, settings).to_bytes() for one in found]
     counts = range(2, len(models) + 1)
     searched = {"camera 1": Learned.from_bytes(models[0], "")}
-    searched |= {f"cameras 1-{count}": Learned.from_bytes(merge_models(models[:count]), "") for count in counts}
+    merged = {f"cameras 1-{count}": merge_in_pairs(models[:count], joined) for count in counts}
+    searched |= {name: Learned.from_bytes(model, "") for name, model in merged.items()}
     searched["one tree"] = model_of([part for one in found for part in one], settings)
     return scene.name, {name: _searched(learned, last, scene.stranger, frames) for name, learned in searched.items()}
 

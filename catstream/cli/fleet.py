@@ -264,7 +264,7 @@ def remove(names: tuple[str, ...], forget: bool, of: dict[str, object]) -> None:
 @click.argument("node")
 @with_fleet
 def move(name: str, node: str, of: dict[str, object]) -> None:
-    """Move the stream NAME to a NODE, where it runs whenever the node lives.
+    """Move the stream NAME to a NODE, where it stays until the node dies or drains.
 
     The stream stores its state, ends, and continues on the other node; a live
     stream loses the frames of about three seconds.

@@ -43,6 +43,6 @@ def merge(names: tuple[str, ...], object_name: str, output: Path | None, of: dic
         except OSError as error:
             raise ServiceError(f"cannot write {str(output)!r} ({error.strerror}): give another file") from None
     line = f"merged: {', '.join(merged.streams)}"
-    if merged.left:
-        line += f"; the frames of these are in them already, at least in part: {', '.join(merged.left)}"
+    if merged.skipped:
+        line += f"; the frames of these are in them already, at least in part: {', '.join(merged.skipped)}"
     click.echo(line)

@@ -10,6 +10,7 @@ but the change that waits for it. What is answered as done is stored.
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -23,11 +24,12 @@ from catstream.errors import CatstreamError, FleetError
 from catstream.fleet import life
 from catstream.fleet.cluster import NAMESPACE, actor_name, actors, is_local, nodes
 from catstream.fleet.desired import Desired, objection
-from catstream.fleet.life import Node, Order, Seen, Step, Wanted
+from catstream.fleet.life import NODE_ID, Node, Order, Seen, Step, Wanted
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.fleet.stream import Place, Report, Stream, given_model
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
+from catstream.services.start_server import share_start_server, start_server
 from catstream.video.frames import without_password
 from catstream.wire.keys import Client, allowed, create
 
@@ -44,12 +46,24 @@ _ANSWER_SECONDS = 10.0  # limit for a stream to answer a call that a person wait
 _log = logging.getLogger(__name__)
 
 
+def warm() -> None:
+    """Let this process share the start server of its node, and start it if there is none.
+
+    It has imported what the processes of a stream need, so that a stream is quickly there whose node has died. It ends
+    with the node: the process that starts those of Ray.
+    """
+    os.environ["OMP_NUM_THREADS"] = "1"  # Ray sets the cores of an actor: there would be a server for each number
+    share_start_server(os.getppid())
+    start_server()
+
+
 class StreamActor(Stream):
     """A stream as an actor of Ray, which tells the stream where it was placed."""
 
     def __init__(self, spec: StreamSpec, order: Order, clients: dict[str, Client] | None, store: str, every: float):
         import ray
 
+        warm()
         node = ray.get_runtime_context().get_node_id()
         address = "" if clients is None else ray.util.get_node_ip_address()
         super().__init__(spec, order, Place(node, address, clients or {}), store, every)
@@ -97,6 +111,7 @@ class Controller:
         self._changing = threading.Lock()  # held by a change while it is stored
         self._lock = threading.RLock()  # of what follows, held for moments only
         self._nodes: list[Node] = []
+        self._warmed: set[str] = set()  # ids of the nodes that have a start server
         self._streams: dict[str, _Known] = {}
         self._clients: dict[str, Client] | None = None if self._keys is None else {}
         self._clients_due = 0.0
@@ -169,7 +184,7 @@ class Controller:
         return [line for line in lines if line.partition(":")[0] in names]
 
     def move(self, name: str, node: str) -> str:
-        """Move a stream to a node, where it runs whenever the node lives."""
+        """Move a stream to a node, where it stays until the node dies or drains."""
         with self._changing:
             desired = self._desired.moved(name, node, self._nodes)
             before = self.status().streams[name].node
@@ -279,6 +294,7 @@ class Controller:
             if self._keys is not None and time.monotonic() >= self._clients_due:
                 self._clients_due = time.monotonic() + _CLIENTS_SECONDS
                 self._clients = allowed(self._keys)  # the next reports tell the streams
+            self._warm_nodes()
             for name in existing | self._desired.spec.streams.keys():
                 self._streams.setdefault(name, _Known(Seen("absent")))
             for name, known in self._streams.items():
@@ -290,6 +306,15 @@ class Controller:
             for name in set(gone) - self._desired.spec.streams.keys():
                 del self._streams[name]
             self._recent = self.status()
+
+    def _warm_nodes(self) -> None:
+        """Start the start server of each new node, before there is a stream for it."""
+        import ray
+
+        for node in self._nodes:
+            if node.alive and node.id not in self._warmed:
+                self._warmed.add(node.id)
+                ray.remote(warm).options(num_cpus=0, label_selector={NODE_ID: node.id}).remote()
 
     def _wanted(self) -> dict[str, Wanted]:
         """The streams that should run now."""
@@ -367,9 +392,12 @@ class Controller:
     def _start(self, name: str, known: _Known, wanted: Wanted, now: float) -> None:
         """Ask Ray to run a stream."""
         import ray
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         spec, order = self._desired.spec, wanted.order(self._nodes)
         options: dict[str, Any] = {"label_selector": order.selector} if order.selector else {}
+        if order.node:
+            options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(order.node, soft=True)
         with suppress(ValueError):  # the name is taken: the actor before it is not quite gone
             known.handle = (
                 ray.remote(StreamActor)

@@ -18,7 +18,7 @@ class Desired:
 
     spec      the streams
     origin    machine and file that the streams came from
-    pins      name of the node that each stream was moved to
+    pins      id of the node that each stream was moved to
     draining  names of the nodes that streams leave
     """
 
@@ -54,13 +54,13 @@ class Desired:
         return replace(self, spec=replace(self.spec, streams=streams), pins=pins)
 
     def moved(self, name: str, node: str, nodes: Collection[Node]) -> Desired:
-        """With a stream on a node, where it runs whenever the node lives."""
+        """With a stream on a node, until that dies or drains: a node that was started again has another id."""
         self.check_stream(name)
         _check_node(node, nodes)
-        desired = replace(self, pins=self.pins | {name: node})
-        if reason := objection(name, desired.wanted(name), [each for each in nodes if each.name == node]):
+        there = [each for each in nodes if each.name == node]
+        if reason := objection(name, self.wanted(name), there):
             raise FleetError(reason)
-        return desired
+        return replace(self, pins=self.pins | {name: there[0].id})
 
     def drained(self, node: str, nodes: Collection[Node], *, undo: bool) -> Desired:
         """With a node that streams leave; `undo` takes that back."""

@@ -152,7 +152,7 @@ class Fleet:
         return answer
 
     def move(self, name: str, node: str) -> str:
-        """Move a stream to a node, where it runs whenever the node lives."""
+        """Move a stream to a node, where it stays until the node dies or drains."""
         answer: str = self._ask("move", name, node)
         return answer
 
@@ -258,10 +258,11 @@ class Fleet:
             )
             .remote(spec.name, spec.store, listen, spec.keys or str(_home() / spec.name / "keys"))
         )
+        started = self._controller
         try:
             self._ask("ready")
         except CatstreamError:
-            ray.kill(self._controller)
+            ray.kill(started)
             raise
 
     @contextmanager

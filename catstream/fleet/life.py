@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 __all__ = [
     "EVENTS",
+    "NODE_ID",
     "PAUSE_SECONDS",
     "SILENT_SECONDS",
     "STATES",
@@ -77,7 +78,7 @@ PAUSE_SECONDS = 5.0  # between two starts of one actor, at least: one may die ea
 _ADOPTED_SECONDS = 30.0  # within which an actor that an earlier controller started says what it was started for
 
 #: Label that Ray gives to each node: its id.
-_NODE_ID = "ray.io/node-id"
+NODE_ID = "ray.io/node-id"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +110,7 @@ class Wanted:
     digest  `StreamSpec.digest`: a stream whose digest changes is started anew
     cores   that Ray reserves for it
     labels  that its node must have
-    pinned  name of the node that it was moved to; "" for any
+    pinned  id of the node that it was moved to; "" for any
     """
 
     digest: str
@@ -119,14 +120,14 @@ class Wanted:
 
     def target(self, nodes: Collection[Node]) -> Node | None:
         """The node that it was moved to; None if it may run on any, because that one has died or drains since."""
-        return next((node for node in nodes if node.name == self.pinned and node.alive and not node.draining), None)
+        return next((node for node in nodes if node.id == self.pinned and node.alive and not node.draining), None)
 
     def order(self, nodes: Collection[Node]) -> Order:
         """What Ray is asked for."""
-        pinned = self.target(nodes)
-        leaving = sorted(node.id for node in nodes if node.draining)
-        where = pinned.id if pinned is not None else f"!in({','.join(leaving)})" if leaving else ""
-        return Order(self.digest, self.cores, dict(self.labels) | ({_NODE_ID: where} if where else {}))
+        target = self.target(nodes)
+        leaving = ",".join(sorted(node.id for node in nodes if node.draining))
+        selector = dict(self.labels) | ({NODE_ID: f"!in({leaving})"} if leaving else {})
+        return Order(self.digest, self.cores, selector, target.id if target is not None else "")
 
     def fits(self, node: Node) -> bool:
         """Whether it may run on a node."""
@@ -140,11 +141,13 @@ class Order:
     digest    of the stream
     cores     that Ray reserves
     selector  labels of its node, as Ray's `label_selector` takes them
+    node      id of the node that it is placed on as long as that lives; "" for any
     """
 
     digest: str
     cores: float
     selector: dict[str, str]
+    node: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +233,7 @@ def _is_as_wanted(wanted: Wanted, seen: Seen, nodes: Collection[Node], now: floa
         return False
     node = next((node for node in nodes if node.id == seen.node and node.alive), None)
     if node is None:
-        return seen.order.selector == order.selector
+        return seen.order.selector == order.selector and order.node in ("", seen.order.node)
     return wanted.fits(node) and wanted.target(nodes) in (None, node)
 
 

@@ -20,7 +20,7 @@ from catstream.run import state
 from catstream.run.job import Job
 from catstream.run.learned import Learned, merge
 
-__all__ = ["Merged", "Part", "apart", "merge_in_pairs", "merge_models", "merge_streams", "saved_part"]
+__all__ = ["Merged", "Part", "disjoint", "joined", "merge_in_pairs", "merge_streams", "saved_part"]
 
 Model = TypeVar("Model")
 
@@ -51,15 +51,15 @@ class Merged:
 
     model    the content of its file
     streams  that it was merged from; the last merged model may be among them
-    left     streams whose frames are in one of those already, or that share frames with one of those
+    skipped  streams whose frames are in one of those already, or that share frames with one of those
     """
 
     model: bytes
     streams: tuple[str, ...]
-    left: tuple[str, ...]
+    skipped: tuple[str, ...]
 
 
-def apart(parts: Mapping[str, Part]) -> list[str]:
+def disjoint(parts: Mapping[str, Part]) -> list[str]:
     """Return the names of parts that share no origin, with as many origins as possible, and then as many rows.
 
     Two choices are compared: the parts with the most origins first, as a merged model has them, and those with the
@@ -68,32 +68,24 @@ def apart(parts: Mapping[str, Part]) -> list[str]:
     Examples
     --------
     >>> door, yard, both = Part(frozenset("a"), 90), Part(frozenset("b"), 20), Part(frozenset("ab"), 70)
-    >>> apart({"door": door, "yard": yard, "both": both})
+    >>> disjoint({"door": door, "yard": yard, "both": both})
     ['door', 'yard']
-    >>> apart({"door": door, "both": both})
+    >>> disjoint({"door": door, "both": both})
     ['both']
     """
-    choices = []
-    for sign in (-1, 1):  # first the parts with the most origins, which a merged model has, then those with the fewest
-        order = sorted(
-            parts.items(), key=lambda item: (sign * len(item[1].origins), -item[1].rows, sorted(item[1].origins))
-        )
-        choices.append(_disjoint(parts, [name for name, _ in order]))
-    return max(choices, key=lambda names: _seen(parts, names))
+    choices: list[list[str]] = []
+    for sign in (-1, 1):  # first the parts with the most origins, then those with the fewest
+        key = {name: (sign * len(part.origins), -part.rows, sorted(part.origins)) for name, part in parts.items()}
+        chosen: list[str] = []
+        for name in sorted(parts, key=key.__getitem__):
+            if not any(parts[name].origins & parts[other].origins for other in chosen):
+                chosen.append(name)
+        choices.append(chosen)
 
+    def size(names: list[str]) -> tuple[int, int]:
+        return sum(len(parts[name].origins) for name in names), sum(parts[name].rows for name in names)
 
-def _disjoint(parts: Mapping[str, Part], order: Iterable[str]) -> list[str]:
-    """The names of parts of which each shares no origin with those before it."""
-    chosen: list[str] = []
-    for name in order:
-        if not any(parts[name].origins & parts[other].origins for other in chosen):
-            chosen.append(name)
-    return chosen
-
-
-def _seen(parts: Mapping[str, Part], names: Iterable[str]) -> tuple[int, int]:
-    """Number of origins and of rows of several parts."""
-    return sum(len(parts[name].origins) for name in names), sum(parts[name].rows for name in names)
+    return max(choices, key=size)
 
 
 def merge_in_pairs(models: Sequence[Model], join: Callable[[Model, Model], Model]) -> Model:
@@ -108,23 +100,6 @@ def merge_in_pairs(models: Sequence[Model], join: Callable[[Model, Model], Model
         pairs = [join(one, other) for one, other in zip(models[::2], models[1::2], strict=False)]
         models = [*pairs, *models[len(models) - len(models) % 2 :]]
     return models[0]
-
-
-def merge_models(models: Iterable[bytes]) -> bytes:
-    """Merge saved models of one object in this process; frames that several of them contain are counted once.
-
-    Raises
-    ------
-    FleetError
-        If there is none.
-    SettingsError
-        If their settings or the names of their objects differ.
-    """
-    read = {str(number): model for number, model in enumerate(models)}
-    if not read:
-        raise FleetError("there is no saved model to merge: give at least one")
-    parts = {name: Part.of(Learned.from_bytes(model, "a saved model")) for name, model in read.items()}
-    return merge_in_pairs([read[name] for name in apart(parts)], _joined)
 
 
 def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -> Merged:
@@ -151,7 +126,7 @@ def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -
     from ray.exceptions import RayTaskError
 
     remote: Any = ray.remote
-    load, join = remote(num_returns=2)(saved_part), remote(_joined)
+    load, join = remote(num_returns=2)(saved_part), remote(joined)
     refs: dict[str, Any] = {stream: load.remote(url, stream, name, named=named) for stream in streams}
     store = Store(url)
     earlier = before.files["model"] if (before := store.get_model(name)) is not None else None
@@ -162,7 +137,7 @@ def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -
         parts = {stream: part for stream, part in found.items() if part is not None}
         if not parts:
             raise FleetError(f"no stream has learned of {name or 'the object'!r} yet: see catstream fleet status")
-        chosen = apart(parts)
+        chosen = disjoint(parts)
         merged: bytes = ray.get(merge_in_pairs([refs[stream][1] for stream in chosen], join.remote))
     except RayTaskError as error:
         raise (error.cause if isinstance(error.cause, CatstreamError) else error) from None
@@ -194,7 +169,7 @@ def saved_part(url: str, stream: str, name: str, *, named: bool) -> tuple[Part, 
     return Part.of(learned), learned.to_bytes()
 
 
-def _joined(one: bytes, other: bytes) -> bytes:
-    """Two saved models merged: the name says that the object is the same, so its appearances are not compared."""
+def joined(one: bytes, other: bytes) -> bytes:
+    """Two saved models merged. The name says that the object is the same, so its appearances are not compared."""
     parts = [Learned.from_bytes(model, "the saved model of a stream") for model in (one, other)]
     return merge(parts, force=True).to_bytes()

@@ -69,16 +69,22 @@ class Ray(types.ModuleType):
     def __init__(self):
         super().__init__("ray")
         self.__spec__ = ModuleSpec("ray", None)
-        self.actors, self.started = {}, []
+        self.actors, self.started, self.warmed = {}, [], []
         self.util = types.ModuleType("ray.util")
         self.util.list_named_actors = lambda **_: [{"name": name, "namespace": "catstream"} for name in self.actors]
         self.exceptions = types.ModuleType("ray.exceptions")
         self.exceptions.RayError = RayError
+        self.strategies = types.ModuleType("ray.util.scheduling_strategies")
+        self.strategies.NodeAffinitySchedulingStrategy = lambda node, *, soft: (node, soft)
 
-    def remote(self, _):
+    def remote(self, what):
+        start = self._warm if what is module.warm else self._start
         return types.SimpleNamespace(
-            options=lambda **options: types.SimpleNamespace(remote=lambda *given: self._start(options, *given))
+            options=lambda **options: types.SimpleNamespace(remote=lambda *given: start(options, *given))
         )
+
+    def _warm(self, options):
+        self.warmed.append(options["label_selector"]["ray.io/node-id"])
 
     def _start(self, options, spec, order, *_):
         if options["name"] in self.actors:
@@ -108,8 +114,8 @@ class Ray(types.ModuleType):
 @pytest.fixture
 def ray(monkeypatch):
     fake = Ray()
-    for name, part in (("ray", fake), ("ray.util", fake.util), ("ray.exceptions", fake.exceptions)):
-        monkeypatch.setitem(sys.modules, name, part)
+    for part in (fake, fake.util, fake.exceptions, fake.strategies):
+        monkeypatch.setitem(sys.modules, part.__name__, part)
     fake.nodes = [Node("n1", "1", "127.0.0.1", 2.0), Node("n2", "2", "127.0.0.1", 2.0)]
     monkeypatch.setattr(module, "nodes", lambda: list(fake.nodes))
     monkeypatch.setattr(module, "is_local", lambda: True)
@@ -178,6 +184,13 @@ def test_a_controller_that_starts_again_touches_no_stream_that_runs(site, ray, m
     assert states(again) == {"gate": "running", "roof": "running"}
 
 
+def test_each_node_gets_its_start_server_once_before_there_is_a_stream_for_it(site, ray):
+    ray.nodes[1:] = [replace(ray.nodes[1], alive=False), Node("n3", "3")]
+    for _ in range(2):
+        site._turn()
+    assert ray.warmed == ["1", "2", "3"]
+
+
 def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
     running(site, ray, "gate")
     assert site.move("gate", "n2") == "gate moves from n1 to n2"
@@ -186,7 +199,7 @@ def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
     assert ray.actors["site/stream/gate"].asked[-1] == ("stop",)
     for _ in range(3):
         site._turn()
-    assert ray.actors["site/stream/gate"].options["label_selector"] == {"ray.io/node-id": "2"}
+    assert ray.actors["site/stream/gate"].options["scheduling_strategy"] == ("2", True)
     running(site, ray, "gate", "2")
     assert site.move("gate", "n2") == "gate stays on n2"
 
@@ -204,18 +217,20 @@ def test_a_drained_node_loses_its_streams_and_gets_them_back_only_if_it_takes_st
     assert states(site)["gate"] == "running", "it stays where it is"
 
 
-def test_a_stream_that_was_moved_to_a_node_that_died_runs_elsewhere(site, ray):
+def test_a_stream_that_was_moved_to_a_node_that_died_is_placed_by_ray_and_stays_there(site, ray):
     site.move("gate", "n2")
-    for _ in range(4):
+    for _ in range(3):
         site._turn()
     running(site, ray, "gate", "2")
     ray.nodes[1] = replace(ray.nodes[1], alive=False)
     actor = ray.actors["site/stream/gate"]
-    actor._called = lambda *_: Call(error=RayError("unavailable"))
-    for _ in range(5):
-        site._turn()
-    assert ray.actors["site/stream/gate"] is not actor
-    assert "label_selector" not in ray.actors["site/stream/gate"].options
+    site._streams["gate"].call = Call(error=RayError("unavailable"))
+    site._turn()
+    assert states(site)["gate"] == "starting"
+    ray.nodes[1] = replace(ray.nodes[1], id="3", alive=True)
+    running(site, ray, "gate", "1")
+    assert ray.actors["site/stream/gate"] is actor
+    assert (site.status().streams["gate"].node, site.status().streams["gate"].restarts) == ("n1", 1)
 
 
 def test_a_stream_that_has_ended_is_stopped_and_runs_again_only_if_it_is_changed(site, ray):
@@ -251,7 +266,7 @@ def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, sp
     assert "gate" not in site._streams
     site.add(GATE)
     site._turn()
-    assert "label_selector" not in ray.actors["site/stream/gate"].options
+    assert "scheduling_strategy" not in ray.actors["site/stream/gate"].options
 
 
 def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, monkeypatch):

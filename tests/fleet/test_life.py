@@ -11,7 +11,7 @@ from hypothesis import given
 
 from catstream.fleet import life
 from catstream.fleet.desired import objection, shortage
-from catstream.fleet.life import TABLE, Node, Seen, Step, Wanted, diff, event
+from catstream.fleet.life import TABLE, Node, Order, Seen, Step, Wanted, diff, event
 
 IDS = st.sampled_from(["1", "2", "3"])
 LABELS = st.sampled_from([{}, {"site": "north"}])
@@ -25,7 +25,7 @@ NODES = st.lists(
     ),
     unique_by=lambda node: node.id,
 )
-WANTED = st.builds(Wanted, st.sampled_from(["a", "b"]), st.just(1.0), LABELS, st.sampled_from(["", "n1", "n2"]))
+WANTED = st.builds(Wanted, st.sampled_from(["a", "b"]), st.just(1.0), LABELS, st.sampled_from(["", "1", "2"]))
 
 
 @st.composite
@@ -54,26 +54,18 @@ def test_the_diagram_has_each_line_of_the_table():
 def test_a_stream_that_was_just_placed_where_it_may_be_stays(wanted, nodes):
     order = wanted.order(nodes)
     for node in nodes:
-        if (
-            node.alive
-            and wanted.fits(node)
-            and order.selector.get("ray.io/node-id", node.id) in (node.id, leaving(nodes))
-        ):
+        if node.alive and wanted.fits(node) and order.node in ("", node.id):
             assert (
                 event(wanted, Seen("working", order=order, node=node.id, happened="reports"), nodes, 1.0) == "reports"
             )
 
 
-def leaving(nodes):
-    return f"!in({','.join(sorted(node.id for node in nodes if node.draining))})"
-
-
 @given(WANTED, NODES)
 def test_no_stream_is_sent_to_a_node_that_drains(wanted, nodes):
-    where = wanted.order(nodes).selector.get("ray.io/node-id", "")
-    assert all(where != node.id for node in nodes if node.draining)
-    target = wanted.target(nodes)
-    assert where == (target.id if target is not None else leaving(nodes) if any(n.draining for n in nodes) else "")
+    order, leaving = wanted.order(nodes), sorted(node.id for node in nodes if node.draining)
+    assert order.selector.get("ray.io/node-id", "") == (f"!in({','.join(leaving)})" if leaving else "")
+    assert order.node not in leaving
+    assert order.node in ("", wanted.pinned)
 
 
 @given(seen(), NODES)
@@ -110,18 +102,19 @@ def test_a_stream_of_another_digest_cores_drained_node_or_missing_label_is_stopp
     before = Wanted("a1", labels={"site": "north"})
     running = Seen(state, order=before.order(nodes), node="1")
     assert event(before, running, nodes, 0.0) is None
-    for changed in (Wanted("a2"), Wanted("a1", 2.0), Wanted("a1", pinned="n2"), Wanted("a1", labels={"site": "south"})):
+    for changed in (Wanted("a2"), Wanted("a1", 2.0), Wanted("a1", pinned="2"), Wanted("a1", labels={"site": "south"})):
         assert event(changed, running, nodes, 0.0) == "unwanted"
     assert event(before, running, [replace(nodes[0], draining=True), nodes[1]], 0.0) == "unwanted"
 
 
-def test_a_stream_whose_node_died_is_left_to_ray_unless_it_was_moved_there():
-    nodes = [Node("n1", "1", alive=False), Node("n2", "2")]
-    anywhere, moved = Wanted("a1"), Wanted("a1", pinned="n1")
-    started = [Node("n1", "1"), Node("n2", "2")]
-    assert event(anywhere, Seen("pending", order=anywhere.order(started)), nodes, 0.0) is None
-    assert event(moved, Seen("pending", order=moved.order(started)), nodes, 0.0) == "unwanted"
-    assert moved.order(nodes).selector == {}
+@pytest.mark.parametrize("wanted", [Wanted("a1"), Wanted("a1", pinned="1")])
+def test_a_stream_whose_node_died_is_left_to_ray_and_stays_elsewhere_if_the_node_returns(wanted):
+    order = wanted.order([Node("n1", "1"), Node("n2", "2")])
+    without = [Node("n1", "1", alive=False), Node("n2", "2")]
+    assert event(wanted, Seen("pending", order=order), without, 0.0) is None
+    assert wanted.order(without) == Order("a1", 1.0, {})
+    again = [Node("n1", "3"), Node("n2", "2")]
+    assert event(wanted, Seen("working", order=order, answered=0.0, node="2"), again, 0.0) is None
 
 
 def test_one_that_hangs_is_started_again_and_one_that_does_not_stop_is_killed():

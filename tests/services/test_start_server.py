@@ -228,3 +228,74 @@ def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own(server):
     assert psutil.pid_exists(server.pid)
     os.close(reading)
     os.close(writing)
+
+
+SHARING = """
+import sys, time
+from catstream.services import start_server as module
+from catstream.services.process_log import ProcessLog
+from catstream.services.start_server import Request, share_start_server, start_server
+from catstream.services.watchdog import Watchdog
+
+share_start_server(int(sys.argv[1]))
+log, watchdog = ProcessLog("trainer", open(sys.argv[2] + ".log", "w+b")), Watchdog()
+process = start_server().start(Request.here("trainer", sys.argv[2], restarted=False), log.fileno(), watchdog.handle)
+print(process.pid, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def sharing(folder, tmp_path):
+    """Starts a program that shares a server with others, and a process of it; both of them."""
+    file = Job(endpoint=str(folder)).save(tmp_path)
+    programs = []
+
+    def start(program):
+        words = [sys.executable, "-c", SHARING, str(program), str(file)]
+        programs.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        return programs[-1], psutil.Process(int(programs[-1].stdout.readline()))
+
+    yield start
+    for each in programs:
+        each.kill()
+        each.communicate()
+
+
+def has_ended(process):
+    return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
+
+
+def test_programs_share_a_server_that_ends_with_the_process_that_they_name(sharing, until):
+    with subprocess.Popen(["sleep", "600"]) as node:
+        first, one = sharing(node.pid)
+        second, other = sharing(node.pid)
+        server = one.parent()
+        assert other.ppid() == server.pid
+        assert server.ppid() not in (first.pid, second.pid), "it outlives each of them"
+        first.kill()
+        until(lambda: has_ended(one))
+        assert not has_ended(other)
+        third, another = sharing(node.pid)
+        assert another.ppid() == server.pid
+        node.kill()
+        until(lambda: has_ended(server) and has_ended(other) and has_ended(another))
+        assert (second.poll(), third.poll()) == (None, None)
+
+
+def test_a_shared_server_that_was_killed_is_replaced_by_another_one(sharing, until):
+    with subprocess.Popen(["sleep", "600"]) as node:
+        _, one = sharing(node.pid)
+        server = one.parent()
+        server.kill()
+        until(lambda: has_ended(one))
+        _, other = sharing(node.pid)
+        assert other.ppid() != server.pid
+        node.kill()
+
+
+def test_a_program_whose_partner_has_ended_has_a_server_of_its_own(sharing):
+    with subprocess.Popen(["true"]) as node:
+        node.wait()
+        program, process = sharing(node.pid)
+    assert process.parent().ppid() == program.pid
