@@ -7,50 +7,36 @@ for track in catstream.Pipeline("walk.mp4", {"anna": (120, 80, 64, 48), "ben": (
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import os
 import time
 import warnings
-from collections import deque
 from collections.abc import AsyncIterator, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from copy import copy
 from dataclasses import replace
-from functools import partial
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
-from catstream.errors import CatstreamError, RecordingError, ServiceError, SettingsError, VideoError
-from catstream.messages.kinds import End, Health, ObjectPosition, Position, Track, Tracks
-from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_boxes, check_name
-from catstream.run.job import Job, Results
+from catstream.errors import RecordingError, ServiceError, SettingsError
+from catstream.messages.kinds import Health, Position, Track
+from catstream.messages.names import Boxes, check_boxes
+from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import Learned, check_sizes
-from catstream.run.state import began, learned, locked, position
-from catstream.services.start_server import start_server, start_server_lines
-from catstream.services.supervisor import Supervisor
+from catstream.run.state import begun, position, saved
+from catstream.services.run_reader import RunReader
+from catstream.services.start_server import start_server
 from catstream.settings import Settings
 from catstream.video.frames import without_password
-from catstream.video.source import ALL_FRAMES, is_live, open_source, without_scheme
-from catstream.wire.acknowledged import Receiver
-from catstream.wire.channels import HEALTH, RESULTS
+from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
 from catstream.wire.endpoint import meeting_place, private_folder
-from catstream.wire.newest import Subscriber
-from catstream.wire.readable import readable
+from catstream.wire.readable import finish, finish_async
 
 __all__ = ["Pipeline"]
 
-_CHECK_SECONDS = 0.02
-_EXIT_SECONDS = 12.0  # time for the detector to exit after the end of the stream was received
-_TURN_SECONDS = 0.01
-
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
-#: Files of saved models: of one object without a name, or by name.
-Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
-
 _CLOSED = ExitStack()  # marks a pipeline that was closed
-
-_log = logging.getLogger(__name__)
 
 
 class Pipeline:
@@ -91,10 +77,11 @@ class Pipeline:
         With `resume`: the last track that the caller has; the run continues with the next one. If None, it continues
         after the last checkpoint: tracks of the last second may be repeated.
     results : Results
-        The files that the program writes, stored in the state folder for the program that resumes the run.
+        The files that the program writes, stored in the state folder for the program that resumes the run. A run that
+        is resumed keeps those of each kind that are not given again.
     save_model : path, or a mapping of names to paths
         Files for what was learned of the objects, written as by `catstream save` once the processes have ended, however
-        the run ended. One path is for the only object.
+        the run ended. One path is for the only object. By default those of `results`.
 
     Attributes
     ----------
@@ -148,15 +135,16 @@ class Pipeline:
         self._resumed_job = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         given = settings.changed() if isinstance(settings, Settings) else settings or {}
-        job = _with_objects(self._resumed_job or Job(started=time.time()), box, model)
+        job = self._resumed_job or Job(started=time.time())
         job = replace(
-            job,
-            source=_text(source) if source is not None else job.source,
+            job if box is None and model is None else job.with_objects(box, model),
+            source=source_text(source) if source is not None else job.source,
             part=job.part if part == ALL_FRAMES else part,
             settings=job.settings.but(given),
-            results=results if results is not None else job.results,
+            results=job.results if results is None else results.after(job.results),
         )
-        _check(job, _path(record), is_new=self._resumed_job is None)
+        self._record = Path(record) if record is not None else None
+        _check(job, self._record, is_new=self._resumed_job is None)
         # The source is closed here, because the detector opens it, and a camera can be open in one program only.
         image_rate, skip_damaged = job.settings.run.image_rate, job.settings.run.skip_damaged
         with open_source(job.source, part=job.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
@@ -170,17 +158,11 @@ class Pipeline:
         check_sizes({name: file.stat().st_size for name, file in job.models.items()})
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
-        self._record, self._save_models = _path(record), _files_by_name(save_model)
+        self._save_models = job.results.models if save_model is None else files_by_name(save_model)
         self._after = after
-        self._found = {name: ObjectPosition(each) for name, each in job.boxes.items()}  # where each object was last
-        self._waiting: deque[Track] = deque()  # that were received and not returned yet
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
-        self._supervisor: Supervisor | None = None
-        self._checked = 0.0
-        self._end: End | None = None
-        self._rows = 0  # tracks that were received
-        self._health: dict[str, Health] = {}
+        self._reader: RunReader | None = None
 
     @property
     def source(self) -> str:
@@ -197,6 +179,16 @@ class Pipeline:
         """All settings of the run."""
         return self._job.settings
 
+    @property
+    def results(self) -> Results:
+        """The files that the program writes, with those of the run that is resumed."""
+        return self._job.results
+
+    @property
+    def earlier_results(self) -> Results:
+        """The files of the run that is resumed; none for a new run."""
+        return self._resumed_job.results if self._resumed_job is not None else Results()
+
     def starting_after(self, position: Position | None) -> Self:
         """A copy of a pipeline that has not started yet, with another `after`."""
         if self._stack is not None:
@@ -212,18 +204,13 @@ class Pipeline:
             folder = stack.enter_context(private_folder())
             settings, shown = self.settings, without_password(self.source)
             endpoint = stack.enter_context(meeting_place(settings.run.endpoint, folder, settings.run.keys, shown))
-            start = Position()
             if self._state is not None:
-                stack.enter_context(_begun(self._state, self._resumed_job, self._job))
-                start = self._start(self._state) if self._resumed_job is not None else start
-            self._found |= start.objects
-            self._incoming = stack.enter_context(Receiver(RESULTS, endpoint, start, settings.run.unstored_frames))
-            self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
-            if self._save_models:  # from the compressor's last checkpoint
-                stack.enter_context(_saved(self._save_models, self._state or folder, settings))
-            supervisor = Supervisor(self._started(str(endpoint)), folder)
-            stack.callback(supervisor.stop, partial(_receive_rest, self._incoming))  # without a circle: see `__del__`
-            self._endpoint, self._supervisor, self._stack = str(endpoint), supervisor, stack.pop_all()
+                stack.enter_context(begun(self._state, self._resumed_job, self._job))
+            job = self._started(str(endpoint))
+            reader = stack.enter_context(RunReader(job, endpoint, self._start, folder, live=self.live))
+            stack.enter_context(saved(self._save_models, self._state or folder, settings))
+            stack.callback(reader.stop)  # before the models are saved, from the compressor's last checkpoint
+            self._endpoint, self._reader, self._stack = str(endpoint), reader, stack.pop_all()
         return self
 
     def _started(self, endpoint: str) -> Job:
@@ -251,8 +238,7 @@ class Pipeline:
         """Stop the processes in order, after they have stored everything. The pipeline cannot be started again."""
         stack, self._stack = self._stack, _CLOSED
         if stack is not None and stack is not _CLOSED:
-            with stack:
-                self._receive_health()  # the health that has arrived since the last track, before Ctrl-C
+            stack.close()
 
     def __del__(self) -> None:
         if getattr(self, "_stack", None) not in (None, _CLOSED):
@@ -289,71 +275,29 @@ class Pipeline:
         Raises
         ------
         ServiceError
-            If the pipeline was not started, or has ended.
+            If the pipeline was not started, or was closed.
         """
-        returned = time.monotonic()
-        while not self._over():
-            tracks = self._take(min(seconds, _CHECK_SECONDS))
-            if tracks is not None or time.monotonic() - returned >= seconds:
-                yield tracks.tracks if tracks is not None else {}
-                returned = time.monotonic()
-        for _ in self._wait_for_exit():
-            time.sleep(_TURN_SECONDS)
-        self._raise_failure()
+        while (tracks := finish(self._running.next_frame(seconds))) is not None:
+            yield tracks
 
     def _tracks(self) -> Iterator[Track]:
-        """The tracks that arrive from now on."""
-        yield from self._rest()
-        for tracks in self.by_frame():
-            self._waiting.extend(tracks.values())
-            yield from self._rest()
+        """The tracks that arrive from now on; the loop before may have ended within a frame."""
+        while (track := finish(self._running.next_track())) is not None:
+            yield track
 
     async def _tracks_async(self) -> AsyncIterator[Track]:
         """The same for an event loop, without blocking it."""
-        while not self._over() or self._waiting:
-            for track in self._rest():
-                yield track
-            if (tracks := self._take(0)) is not None:
-                self._waiting.extend(tracks.tracks.values())
-            elif self._end is None:
-                await readable([self._incoming], _CHECK_SECONDS)
-        for _ in self._wait_for_exit():
-            await asyncio.sleep(_TURN_SECONDS)
-        self._raise_failure()
+        while (track := await finish_async(self._running.next_track())) is not None:
+            yield track
 
-    def _rest(self) -> Iterator[Track]:
-        """The tracks that were received and not returned yet: the loop before may have ended within a frame."""
-        while self._waiting:
-            yield self._waiting.popleft()
-
-    def _over(self) -> bool:
-        """Whether the end of the stream was received."""
+    @property
+    def _running(self) -> RunReader:
+        """The reader of the run, while it is open."""
         if self._stack is _CLOSED:
             raise ServiceError(_ONCE)
-        return self._end is not None
-
-    def _take(self, seconds: float) -> Tracks | None:
-        """The tracks of the next frame, None if none arrive in time; checks the processes now and then."""
-        message = self._incoming.receive(seconds)
-        if isinstance(message, Tracks):
-            self._found = {
-                name: ObjectPosition(each.box) if each.box is not None else self._found.get(name, ObjectPosition())
-                for name, each in message.tracks.items()
-            }
-            self._incoming.acknowledge(Position(message.seq, message.frame, self._found))
-            self._rows += len(message.tracks)
-        elif isinstance(message, End):
-            self._incoming.acknowledge(Position(message.seq))
-            self._end = message
-        if time.monotonic() - self._checked > _CHECK_SECONDS:
-            self._checked = time.monotonic()
-            self._watch()
-        return message if isinstance(message, Tracks) else None
-
-    def _raise_failure(self) -> None:
-        """Raise VideoError if the source failed."""
-        if self._end is not None and self._end.failed:
-            raise VideoError(self._end.reason)
+        if self._reader is None:
+            raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
+        return self._reader
 
     @property
     def endpoint(self) -> str:
@@ -376,35 +320,35 @@ class Pipeline:
         frames of a file were left out, how many were `damaged`; of a live source, how many frames were `skipped`, and
         how often it was `reopened`.
         """
-        if self._end is None:
+        if self._reader is None or self._reader.end is None:
             return {}
-        own = {"rows": self._rows, "restarts": self.restarts}
-        return {name: int(value) for name, value in self._end.totals.items()} | own
+        own = {"rows": self._reader.rows, "restarts": self.restarts}
+        return {name: int(value) for name, value in self._reader.end.totals.items()} | own
 
     @property
     def reason(self) -> str:
         """At the end: why the stream ended; empty before."""
-        return self._end.reason if self._end is not None else ""
+        return self._reader.end.reason if self._reader is not None and self._reader.end is not None else ""
 
     @property
     def health(self) -> dict[str, dict[str, float]]:
         """The counters of each process that were received last, by the name of the process."""
-        return {name: health.counters for name, health in self._health.items()}
+        return {name: health.counters for name, health in self._reports.items()}
 
     @property
     def trouble(self) -> dict[str, str]:
         """Descriptions of current problems, by the name of the process; empty if there are none."""
-        return {name: health.trouble for name, health in self._health.items() if health.trouble}
+        return {name: health.trouble for name, health in self._reports.items() if health.trouble}
 
     @property
     def pids(self) -> dict[str, int]:
         """Process ids of the running processes, by name."""
-        return self._supervisor.pids if self._supervisor is not None else {}
+        return self._reader.supervisor.pids if self._reader is not None else {}
 
     @property
     def restarts(self) -> int:
         """How many times a process was restarted."""
-        return self._supervisor.restarts if self._supervisor is not None else 0
+        return self._reader.supervisor.restarts if self._reader is not None else 0
 
     @property
     def lost_seconds(self) -> float:
@@ -414,14 +358,12 @@ class Pipeline:
     @property
     def waits(self) -> bool:
         """Whether a new run waits for a box, because it has neither box nor model; false for a resumed run."""
-        return not self._found and not self._job.models and self._resumed_job is None
+        return not self._job.boxes and not self._job.models and self._resumed_job is None
 
     @property
     def complete(self) -> bool:
         """Whether the run to resume has already tracked all frames; valid before the start."""
-        if self._resumed_job is None or self._state is None or self.frames is None or self.live:
-            return False
-        return self._start(self._state).seq >= self.frames
+        return self._resumed_job is not None and self.frames is not None and self._start.seq >= self.frames
 
     @property
     def holding(self) -> str:
@@ -429,79 +371,25 @@ class Pipeline:
         counters = self.health.get("detector", {})
         return next((name for name in ("waiting", "paused") if counters.get(name)), "")
 
-    def _start(self, state: Path) -> Position:
+    @property
+    def _reports(self) -> dict[str, Health]:
+        """The newest health report of each process, by its name."""
+        return self._reader.health if self._reader is not None else {}
+
+    @property
+    def _start(self) -> Position:
         """The track after which the run continues."""
+        if self._resumed_job is None:
+            return Position()
         if self._after is not None and not self.live:
             return self._after
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
-        learned = position(state, self.settings)
-        return max(learned, self._after or learned, key=lambda start: start.seq)
+        return max(self._learned, self._after or self._learned, key=lambda start: start.seq)
 
-    def _watch(self) -> None:
-        """Receive the health, restart processes that died, and log warnings for the user."""
-        self._receive_health()
-        self._children.check_children()
-        for line in [*start_server_lines(), *(self._children.new_lines("detector") if self.live else ())]:
-            _log.warning("%s", line)  # kernels are compiled; a live source was lost or is available again
-        if self._children.finished and self._end is None:
-            raise ServiceError("the processes ended before the video did: this should not happen, please report it")
-
-    def _receive_health(self) -> None:
-        """Receive the health of the processes, and log each new problem."""
-        for health in self._reports.receive_all():
-            before = self._health.get(health.process)
-            if health.trouble and (before is None or before.trouble != health.trouble):
-                _log.warning("%s: %s", health.process, health.trouble)
-            self._health[health.process] = health
-
-    def _wait_for_exit(self) -> Iterator[None]:
-        """Yield until the detector has exited; it does so once its last message is acknowledged."""
-        deadline = time.monotonic() + _EXIT_SECONDS
-        while not self._children.finished and time.monotonic() < deadline:
-            yield
-            self._incoming.receive(0)
-            self._receive_health()
-            self._children.check_children()
-        self._receive_health()
-
-    @property
-    def _children(self) -> Supervisor:
-        if self._supervisor is None:
-            raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
-        return self._supervisor
-
-
-def _receive_rest(incoming: Receiver[Tracks | End]) -> None:
-    """Receive the tracks that nobody iterates over any more, so that the detector need not wait for that."""
-    while (message := incoming.receive(0)) is not None:
-        incoming.acknowledge(Position(message.seq))
-
-
-def _path(path: str | os.PathLike[str] | None) -> Path | None:
-    return None if path is None else Path(path)
-
-
-def _text(source: object) -> str:
-    """The text of a source that a program has given."""
-    if isinstance(source, (str, int, os.PathLike)):
-        return without_scheme(str(source))
-    raise VideoError(
-        f"a source is a path, an address or the number of a camera, got {type(source).__name__}: "
-        "for frames in memory, call catstream.Tracker.update with each of them"
-    )
-
-
-def _with_objects(job: Job, box: Boxes | None, model: Models | None) -> Job:
-    """The job with other objects, if any are given."""
-    if box is None and model is None:
-        return job
-    models = {name: file.absolute() for name, file in _files_by_name(model).items()}
-    return replace(job, boxes={} if box is None else boxes_by_name(box), models=models)
-
-
-def _files_by_name(files: Models | None) -> dict[str, Path]:
-    named = files if isinstance(files, Mapping) else {} if files is None else {UNNAMED: files}
-    return {check_name(name): Path(file) for name, file in named.items()}
+    @cached_property
+    def _learned(self) -> Position:
+        """The position of the checkpoint from which the run is resumed."""
+        return position(self._state) if self._state is not None else Position()
 
 
 def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
@@ -512,43 +400,3 @@ def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
         raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
     if record is not None and record.exists() and is_new:
         raise RecordingError(f"{record} exists already: give another name, or remove it")
-
-
-@contextmanager
-def _begun(folder: Path, kept: Job | None, job: Job) -> Iterator[None]:
-    """Lock the state folder, and store the job there if it is new or has changed."""
-    with locked(folder):
-        if kept is None and began(folder):
-            raise ServiceError(
-                f"{str(folder)!r} already contains a run: continue it (--resume {folder}), or give another folder"
-            )
-        if job != kept:
-            job.save(folder)
-        yield
-
-
-@contextmanager
-def _saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterator[None]:
-    """Save what was learned of each object to its file afterwards; an error of the run comes before those of saving."""
-    try:
-        yield
-    except BaseException:
-        for error in _save(files, state, settings):
-            _log.warning("%s", error)
-        raise
-    errors = _save(files, state, settings)
-    for error in errors[1:]:
-        _log.warning("%s", error)
-    if errors:
-        raise errors[0]
-
-
-def _save(files: Mapping[str, Path], state: Path, settings: Settings) -> list[CatstreamError]:
-    """Save what was learned of each object to its file; returns the errors of those that could not be saved."""
-    errors: list[CatstreamError] = []
-    for name, file in files.items():
-        try:
-            learned(state, settings, name).save(file)
-        except CatstreamError as error:
-            errors.append(error)
-    return errors

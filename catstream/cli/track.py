@@ -22,7 +22,7 @@ from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, doubtful, listed
 from catstream.messages.storage import why_not_writable
 from catstream.pipeline import Pipeline
-from catstream.run.job import Job, Results
+from catstream.run.job import Results
 from catstream.services.options import named, with_given, with_object, with_part, with_reading
 from catstream.sinks.recording.file import Recording
 from catstream.sinks.run import RunFiles
@@ -157,9 +157,7 @@ def track(
         raise click.UsageError(
             "--resume continues the existing results, and --overwrite replaces them: give one of them"
         )
-    known = Job.load(resume).results if resume is not None else Results()
     saved = {name: Path(file) for name, file in named("--save-model", save_model).items()}
-    results = _results(known, output, video, write, saved)
     pipeline = Pipeline(
         source,
         boxes or None,
@@ -169,16 +167,21 @@ def track(
         state=state,
         record=record,
         resume=resume,
-        results=results,
-        save_model=results.models,
+        results=Results(  # absolute, to resume from any folder
+            output=output and output.absolute(),
+            video=video,
+            write=tuple(file.absolute() for file in write if file != STDOUT),
+            models={name: file.absolute() for name, file in saved.items()},
+        ),
     )
+    results, earlier = pipeline.results, pipeline.earlier_results
     if view is not None:
         require_extra("view")
     files = _files(pipeline, results, STDOUT in write, [*boxes, *models])
     files.check_writable(
         overwrite=overwrite,
         resumable=state is not None or resume is not None,
-        known=[*known.write, *([known.output] if known.output is not None else [])],
+        known=[*earlier.write, *([earlier.output] if earlier.output is not None else [])],
     )
     _check_models(saved, overwrite)
     if UNNAMED in saved and len(boxes) + len(models) > 1:
@@ -283,19 +286,6 @@ def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
     return (
         f"the run in {resume} is complete, all {pipeline.frames} frames were tracked{results}; "
         "to track the source again, start a new run in another folder (--state DIR)"
-    )
-
-
-def _results(
-    known: Results, output: Path | None, video: bool, write: tuple[Path, ...], models: Mapping[str, Path]
-) -> Results:
-    """The files of a run, including those of its earlier part; the paths are absolute, to resume from any folder."""
-    files = tuple(file.absolute() for file in write if file != STDOUT)
-    return Results(
-        output=output.absolute() if output is not None else known.output,
-        video=video or known.video,
-        write=files or known.write,
-        models={name: file.absolute() for name, file in models.items()} or known.models,
     )
 
 

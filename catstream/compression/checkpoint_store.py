@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from catstream.compression.forest import Forest
 from catstream.errors import ProtocolError
+from catstream.messages.kinds import Position
 from catstream.settings import Settings
 
 __all__ = ["CheckpointStore"]
 
 _KEPT = 2
 _DAMAGED = "damaged"  # name of the newest damaged checkpoint, which is kept for analysis
+
+Read = TypeVar("Read")
 
 _log = logging.getLogger(__name__)
 
@@ -55,19 +60,33 @@ class CheckpointStore:
         SettingsError
             If it was made with another coreset size.
         """
-        self._damaged, forest = [], None
-        for path in reversed(self._files()):
-            try:
-                forest = Forest.load(path, settings)
-                break
-            except (ProtocolError, OSError) as error:
-                _log.warning("a checkpoint cannot be used: %s", error)
-                self._damaged.append(path)
+        forest = self._newest(lambda path: Forest.load(path, settings))
         if self._damaged:
             instead = f"the one of frame {forest.frame} was used" if forest else "everything is learned again"
             self._found_damaged = f"damaged checkpoints: {len(self._damaged)}, {instead}"
             _log.warning("%s", self._found_damaged)
         return forest or Forest(settings)
+
+    def position(self) -> Position:
+        """The position of the newest undamaged checkpoint, read without its trees; that of a new run if there is none.
+
+        Raises
+        ------
+        ServiceError
+            As `load`.
+        """
+        return self._newest(Forest.position_in) or Position()
+
+    def _newest(self, read: Callable[[Path], Read]) -> Read | None:
+        """The newest checkpoint that is not damaged, as `read` returns it; None if there is none."""
+        self._damaged = []
+        for path in reversed(self._files()):
+            try:
+                return read(path)
+            except (ProtocolError, OSError) as error:
+                _log.warning("a checkpoint cannot be used: %s", error)
+                self._damaged.append(path)
+        return None
 
     def save(self, forest: Forest) -> bool:
         """Write a checkpoint, and remove the oldest; returns False and changes nothing if it cannot be written."""

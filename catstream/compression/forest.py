@@ -6,10 +6,11 @@ import os
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
-from catstream.messages.kinds import Features, Position, Sample
+from catstream.messages.kinds import Features, ObjectPosition, Position, Sample
 from catstream.messages.storage import Arrays, Metadata, with_prefix
 from catstream.settings import Settings
 
@@ -123,6 +124,24 @@ class Forest:
         arrays, metadata = self.state()
         storage.write(path, arrays, metadata | {"kind": _KIND})
 
+    @staticmethod
+    def position_in(path: str | os.PathLike[str]) -> Position:
+        """The position in a file that `save` wrote, with the box of each object; no tree is made.
+
+        Raises
+        ------
+        ProtocolError, ServiceError
+            As `load`.
+        """
+        metadata = storage.read_metadata(path)
+        _check_kind(path, metadata)
+        try:
+            boxes = {str(own["name"]): own["box"] for own in metadata["objects"]}
+            objects = {name: ObjectPosition(Box(*box) if box else None) for name, box in boxes.items()}
+            return Position(int(metadata["seq"]), max(int(metadata["frame"]), 0), objects)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
+
     @classmethod
     def load(cls, path: str | os.PathLike[str], settings: Settings) -> Forest:
         """Restore what `save` wrote.
@@ -137,11 +156,7 @@ class Forest:
             If it was made with another coreset size.
         """
         arrays, metadata = storage.read(path)
-        if (kind := metadata.get("kind")) != _KIND:
-            raise ServiceError(
-                f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: continue with the version that wrote it, "
-                "or start a new run in another folder"
-            )
+        _check_kind(path, metadata)
         try:
             self = cls.from_state(arrays, metadata, settings)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -178,3 +193,12 @@ class Forest:
             name = str(own["name"])
             self.compressors[name] = Compressor.from_state(with_prefix(arrays, f"{i}."), own, settings, name)
         return self
+
+
+def _check_kind(path: str | os.PathLike[str], metadata: Metadata) -> None:
+    """Raise ServiceError unless a file is a checkpoint of this version."""
+    if (kind := metadata.get("kind")) != _KIND:
+        raise ServiceError(
+            f"{path} is of kind {kind!r}, this catstream reads {_KIND!r}: continue with the version that wrote it, "
+            "or start a new run in another folder"
+        )

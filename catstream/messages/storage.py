@@ -30,6 +30,7 @@ __all__ = [
     "lock",
     "name_fits",
     "read",
+    "read_metadata",
     "remove_parts",
     "why_not_writable",
     "write",
@@ -205,6 +206,17 @@ def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
     return decode(Path(path).read_bytes(), str(path))
 
 
+def read_metadata(path: str | os.PathLike[str]) -> Metadata:
+    """Return the metadata of a file that `write` wrote; the arrays are only checked, not copied.
+
+    Raises
+    ------
+    ProtocolError
+        As in `read`.
+    """
+    return _checked(Path(path).read_bytes(), str(path))[1]
+
+
 def encode(arrays: Arrays, metadata: Metadata) -> bytes:
     """Return the content of the file that `write` writes."""
     return b"".join(_parts(arrays, metadata))
@@ -218,11 +230,17 @@ def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
     ProtocolError
         As in `read`.
     """
+    arrays, metadata = _checked(data, name)
+    return {key: array.copy() for key, array in arrays.items()}, metadata
+
+
+def _checked(data: bytes, name: str) -> tuple[Arrays, Metadata]:
+    """The metadata and the arrays in the content of a file; the arrays are read-only and share its memory."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
     try:
-        arrays = {key: array.copy() for key, array in load(data).items()}  # `load` checks the header, and shares `data`
+        arrays = load(data)  # it checks the header
         length = int.from_bytes(data[:8], "little")
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][_KEY])
         metadata = header["facts"]

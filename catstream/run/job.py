@@ -6,19 +6,23 @@ folder keeps a copy of the job in that folder, from which it is resumed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
-from catstream.messages.names import check_count, listed
+from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
 from catstream.messages.storage import Metadata
 from catstream.settings import Settings
 
-__all__ = ["Job", "Results"]
+__all__ = ["Job", "Models", "Results", "files_by_name"]
+
+#: Files of saved models: of one object without a name, or by name.
+Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 
 _NAME = "job.safetensors"
 
@@ -40,6 +44,15 @@ class Results:
     video: bool = False
     write: tuple[Path, ...] = ()
     models: dict[str, Path] = field(default_factory=dict)
+
+    def after(self, earlier: Results) -> Results:
+        """These files, and of a kind of which there is none those of the earlier part of the run."""
+        return Results(
+            output=self.output or earlier.output,
+            video=self.video or earlier.video,
+            write=self.write or earlier.write,
+            models=self.models or earlier.models,
+        )
 
     @classmethod
     def from_json(cls, metadata: Metadata) -> Results:
@@ -96,6 +109,11 @@ class Job:
                 "give one of them"
             )
         check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
+
+    def with_objects(self, box: Boxes | None, model: Models | None) -> Job:
+        """The job with these objects instead of its own, which have boxes or are searched for by saved models."""
+        models = {name: file.absolute() for name, file in files_by_name(model).items()}
+        return replace(self, boxes={} if box is None else boxes_by_name(box), models=models)
 
     def save(self, folder: Path) -> Path:
         """Write the job to a folder, readable by its owner only: the source may contain a password.
@@ -164,6 +182,12 @@ class Job:
         size = "" if self.size is None else f"{self.size[0]}x{self.size[1]} pixels, "
         numbers = (self.part.start, self.part.stop, self.part.step)
         return f"{size}frames {':'.join('' if number is None else str(number) for number in numbers)}"
+
+
+def files_by_name(files: Models | None) -> dict[str, Path]:
+    """Files by the names of their objects; a file without a name is for the only object."""
+    named = files if isinstance(files, Mapping) else {} if files is None else {UNNAMED: files}
+    return {check_name(name): Path(file) for name, file in named.items()}
 
 
 def _plain(value: object) -> object:

@@ -12,6 +12,7 @@ happens.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -19,7 +20,7 @@ from pathlib import Path
 
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
-from catstream.errors import ObjectError, ServiceError
+from catstream.errors import CatstreamError, ObjectError, ServiceError
 from catstream.messages import storage
 from catstream.messages.kinds import Position
 from catstream.messages.names import UNNAMED, listed
@@ -27,7 +28,7 @@ from catstream.run.job import Job
 from catstream.run.learned import Learned
 from catstream.settings import Settings
 
-__all__ = ["SEARCHED", "TREES", "began", "files", "learned", "locked", "position", "restore", "skip"]
+__all__ = ["SEARCHED", "TREES", "began", "begun", "files", "learned", "locked", "position", "restore", "saved", "skip"]
 
 #: Folder of the checkpoints, in that of the state.
 TREES = "trees"
@@ -41,15 +42,17 @@ _NAMES = re.compile(
 )
 _ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
 
+_log = logging.getLogger(__name__)
+
 
 def began(folder: Path) -> bool:
     """Whether a pipeline was started in this folder."""
     return Job.is_in(folder) or (folder / TREES).exists()
 
 
-def position(folder: Path, settings: Settings) -> Position:
-    """The position of the newest valid checkpoint."""
-    return CheckpointStore(folder / TREES).load(settings).position
+def position(folder: Path) -> Position:
+    """The position of the newest valid checkpoint: where the run is resumed."""
+    return CheckpointStore(folder / TREES).position()
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
@@ -149,3 +152,43 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
         yield folder
     finally:
         os.close(handle)
+
+
+@contextlib.contextmanager
+def begun(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
+    """Lock the state folder, and store the job there if it is new or has changed."""
+    with locked(folder):
+        if resumed is None and began(folder):
+            raise ServiceError(
+                f"{str(folder)!r} already contains a run: continue it (--resume {folder}), or give another folder"
+            )
+        if job != resumed:
+            job.save(folder)
+        yield
+
+
+@contextlib.contextmanager
+def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterator[None]:
+    """Save what was learned of each object to its file afterwards; an error of the run comes before those of saving."""
+    try:
+        yield
+    except BaseException:
+        for error in _save(files, state, settings):
+            _log.warning("%s", error)
+        raise
+    errors = _save(files, state, settings)
+    for error in errors[1:]:
+        _log.warning("%s", error)
+    if errors:
+        raise errors[0]
+
+
+def _save(files: Mapping[str, Path], state: Path, settings: Settings) -> list[CatstreamError]:
+    """Save what was learned of each object to its file; returns the errors of those that could not be saved."""
+    errors: list[CatstreamError] = []
+    for name, file in files.items():
+        try:
+            learned(state, settings, name).save(file)
+        except CatstreamError as error:
+            errors.append(error)
+    return errors

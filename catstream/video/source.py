@@ -24,6 +24,7 @@ are live: see `catstream.video.live`.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -52,7 +53,7 @@ __all__ = [
     "natural_order",
     "open_source",
     "read_image",
-    "without_scheme",
+    "source_text",
 ]
 
 #: All frames of a source.
@@ -198,7 +199,7 @@ def open_source(
             "standard input is not a source, because a restarted process cannot read it again: "
             "write the video to a file, or serve it as a stream"
         )
-    path = Path(without_scheme(str(text)))
+    path = Path(source_text(text))
     images = partial(_open_images, part=part, start=start, rate=image_rate, resize=resize)
     video = partial(_open_video, part=part, start=start, skip_damaged=skip_damaged)
     try:
@@ -218,17 +219,23 @@ def open_source(
     raise VideoError(f"there is no video or folder {str(text)!r}: {_EXPECTED}")
 
 
-def without_scheme(text: str) -> str:
-    """Return the path of a file:// address, and any other text unchanged.
+def source_text(source: object) -> str:
+    """The text of a source that a program has given; of a file:// address its path.
 
     Raises
     ------
     VideoError
-        If the address names another machine.
+        If it is neither a path, an address nor a number, or if the address names another machine.
 
-    >>> without_scheme("file:///videos/a%20walk.mp4"), without_scheme("./0")
-    ('/videos/a walk.mp4', './0')
+    >>> source_text("file:///videos/a%20walk.mp4"), source_text(Path("walk.mp4")), source_text(0)
+    ('/videos/a walk.mp4', 'walk.mp4', '0')
     """
+    if not isinstance(source, (str, int, os.PathLike)):
+        raise VideoError(
+            f"a source is a path, an address or the number of a camera, got {type(source).__name__}: "
+            "for frames in memory, call catstream.Tracker.update with each of them"
+        )
+    text = str(source)
     if not text.startswith("file://"):
         return text
     address = urlsplit(text)

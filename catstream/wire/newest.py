@@ -202,8 +202,8 @@ class Subscriber(ChannelSocket[Message]):
         self._connect()
 
     def pending(self) -> bool:
-        """Whether something has arrived."""
-        return bool(self._arrived) or self._wait(0)
+        """Whether something has arrived that was not received yet."""
+        return bool(self._arrived) or super().pending()
 
     def receive(self, seconds: float) -> Message | None:
         """The next message, None if none arrived in time; repeats and what is rejected are passed over."""

@@ -151,6 +151,10 @@ class ChannelSocket(Generic[Message]):
         for sender in self.channel.senders:
             self._socket.connect(self._endpoint.address(self.channel, sender))
 
+    def pending(self) -> bool:
+        """Whether something has arrived that was not received yet."""
+        return self._wait(0)
+
     def _wait(self, seconds: float) -> bool:
         """Whether something arrives within so many seconds; handles the events of connections first."""
         self._read_events()

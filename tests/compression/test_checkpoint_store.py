@@ -12,7 +12,7 @@ from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
 from catstream.errors import SettingsError
 from catstream.messages.heads import GROUPS
-from catstream.messages.kinds import Features, ObjectFeatures, TrainingRows
+from catstream.messages.kinds import Features, ObjectFeatures, Position, TrainingRows
 from catstream.settings import Settings
 
 SETTINGS = Settings(coreset={"size": 8})
@@ -56,6 +56,17 @@ def test_the_newest_two_checkpoints_are_kept_and_the_newest_is_used(kept):
 
 def test_a_folder_without_any_begins_anew(tmp_path):
     assert CheckpointStore(tmp_path).load(SETTINGS).seq == 0
+    assert CheckpointStore(tmp_path).position() == Position()
+
+
+def test_the_position_is_that_of_the_checkpoint_that_would_be_loaded(kept):
+    for seq in (60, 50):
+        position, loaded = CheckpointStore(kept).position(), CheckpointStore(kept).load(SETTINGS).position
+        assert (position.seq, position.frame, position.objects.keys()) == (seq, loaded.frame, loaded.objects.keys())
+        assert [each.box for each in position.objects.values()] == [each.box for each in loaded.objects.values()]
+        data = bytearray(newest(kept).read_bytes())
+        data[-1] ^= 1  # in an array, not in the header
+        newest(kept).write_bytes(data)
 
 
 @pytest.mark.parametrize("share", [0, 0.001, 0.5, 0.999])

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from catstream import pipeline as module
 from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
+from catstream.services import run_reader
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 
@@ -43,7 +43,7 @@ def test_a_detector_that_has_ended_with_the_stream_is_no_failure(pipeline, monke
         check(supervisor)
 
     monkeypatch.setattr(Supervisor, "check_children", check_late)
-    monkeypatch.setattr(module, "_CHECK_SECONDS", -1)
+    monkeypatch.setattr(run_reader, "_CHECK_SECONDS", 0)
     assert [track.frame for track in pipeline] == list(range(20))
 
 
