@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import replace
 from time import monotonic
 from typing import Self
 from uuid import uuid4
 
 from catstream.box import Box
-from catstream.client.registry import fleet_and_stream, locate
+from catstream.client.registry import follow, locate
 from catstream.errors import CommandRejectedError, SilenceError
 from catstream.messages.kinds import Answer, Command, SavedModel
 from catstream.messages.names import UNNAMED, check_name
@@ -63,9 +62,8 @@ class Control:
     def __init__(
         self, endpoint: str | Endpoint = "", *, timeout: float = 5.0, keys: str = "", source: str = ""
     ) -> None:
-        self._stream = str(endpoint) if fleet_and_stream(endpoint) is not None else ""
-        self._keys = keys
-        self._place = locate(endpoint, keys, source)
+        self._stream = follow(endpoint, keys)
+        self._place = self._stream.endpoint if self._stream is not None else locate(endpoint, keys, source)
         self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
         self._commands = Requester[Command, Answer](CONTROL, self._place)
 
@@ -166,6 +164,8 @@ class Control:
     def close(self) -> None:
         """Disconnect; the pipeline continues."""
         self._commands.close()
+        if self._stream is not None:
+            self._stream.close()
 
     def __enter__(self) -> Self:
         return self
@@ -188,14 +188,13 @@ class Control:
 
     def _follow(self) -> None:
         """Connect to the pipeline that a stream of a fleet has now; the last one, if the registry does not answer."""
-        if not self._stream:
+        if self._stream is None:
             return
-        with suppress(SilenceError):
-            place = locate(self._stream, self._keys, timeout=_REGISTRY_SECONDS)
-            if place != self._place:
-                self._commands.close()
-                self._place, self.endpoint = place, str(place)
-                self._commands = Requester[Command, Answer](CONTROL, place)
+        self._stream.ask(_REGISTRY_SECONDS)
+        if (place := self._stream.endpoint) != self._place:
+            self._commands.close()
+            self._place, self.endpoint = place, str(place)
+            self._commands = Requester[Command, Answer](CONTROL, place)
 
     def _ask(self, command: Command) -> Answer:
         self._follow()

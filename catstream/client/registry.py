@@ -16,6 +16,7 @@ for the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet:/
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -25,7 +26,8 @@ from typing import Self, TypeVar
 from uuid import uuid4
 
 from catstream.errors import ProtocolError, ServiceError, SilenceError
-from catstream.messages.kinds import End, FleetStatus, Listing, NodeStatus, Question, StreamStatus
+from catstream.messages.kinds import End, Features, FleetStatus, Listing, NodeStatus, Question, StreamStatus, Track
+from catstream.messages.names import UNNAMED
 from catstream.messages.schema import LONGEST_LIST
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
@@ -41,6 +43,7 @@ __all__ = [
     "address_of",
     "described",
     "fleet_and_stream",
+    "follow",
     "locate",
 ]
 
@@ -258,6 +261,7 @@ class FollowedStream:
     def __init__(self, registry: Registry, stream: str) -> None:
         self._stream, self._registry = stream, registry
         self._pipeline_end: End | None = None
+        self._frames: dict[str, int] = {}  # the newest frame of each object
         self.end: End | None = None
         try:
             self.place = self._registry.place(stream)
@@ -267,16 +271,25 @@ class FollowedStream:
         self._conclude(self.place.status)
         self._next_question = monotonic() + _QUIET_SECONDS
 
-    def message_arrived(self) -> None:
-        """Report a message from the pipeline: the registry is not asked while there are any."""
+    def take(self, message: object) -> bool:
+        """Note a message from the pipeline; returns False if it is of a frame that the stream has repeated.
+
+        The registry is not asked while there are any.
+        """
         self._next_question = monotonic() + _QUIET_SECONDS
+        if isinstance(message, Track | Features):
+            name = message.object if isinstance(message, Track) else UNNAMED
+            if message.frame <= self._frames.get(name, -1):
+                return False
+            self._frames[name] = message.frame
+        return True
 
     def pipeline_ended(self, end: End) -> None:
         """Report the end of the pipeline: the registry is asked at once whether it is that of the stream."""
         self._pipeline_end, self._next_question = self._pipeline_end or end, monotonic()
 
-    def has_moved(self) -> bool:
-        """Ask if it is time to, take the answer if it has arrived, and return whether `place` has another pipeline."""
+    def update(self) -> bool:
+        """Ask if it is time to, and take the answer if it has arrived; returns whether `place` has another pipeline."""
         now = monotonic()
         if now >= self._next_question:
             self._registry.request(self._stream)
@@ -288,11 +301,32 @@ class FollowedStream:
         if place is None:
             self.end = End(0, f"the stream {self._stream} was removed from the fleet {fleet}")
             return False
-        moved = place.endpoint is not None and place.identity != self.place.identity
-        if moved:
-            self.place, self._pipeline_end = place, None
-        self._conclude(place.status)
-        return moved
+        return self._move_to(place)
+
+    def ask(self, seconds: float) -> None:
+        """Ask the registry now, and wait for the answer; the last one holds if none arrives in time.
+
+        Raises
+        ------
+        ServiceError
+            If the fleet has no such stream any more.
+        """
+        self._registry.timeout = seconds
+        with contextlib.suppress(SilenceError):
+            self._move_to(self._registry.place(self._stream))
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """The endpoint of its pipeline, as the registry said it last.
+
+        Raises
+        ------
+        ServiceError
+            If it runs nowhere.
+        """
+        if self.place.endpoint is None or not self.status.endpoint:
+            raise ServiceError(f"the stream {self._stream} runs nowhere, {described(self.status)}")
+        return self.place.endpoint
 
     def fileno(self) -> int:
         """Readable if an answer may have arrived."""
@@ -301,6 +335,16 @@ class FollowedStream:
     def close(self) -> None:
         """Disconnect from the registry."""
         self._registry.close()
+
+    def _move_to(self, place: Place) -> bool:
+        """Keep what the registry says of the stream; returns whether it has another pipeline."""
+        moved = place.endpoint is not None and place.identity != self.place.identity
+        if moved:
+            if not self.place.continues_as(place):
+                self._frames.clear()
+            self.place, self._pipeline_end = place, None
+        self._conclude(place.status)
+        return moved
 
     def _conclude(self, status: StreamStatus) -> None:
         """Keep the state; end if the stream has ended."""
@@ -418,6 +462,20 @@ def fleet_and_stream(endpoint: str | Endpoint) -> tuple[str, str] | None:
     return fleet, stream
 
 
+def follow(endpoint: str | Endpoint, keys: str = "") -> FollowedStream | None:
+    """The stream of a fleet that has this address; None if it is no address of a stream.
+
+    Raises
+    ------
+    ServiceError, SilenceError
+        As `Registry` and `FollowedStream`.
+    """
+    if (address := fleet_and_stream(endpoint)) is None:
+        return None
+    fleet, stream = address
+    return FollowedStream(Registry(fleet, keys), stream)
+
+
 def described(status: StreamStatus) -> str:
     """The state of a stream, for a message to the user.
 
@@ -427,14 +485,10 @@ def described(status: StreamStatus) -> str:
     return f"its state is {status.state}{': ' if status.trouble else ''}{status.trouble}"
 
 
-def locate(endpoint: str | Endpoint, keys: str = "", source: str = "", *, timeout: float = 5.0) -> Endpoint:
+def locate(endpoint: str | Endpoint, keys: str = "", source: str = "") -> Endpoint:
     """The endpoint of a running pipeline, as `find` returns it; for the address of a stream, that of its pipeline now.
 
     What is an `Endpoint` already is returned.
-
-    Parameters
-    ----------
-    timeout : seconds to wait for an answer of the registry
 
     Raises
     ------
@@ -445,12 +499,7 @@ def locate(endpoint: str | Endpoint, keys: str = "", source: str = "", *, timeou
     """
     if isinstance(endpoint, Endpoint):
         return endpoint
-    address = fleet_and_stream(endpoint)
-    if address is None:
+    if (stream := follow(endpoint, keys)) is None:
         return find(endpoint, keys, source)
-    fleet, stream = address
-    with Registry(fleet, keys, timeout=timeout) as registry:
-        place = registry.place(stream)
-    if place.endpoint is None:
-        raise ServiceError(f"the stream {stream} runs nowhere, {described(place.status)}")
-    return place.endpoint
+    with contextlib.closing(stream):
+        return stream.endpoint

@@ -15,20 +15,20 @@ continues if the stream moves to another node.
 
 from __future__ import annotations
 
-import select
+from collections.abc import Generator
 from time import monotonic
-from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
+from typing import Any, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
 
-from catstream.client.registry import FollowedStream, Registry, described, fleet_and_stream, locate
+from catstream.client.registry import FollowedStream, described, follow, locate
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Model, Preview, Run, Sample, Track
-from catstream.messages.names import UNNAMED, check_name
-from catstream.wire.channels import CHANNELS, HEALTH, TRACKS, Channel
-from catstream.wire.endpoint import Endpoint, find
-from catstream.wire.newest import Subscriber
-from catstream.wire.readable import readable
+from catstream.messages.names import check_name
+from catstream.wire.channels import CHANNELS, TRACKS, Channel
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import GapCounter, Subscriber
+from catstream.wire.readable import Wait, finish, finish_async
 
-__all__ = ["AnyMessage", "GapCounter", "Subscription", "subscribe", "wait_until_running"]
+__all__ = ["AnyMessage", "Subscription", "subscribe", "wait_until_running"]
 
 #: Seconds to wait for messages after the end was received; it arrives on a connection of its own and may overtake them.
 _DRAIN_SECONDS = 0.5
@@ -52,31 +52,6 @@ Message = TypeVar("Message", bound=AnyMessage)
 
 #: Public name of a channel whose messages are about one object each -> their kind.
 _KINDS: dict[str, type] = {"tracks": Track, "models": Model, "samples": Sample}
-
-
-class GapCounter:
-    """Counts lost frames of a stream by the gaps in the numbers `seq` of its messages, which start with 1.
-
-    The tracks of all objects in a frame have the same number. A restarted sender may repeat numbers.
-
-    missed  frames without a message between the first and the last one that was received
-    before  frames before the first message that was received
-    """
-
-    def __init__(self) -> None:
-        self.missed = self.before = self._seq = 0
-
-    def take(self, seq: int) -> None:
-        """Count the frames missing before the number of the next message, or of the end."""
-        if self._seq:
-            self.missed += max(0, seq - self._seq - 1)
-        else:
-            self.before = max(0, seq - 1)
-        self._seq = seq
-
-    def begin(self, seq: int) -> None:
-        """Count from this number on: an object begins here, so there were no messages about it before."""
-        self._seq = seq
 
 
 class _Connection:
@@ -168,14 +143,10 @@ class Subscription(Generic[Message]):
         self.end: End | None = None
         self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
         self._close_time = float("inf")  # when to stop waiting
-        self._began: int | None = None  # first frame of the object
-        self._frames: dict[str, int] = {}  # the newest of each object, of a stream of a fleet
         self._rejected = 0  # by the connections before this one
         self._connection: _Connection | None = None
-        self._stream: FollowedStream | None = None
-        if (address := fleet_and_stream(endpoint)) is not None:
-            fleet, stream = address
-            self._stream = FollowedStream(Registry(fleet, keys), stream)
+        self._stream = follow(endpoint, keys)
+        if self._stream is not None:
             self._follow()
         else:
             place = locate(endpoint, keys)
@@ -232,26 +203,28 @@ class Subscription(Generic[Message]):
         return self
 
     def __next__(self) -> Message:
-        deadline = self._deadline()
-        while (message := self._take()) is None:
-            if self._ended():
-                raise StopIteration
-            poller = select.poll()
-            for socket in self._sockets():
-                poller.register(socket.fileno(), select.POLLIN)
-            seconds = self._wait_seconds(deadline)
-            poller.poll(seconds * 1000)
+        if (message := finish(self._next())) is None:
+            raise StopIteration
         return message
 
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> Message:
-        deadline = self._deadline()
+        if (message := await finish_async(self._next())) is None:
+            raise StopAsyncIteration
+        return message
+
+    def _next(self) -> Generator[Wait, None, Message | None]:
+        """Wait for the next message, and return it; None at the end."""
+        deadline = float("inf") if self.timeout is None else monotonic() + self.timeout
         while (message := self._take()) is None:
-            if self._ended():
-                raise StopAsyncIteration
-            await readable(self._sockets(), self._wait_seconds(deadline))
+            if self.end is not None and monotonic() >= self._close_time:
+                # One object may have been forgotten before; the end of a fleet's stream may have no number.
+                if self._channel.keeps == "every" and self._about is None and self.end.seq:
+                    self._gaps.take(self.end.seq)
+                return None
+            yield Wait(self._sockets(), self._wait_seconds(deadline))
         return message
 
     @property
@@ -261,10 +234,8 @@ class Subscription(Generic[Message]):
 
     def _sockets(self) -> list[Subscriber[Any] | FollowedStream]:
         """The sockets that are polled for messages."""
-        sockets: list[Subscriber[Any] | FollowedStream] = []
-        if self._connection is not None:
-            sockets += [self._connection.messages, self._connection.ends]
-        return sockets if self._stream is None else [*sockets, self._stream]
+        sockets: list[Subscriber[Any] | FollowedStream] = [] if self._stream is None else [self._stream]
+        return sockets if self._connection is None else [*sockets, self._connection.messages, self._connection.ends]
 
     def _take(self) -> Message | None:
         """Return the next message if one was received, without waiting."""
@@ -275,12 +246,11 @@ class Subscription(Generic[Message]):
 
     def _receive(self, connection: _Connection) -> Message | None:
         while (message := connection.messages.receive(0)) is not None:
-            if self._stream is not None and not isinstance(message, End):
-                self._stream.message_arrived()
+            if self._stream is not None and not isinstance(message, End) and not self._stream.take(message):
+                continue  # the stream was started again, and repeats a frame
             if isinstance(message, Track | Features):
-                if self._stream is not None and self._is_repeat(message):
-                    continue
-                self._count(message)
+                began = message.began if self._about is not None and isinstance(message, Track) else None
+                self._gaps.take(message.seq, began)
             if not isinstance(message, Run | End):
                 return cast(Message, message)
             if isinstance(message, End) and self._channel.keeps == "every":  # the last message here
@@ -302,13 +272,10 @@ class Subscription(Generic[Message]):
         """Connect to the pipeline of a stream of a fleet if it has another one, and end if the stream has ended."""
         if self._stream is None or self.end is not None:
             return
-        before = self._stream.place
-        moved = self._stream.has_moved()
+        moved = self._stream.update()
         if self._stream.end is not None:
             self.end, self._close_time = self._stream.end, monotonic() + _DRAIN_SECONDS
         elif (moved or self._connection is None) and (place := self._stream.place.endpoint) is not None:
-            if not before.continues_as(self._stream.place):
-                self._frames.clear()
             self._disconnect()
             self._connection = _Connection(self._channel, place, self._only, self._about)
 
@@ -317,33 +284,6 @@ class Subscription(Generic[Message]):
             self._connection.close()
             self._rejected += self._connection.messages.rejected
             self._connection = None
-
-    def _is_repeat(self, message: Track | Features) -> bool:
-        """Whether a stream of a fleet repeats a frame, after it was started again."""
-        name = message.object if isinstance(message, Track) else UNNAMED
-        if message.frame <= self._frames.get(name, -1):
-            return True
-        self._frames[name] = message.frame
-        return False
-
-    def _count(self, message: Track | Features) -> None:
-        """Count the frames missing before a message, unless its object was not there."""
-        if self._about is not None and isinstance(message, Track):
-            if message.began != self._began:  # another object of this name
-                self._gaps.begin(message.seq)
-            self._began = message.began
-        self._gaps.take(message.seq)
-
-    def _ended(self) -> bool:
-        if self.end is None or monotonic() < self._close_time:
-            return False
-        # One object may have been forgotten before; a stream of a fleet may have no last message.
-        if self._channel.keeps == "every" and self._about is None and self.end.seq:
-            self._gaps.take(self.end.seq)
-        return True
-
-    def _deadline(self) -> float:
-        return float("inf") if self.timeout is None else monotonic() + self.timeout
 
     def _wait_seconds(self, deadline: float) -> float:
         """Return the seconds to wait for the sockets. Raises SilenceError after the deadline."""
@@ -355,35 +295,27 @@ class Subscription(Generic[Message]):
         return max(0.0, until - now)
 
 
+class _Options(TypedDict, total=False):
+    timeout: float | None
+    keys: str
+
+
+class _OfObject(_Options, total=False):
+    object: str | None
+
+
 @overload
-def subscribe(
-    endpoint: str, channel: Literal["tracks"], *, object: str | None = ..., timeout: float | None = ..., keys: str = ...
-) -> Subscription[Track]: ...
+def subscribe(endpoint: str, channel: Literal["tracks"], **options: Unpack[_OfObject]) -> Subscription[Track]: ...
 @overload
-def subscribe(
-    endpoint: str, channel: Literal["models"], *, object: str | None = ..., timeout: float | None = ..., keys: str = ...
-) -> Subscription[Model]: ...
+def subscribe(endpoint: str, channel: Literal["models"], **options: Unpack[_OfObject]) -> Subscription[Model]: ...
 @overload
-def subscribe(
-    endpoint: str, channel: Literal["health"], *, timeout: float | None = ..., keys: str = ...
-) -> Subscription[Health]: ...
+def subscribe(endpoint: str, channel: Literal["samples"], **options: Unpack[_OfObject]) -> Subscription[Sample]: ...
 @overload
-def subscribe(
-    endpoint: str,
-    channel: Literal["samples"],
-    *,
-    object: str | None = ...,
-    timeout: float | None = ...,
-    keys: str = ...,
-) -> Subscription[Sample]: ...
+def subscribe(endpoint: str, channel: Literal["health"], **options: Unpack[_Options]) -> Subscription[Health]: ...
 @overload
-def subscribe(
-    endpoint: str, channel: Literal["features"], *, timeout: float | None = ..., keys: str = ...
-) -> Subscription[Features]: ...
+def subscribe(endpoint: str, channel: Literal["features"], **options: Unpack[_Options]) -> Subscription[Features]: ...
 @overload
-def subscribe(
-    endpoint: str, channel: Literal["previews"], *, timeout: float | None = ..., keys: str = ...
-) -> Subscription[Preview]: ...
+def subscribe(endpoint: str, channel: Literal["previews"], **options: Unpack[_Options]) -> Subscription[Preview]: ...
 def subscribe(
     endpoint: str,
     channel: str,
@@ -431,27 +363,12 @@ def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_T
     Raises
     ------
     ServiceError
-        If `endpoint` is empty and not exactly one pipeline runs, or the pipeline rejects the keys.
+        If `endpoint` is empty and not exactly one pipeline runs, the pipeline rejects the keys, or it has ended.
     SilenceError
         If no report arrives in time.
     """
-    if fleet_and_stream(endpoint) is not None:
-        return _wait_for_stream(endpoint, keys, seconds)
-    place, deadline = find(endpoint, keys), monotonic() + seconds
-    # Not a `Subscription`: it subscribes to the end of the tracks, too, and a replay waits for a subscriber to tracks.
-    with Subscriber(HEALTH, place) as reports:
-        while reports.receive(min(_CONNECTION_CHECK_SECONDS, seconds)) is None:
-            if monotonic() >= deadline:
-                raise SilenceError(f"no health arrived from {place} within {seconds:g} s: is a pipeline running there?")
-    return place
-
-
-def _wait_for_stream(endpoint: str, keys: str, seconds: float) -> Endpoint:
-    """Wait for a health report of a stream of a fleet, and return the endpoint of its pipeline."""
     with Subscription[Health](endpoint, "health", timeout=seconds, keys=keys) as reports:
-        next(reports, None)
-        if reports.end is not None or reports.place is None:
-            raise ServiceError(
-                f"{endpoint} does not run: {reports.end.reason if reports.end is not None else 'no place'}"
-            )
+        if next(reports, None) is None or reports.place is None:
+            reason = reports.end.reason if reports.end is not None else "it has no place"
+            raise ServiceError(f"{endpoint or 'the pipeline'} does not run: {reason}")
         return reports.place

@@ -34,7 +34,7 @@ from catstream.wire.codec import opening, topic_of
 from catstream.wire.endpoint import Endpoint, Note, names_of_early_subscribers, note_early_subscriber
 from catstream.wire.socket import ChannelSocket
 
-__all__ = ["Publisher", "Subscriber"]
+__all__ = ["GapCounter", "Publisher", "Subscriber"]
 
 _MOST_KEPT = 256  # newest messages that are kept, one of each object
 _MOST_TOPICS = 1024  # topics that a publisher knows the subscribers of, and that a subscriber knows the last message of
@@ -43,6 +43,8 @@ _MAX_SUBSCRIPTION_BYTES = 4096
 _COMPARED_BYTES = 1 << 12  # at either end of a message, by which a repeat is known
 _REPEAT_SECONDS = 0.2  # without a newer message, after which the last ones are sent again; doubled each time
 _NAME = b"\xffreader "  # begins the topic by which a subscriber gives its name; no message begins with it
+
+_ENDS = {opening(End)}
 
 Message = TypeVar("Message")
 
@@ -84,8 +86,8 @@ class Publisher(ChannelSocket[Message]):
 
     @property
     def has_subscribers(self) -> bool:
-        """Whether there was a subscriber when `send` or `serve_late_joiners` was last called."""
-        return bool(self._subscribed)
+        """Whether more than the end had a subscriber when `send` or `serve_late_joiners` was last called."""
+        return not self._subscribed <= _ENDS
 
     def send(self, message: Message) -> None:
         """Send to all subscribers; on a channel that keeps the newest message, later to late joiners too."""
@@ -249,3 +251,32 @@ class Subscriber(ChannelSocket[Message]):
         if len(self._last) > _MOST_TOPICS:
             del self._last[next(iter(self._last))]
         return before == digest
+
+
+class GapCounter:
+    """Counts lost frames of a stream by the gaps in the numbers `seq` of its messages, which start with 1.
+
+    The tracks of all objects in a frame have the same number. A restarted sender may repeat numbers.
+
+    missed  frames without a message between the first and the last one that was received
+    before  frames before the first message that was received
+    """
+
+    def __init__(self) -> None:
+        self.missed = self.before = self._seq = 0
+        self._began: int | None = None
+
+    def take(self, seq: int, began: int | None = None) -> None:
+        """Count the frames missing before the number of the next message, or of the end.
+
+        Parameters
+        ----------
+        began : first frame of the object if messages about one object are counted: there were none before that frame
+        """
+        if began is not None and began != self._began:
+            self._began = began
+        elif self._seq:
+            self.missed += max(0, seq - self._seq - 1)
+        else:
+            self.before = max(0, seq - 1)
+        self._seq = seq

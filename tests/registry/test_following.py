@@ -260,11 +260,11 @@ def test_only_the_registry_ends_a_stream_whatever_its_pipelines_and_its_controll
             registry.answer = _Script._status(token, "running")
         else:
             registry.answer = None if step == "down" else _Script._status(token, "moving")
-        moved = followed.has_moved()
+        moved = followed.update()
         assert moved == (step == "move")
         assert (followed.end, followed.place.status.token) == (None, token)
     registry.answer = _Script._status(token, last) if last == "ended" else None
     if last == "removed":
         registry.receive = lambda _: ("site", None)
-    assert not followed.has_moved()
+    assert not followed.update()
     assert followed.end is not None

@@ -9,13 +9,12 @@ from contextlib import ExitStack
 from time import monotonic, sleep
 from typing import Any, Self
 
-from catstream.client.subscription import GapCounter
 from catstream.messages.kinds import End
 from catstream.services.loop import die_with
 from catstream.services.start import SPAWN, sigint_blocked
 from catstream.wire.channels import TRACKS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.newest import Subscriber
+from catstream.wire.newest import GapCounter, Subscriber
 
 __all__ = ["Subscribers"]
 
