@@ -42,6 +42,7 @@ from catstream.video.source import open_source
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import MODELS
 from catstream.wire.newest import Subscriber
+from catstream.wire.timing import EARLY_SECONDS
 
 __all__ = ["main", "opening_seconds", "prepare"]
 
@@ -53,7 +54,6 @@ _OWNER_SECONDS = 0.5  # the same for the owner of the run, which may no longer r
 _OPEN_SECONDS = 60.0  # limit for opening the source, and for the first frame
 _SKIP_SECONDS = 0.1  # limit for decoding a skipped frame
 _TURN_SECONDS = 0.02  # from one turn of a waiting loop to the next
-_SUBSCRIBERS_SECONDS = 5.0  # limit for early subscribers to connect
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
 _log = logging.getLogger(__name__)
@@ -146,7 +146,7 @@ class DetectorLoop:
 
     def wait_for_subscribers(self) -> None:
         """Wait for the recorder without a time-out, and for early subscribers for a few seconds."""
-        deadline = time.monotonic() + _SUBSCRIBERS_SECONDS
+        deadline = time.monotonic() + EARLY_SECONDS
         while (missing := self._outputs.awaited) and (RECORDER in missing or time.monotonic() < deadline):
             self._outputs.poll(self._outputs.features)
             self._serve_or_exit()
@@ -312,7 +312,7 @@ class DetectorLoop:
         due = features.sent - (0 if settings.run.lockstep else settings.run.lag_frames)
         live = self._source is not None and self._source.live
         while not live and not self.end_reason:
-            match awaited(due, features.taken, features.samples_of(due), self.detectors.newest_versions(due)):
+            match awaited(due, features.taken, features.count_samples(due), self.detectors.newest_versions(due)):
                 case Awaited.NOTHING:
                     return
                 case Awaited.TAKEN:

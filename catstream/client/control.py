@@ -27,13 +27,9 @@ from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.endpoint import Endpoint, is_deserted
 from catstream.wire.newest import Subscriber
+from catstream.wire.timing import ANSWER_SECONDS, DESERTED_SECONDS, REGISTRY_SECONDS
 
 __all__ = ["Control", "control"]
-
-#: Seconds to wait for an answer from a folder in which no pipeline seems to run; its detector may be restarted.
-_DESERTED_SECONDS = 1.0
-#: Seconds to wait for the registry of a fleet before each command; without an answer, the stream has not moved.
-_REGISTRY_SECONDS = 1.0
 
 
 class Control:
@@ -60,7 +56,7 @@ class Control:
     """
 
     def __init__(
-        self, endpoint: str | Endpoint = "", *, timeout: float = 5.0, keys: str = "", source: str = ""
+        self, endpoint: str | Endpoint = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = ""
     ) -> None:
         self._stream = follow(endpoint, keys)
         self._place = self._stream.endpoint if self._stream is not None else locate(endpoint, keys, source)
@@ -190,7 +186,7 @@ class Control:
         """Connect to the pipeline that a stream of a fleet has now; the last one, if the registry does not answer."""
         if self._stream is None:
             return
-        self._stream.ask(_REGISTRY_SECONDS)
+        self._stream.ask(REGISTRY_SECONDS)
         if (place := self._stream.endpoint) != self._place:
             self._commands.close()
             self._place, self.endpoint = place, str(place)
@@ -198,7 +194,7 @@ class Control:
 
     def _ask(self, command: Command) -> Answer:
         self._follow()
-        verb, first = command.verb, min(self.timeout, _DESERTED_SECONDS) if self._place.folder is not None else 0.0
+        verb, first = command.verb, min(self.timeout, DESERTED_SECONDS) if self._place.folder is not None else 0.0
         answer = self._commands.ask(command, first)
         if answer is None and first and is_deserted(self._place):
             raise SilenceError(
@@ -216,7 +212,7 @@ class Control:
         return answer
 
 
-def control(endpoint: str = "", *, timeout: float = 5.0, keys: str = "", source: str = "") -> Control:
+def control(endpoint: str = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = "") -> Control:
     """Connect to a running pipeline to send commands.
 
     Parameters

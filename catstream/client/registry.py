@@ -33,6 +33,7 @@ from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, private_folder
 from catstream.wire.keys import Keys
+from catstream.wire.timing import ANSWER_SECONDS, CONTROLLER_SECONDS, QUIET_SECONDS
 
 __all__ = [
     "REGISTRY_PORT",
@@ -56,8 +57,6 @@ REGISTRY_PORT = 5690
 
 _PREFIX = "fleet://"
 _LONGEST_TROUBLE = 1000  # characters
-_QUIET_SECONDS = 1.0  # without a message, after which the registry is asked where the stream runs; then repeated
-_TURN_SECONDS = 0.5  # after which the endpoint of a fleet on this machine is read again, while it does not answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +100,7 @@ class Registry:
         From each question, if no answer arrives in time.
     """
 
-    def __init__(self, fleet: str = "", keys: str = "", *, timeout: float = 5.0) -> None:
+    def __init__(self, fleet: str = "", keys: str = "", *, timeout: float = ANSWER_SECONDS) -> None:
         self.timeout = timeout
         self._keys = Keys.load(keys) if keys else None
         self._is_remote = ":" in fleet
@@ -184,7 +183,7 @@ class Registry:
         deadline = monotonic() + self.timeout
         while (left := deadline - monotonic()) > 0:
             self._follow_controller()
-            if (answer := self._requester.ask(question, min(left, _TURN_SECONDS))) is not None:
+            if (answer := self._requester.ask(question, min(left, CONTROLLER_SECONDS))) is not None:
                 return answer
         raise SilenceError(
             f"no answer from the fleet {self._name} at {self._endpoint} within {self.timeout:g} s: is its controller "
@@ -269,14 +268,14 @@ class FollowedStream:
             self._registry.close()
             raise
         self._conclude(self.place.status)
-        self._next_question = monotonic() + _QUIET_SECONDS
+        self._next_question = monotonic() + QUIET_SECONDS
 
     def take(self, message: object) -> bool:
         """Note a message from the pipeline; returns False if it is of a frame that the stream has repeated.
 
         The registry is not asked while there are any.
         """
-        self._next_question = monotonic() + _QUIET_SECONDS
+        self._next_question = monotonic() + QUIET_SECONDS
         if isinstance(message, Track | Features):
             name = message.object if isinstance(message, Track) else UNNAMED
             if message.frame <= self._frames.get(name, -1):
@@ -293,7 +292,7 @@ class FollowedStream:
         now = monotonic()
         if now >= self._next_question:
             self._registry.request(self._stream)
-            self._next_question = now + _QUIET_SECONDS
+            self._next_question = now + QUIET_SECONDS
         answer = self._registry.receive(self._stream)
         if answer is None:
             return False

@@ -27,17 +27,9 @@ from catstream.wire.channels import CHANNELS, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import GapCounter, Subscriber
 from catstream.wire.readable import Wait, finish, finish_async
+from catstream.wire.timing import CHECK_SECONDS, DRAIN_SECONDS, REPORT_SECONDS
 
 __all__ = ["AnyMessage", "Subscription", "subscribe", "wait_until_running"]
-
-#: Seconds to wait for messages after the end was received; it arrives on a connection of its own and may overtake them.
-_DRAIN_SECONDS = 0.5
-
-#: Seconds to wait for a health report; each process of a running pipeline sends one every second.
-_HEALTH_TIMEOUT_SECONDS = 5.0
-
-#: Seconds between checks of the connections, which report whether the pipeline has rejected the keys.
-_CONNECTION_CHECK_SECONDS = 1.0
 
 #: Public name -> channel. Subscribers get features from the channel of copies; `catstream.control` gets saved models.
 _SUBSCRIBABLE = {
@@ -258,7 +250,7 @@ class Subscription(Generic[Message]):
                 return None
         for end in connection.ends.receive_all():
             if self.end is None and isinstance(end, End):
-                self._pipeline_ended(end, monotonic() + _DRAIN_SECONDS)
+                self._pipeline_ended(end, monotonic() + DRAIN_SECONDS)
         return None
 
     def _pipeline_ended(self, end: End, close_time: float) -> None:
@@ -274,7 +266,7 @@ class Subscription(Generic[Message]):
             return
         moved = self._stream.update()
         if self._stream.end is not None:
-            self.end, self._close_time = self._stream.end, monotonic() + _DRAIN_SECONDS
+            self.end, self._close_time = self._stream.end, monotonic() + DRAIN_SECONDS
         elif (moved or self._connection is None) and (place := self._stream.place.endpoint) is not None:
             self._disconnect()
             self._connection = _Connection(self._channel, place, self._only, self._about)
@@ -291,7 +283,7 @@ class Subscription(Generic[Message]):
         if now >= deadline and self.end is None:
             why = "is a pipeline running there?" if self._stream is None else described(self._stream.status)
             raise SilenceError(f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {why}")
-        until = min(deadline if self.end is None else float("inf"), self._close_time, now + _CONNECTION_CHECK_SECONDS)
+        until = min(deadline if self.end is None else float("inf"), self._close_time, now + CHECK_SECONDS)
         return max(0.0, until - now)
 
 
@@ -355,7 +347,7 @@ def subscribe(
     return Subscription(endpoint, channel, object=object, timeout=timeout, keys=keys)
 
 
-def wait_until_running(endpoint: str, keys: str = "", seconds: float = _HEALTH_TIMEOUT_SECONDS) -> Endpoint:
+def wait_until_running(endpoint: str, keys: str = "", seconds: float = REPORT_SECONDS) -> Endpoint:
     """Wait for a health report of the pipeline, and return its endpoint.
 
     Tracks and models are no sign of a running pipeline: they may pause for long.

@@ -17,8 +17,9 @@ import zmq
 from catstream.messages.kinds import End, Position, Stored
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow
-from catstream.wire.socket import LINGER_MILLISECONDS, ChannelSocket
+from catstream.wire.go_back_n import HELLO, Deliver, ReceiveWindow, Reject, Reply, SendWindow
+from catstream.wire.socket import ChannelSocket
+from catstream.wire.timing import LINGER_SECONDS, PATIENCE_SECONDS
 
 __all__ = ["Receiver", "Sender"]
 
@@ -72,14 +73,14 @@ class Sender(ChannelSocket[Message]):
         """Version of the newest sample of each object that the receiver has made, by name."""
         return self._window.versions
 
-    def samples_of(self, seq: int) -> dict[str, int]:
-        """Versions of the newest samples that the messages up to `seq` led to: see `SendWindow.samples_of`."""
-        return self._window.samples_of(seq)
+    def count_samples(self, seq: int) -> dict[str, int]:
+        """Count the samples that the messages up to `seq` led to: see `SendWindow.count_samples`."""
+        return self._window.count_samples(seq)
 
     def ask_position(self) -> Position | None:
         """Ask once for the receiver's position; None if it does not answer in time."""
         self._say_hello()
-        if self._wait(PATIENCE):
+        if self._wait(PATIENCE_SECONDS):
             answer = self._decode(self._socket.recv(), *_REPLIES)
             return answer if isinstance(answer, Position) else None
         return None
@@ -176,8 +177,7 @@ class Receiver(ChannelSocket[Message]):
 
     @property
     def has_sender(self) -> bool:
-        """Whether the sender of the last message is still connected and has not sent its end."""
-        self._read_events()
+        """Whether the sender was connected when `receive` was last called, and has not sent its end."""
         return self._window.connected and not self._window.ended
 
     def receive(self, seconds: float) -> Message | None:
@@ -208,7 +208,7 @@ class Receiver(ChannelSocket[Message]):
     def close(self) -> None:
         """Close, after the sender if it has sent its end: a connection that breaks may cost it the last reply."""
         if self._window.ended and self._window.connected:
-            self._read_events(LINGER_MILLISECONDS, until=lambda event: event.disconnected)
+            self._read_events(LINGER_SECONDS, until=lambda event: event.disconnected)
         super().close()
 
     def _disconnected(self) -> None:

@@ -18,15 +18,13 @@ import zmq
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.socket import ChannelSocket
+from catstream.wire.timing import LOOK_SECONDS, RETRY_BYTES_PER_SECOND, RETRY_SECONDS
 
 __all__ = ["Requester", "Responder"]
 
 _MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and that are received at once
 _LONGEST_QUESTION = 1 << 20  # bytes
 _MOST_QUEUED = 256 << 20  # bytes of questions that a socket queues for each client
-_REPEAT_SECONDS = 0.2
-_TURN_SECONDS = 0.05  # from one look at the connection to the next
-_BYTES_PER_SECOND = 1e6  # of a slow network: a large question is repeated later
 
 
 class _HasId(Protocol):
@@ -61,8 +59,8 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         while now < deadline:
             if now >= repeat_at or not self._in_transit:
                 self._send(data)
-                repeat_at = now + _REPEAT_SECONDS + len(data) / _BYTES_PER_SECOND
-            if (answer := self.receive(question.id, min(deadline - now, _TURN_SECONDS))) is not None:
+                repeat_at = now + RETRY_SECONDS + len(data) / RETRY_BYTES_PER_SECOND
+            if (answer := self.receive(question.id, min(deadline - now, LOOK_SECONDS))) is not None:
                 return answer
             now = monotonic()
         return None
@@ -124,7 +122,7 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
                 break
             peer, data = self._receive_from_peer()
             question = self._decode(data, self._question_kind) if data is not None else None
-            if question is not None and self._is_new(question, peer):
+            if question is not None and self._accept(question, peer):
                 questions.append(question)
             seconds = 0.0
         return questions
@@ -137,8 +135,8 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         if (peer := self._waiting.pop(answer.id, None)) is not None:
             self._send(peer, data)
 
-    def _is_new(self, question: Question, peer: bytes) -> bool:
-        """Whether a question has to be answered; one that was answered is answered again."""
+    def _accept(self, question: Question, peer: bytes) -> bool:
+        """Note who asks; returns whether the question has to be answered. One that was answered is answered again."""
         if (answer := self._answers.get(question.id)) is not None:
             self._send(peer, answer)
             return False

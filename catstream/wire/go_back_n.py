@@ -11,7 +11,7 @@ replies once the application has processed it:
     Position    requests a retransmission of everything after `seq`
 
 The receiver replies with a Position if a message is missing, and if the sender asks (with an empty frame, the
-hello). The sender asks if it was restarted, and after `PATIENCE` seconds without a reply while messages wait.
+hello). The sender asks if it was restarted, and after `PATIENCE_SECONDS` without a reply while messages wait.
 So either side may be restarted, and any frame may be lost or arrive twice: each message is still delivered once, in
 order.
 
@@ -27,14 +27,12 @@ from dataclasses import dataclass
 
 from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages.kinds import Position, Stored
+from catstream.wire.timing import PATIENCE_SECONDS
 
-__all__ = ["HELLO", "PATIENCE", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
+__all__ = ["HELLO", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
 
 #: The frame by which a sender asks for the receiver's position.
 HELLO = b""
-
-#: Seconds without a reply after which a sender asks for the position, and between two reports of a missing message.
-PATIENCE = 0.2
 
 _MAX_CHANGES = 65536  # newest samples that a sender remembers until it is asked for them
 _MAX_ASKING = 64  # peers that may wait for a position at a time; any other asks again
@@ -88,7 +86,7 @@ class SendWindow:
         self._last_reply = now
         self.versions: dict[str, int] = {}
         self._changes: deque[tuple[int, str, int]] = deque()  # seq that led to a version of an object; 0: it is gone
-        self._versions: dict[str, int] = {}  # that `samples_of` returned last
+        self._versions: dict[str, int] = {}  # that `count_samples` returned last
 
     def resume(self, seq: int, position: Position) -> None:
         """Continue after message `seq` of an earlier sender, of which the receiver is at `position`."""
@@ -117,11 +115,8 @@ class SendWindow:
         self._in_flight += 1
 
     def must_ask(self, now: float) -> bool:
-        """Whether to send a hello now: messages wait, and the last reply or hello is PATIENCE seconds ago."""
-        if not self._unacknowledged or now - self._last_reply <= PATIENCE:
-            return False
-        self.position_requested(now)
-        return True
+        """Whether to send a hello now: messages wait, and the last reply or hello is `PATIENCE_SECONDS` ago."""
+        return bool(self._unacknowledged) and now - self._last_reply > PATIENCE_SECONDS
 
     def position_requested(self, now: float) -> None:
         """Note that a hello was sent."""
@@ -153,8 +148,8 @@ class SendWindow:
         self.taken = min(reply.seq if isinstance(reply, Position) else reply.taken, self.sent)
         return None
 
-    def samples_of(self, seq: int) -> dict[str, int]:
-        """Versions of the newest samples that the messages up to `seq` led to; ask with a `seq` that never falls.
+    def count_samples(self, seq: int) -> dict[str, int]:
+        """Count the samples that the messages up to `seq`, which never falls, led to; returns the newest versions.
 
         If the receiver did not reply to each message, a sample counts from the first message that it may be of.
         """
@@ -243,7 +238,7 @@ class ReceiveWindow:
         actions: list[Deliver | Reply | Reject] = []
         if seq > self.taken + self._size + 1:  # more than a sender may have in flight
             actions.append(Reject("sequence", f"message {seq} came after {self.taken}"))
-        if now - self._gap_reported > PATIENCE:
+        if now - self._gap_reported > PATIENCE_SECONDS:
             self._gap_reported = now
             actions.append(Reply(peer, self._position))
         return actions

@@ -33,6 +33,7 @@ from catstream.wire.channels import Channel
 from catstream.wire.codec import opening, topic_of
 from catstream.wire.endpoint import Endpoint, Note, names_of_early_subscribers, note_early_subscriber
 from catstream.wire.socket import ChannelSocket
+from catstream.wire.timing import REPEAT_SECONDS
 
 __all__ = ["GapCounter", "Publisher", "Subscriber"]
 
@@ -41,7 +42,6 @@ _MOST_TOPICS = 1024  # topics that a publisher knows the subscribers of, and tha
 _MAX_CHANGES = 1000  # subscriptions that are processed at once
 _MAX_SUBSCRIPTION_BYTES = 4096
 _COMPARED_BYTES = 1 << 12  # at either end of a message, by which a repeat is known
-_REPEAT_SECONDS = 0.2  # without a newer message, after which the last ones are sent again; doubled each time
 _NAME = b"\xffreader "  # begins the topic by which a subscriber gives its name; no message begins with it
 
 _ENDS = {opening(End)}
@@ -81,7 +81,7 @@ class Publisher(ChannelSocket[Message]):
             self._last[b""] = self._encode(first_message)
         self._due: list[bytes] = []  # topics whose last message is sent again, in this order
         self._next_part = 0.0  # when some of them are sent
-        self._repeat_at, self._pause = math.inf, _REPEAT_SECONDS  # when all are due again; seconds from time to time
+        self._repeat_at, self._pause = math.inf, REPEAT_SECONDS  # when all are due again; seconds from time to time
         self._bind(sender)
 
     @property
@@ -104,7 +104,7 @@ class Publisher(ChannelSocket[Message]):
         if len(self._last) > _MOST_KEPT:
             del self._last[next(iter(self._last))]
         self._socket.send(data, copy=False)
-        self._repeat_after(_REPEAT_SECONDS)
+        self._repeat_after(REPEAT_SECONDS)
         self.serve_late_joiners()
 
     def keep_only(self, objects: Iterable[str]) -> None:
@@ -126,7 +126,7 @@ class Publisher(ChannelSocket[Message]):
             self._due = list(dict.fromkeys([*self._due, *self._last]))
             self._next_part = 0.0
             if self._newest:
-                self._repeat_after(_REPEAT_SECONDS if joined else 2 * self._pause)
+                self._repeat_after(REPEAT_SECONDS if joined else 2 * self._pause)
         if self._due and monotonic() >= self._next_part:
             self._repeat_part()
 
@@ -212,7 +212,7 @@ class Subscriber(ChannelSocket[Message]):
         deadline = monotonic() + seconds
         while (frame := self._next_frame(deadline)) is not None:
             message = self._decode(frame.buffer, *self.channel.messages)
-            if message is not None and not (self._newest and self._is_repeat(message, frame.buffer)):
+            if message is not None and (not self._newest or self._remember(message, frame.buffer)):
                 if not isinstance(message, Run):  # it has heard the pipeline: no other one has to wait for it
                     self._remove_note()
                 return message
@@ -241,8 +241,11 @@ class Subscriber(ChannelSocket[Message]):
             self._arrived[topic_of(frame.buffer)] = frame  # in the place of an older one
         return self._arrived.pop(next(iter(self._arrived))) if self._arrived else None
 
-    def _is_repeat(self, message: Message, data: memoryview) -> bool:
-        """Whether the last message of the same process or topic was the same: it was sent again to a late joiner."""
+    def _remember(self, message: Message, data: memoryview) -> bool:
+        """Remember a message as the last one of its process or topic.
+
+        Returns False if the one before was the same: it was sent again to a late joiner.
+        """
         sender = message.process.encode() if isinstance(message, Health) else topic_of(data)
         # Its numbers are at the beginning: to read megabytes of rows would take as long as training.
         ends = bytes(data[:_COMPARED_BYTES]) + bytes(data[-_COMPARED_BYTES:])
@@ -250,7 +253,7 @@ class Subscriber(ChannelSocket[Message]):
         self._last[sender] = digest
         if len(self._last) > _MOST_TOPICS:
             del self._last[next(iter(self._last))]
-        return before == digest
+        return before != digest
 
 
 class GapCounter:

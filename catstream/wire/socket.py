@@ -15,6 +15,7 @@ from weakref import WeakSet
 import zmq
 
 from catstream.errors import ProtocolError, ServiceError
+from catstream.wire import timing
 from catstream.wire.channels import Channel
 from catstream.wire.codec import decode_with_run, encode
 from catstream.wire.context import context
@@ -23,22 +24,25 @@ from catstream.wire.monitor import Event, Monitor
 from catstream.wire.rejects import count, reject
 from catstream.wire.zap import ZAP
 
-__all__ = ["LINGER_MILLISECONDS", "ChannelSocket"]
+__all__ = ["ChannelSocket"]
 
-LINGER_MILLISECONDS = 2000  #: that a closed socket still has to transmit its last messages
+
+def _milliseconds(seconds: float) -> int:
+    return max(0, round(seconds * 1000))
+
 
 #: No ZeroMQ heartbeats: libzmq aborts the process if one is due to a peer that disconnected while its queue was full
 #: (libzmq issue 4767). On one machine the kernel reports that a peer has ended. If a host loses its power, TCP
 #: keepalive reports it after 11 s, or once the host is up again.
 _OPTIONS = {
-    zmq.LINGER: LINGER_MILLISECONDS,
-    zmq.HANDSHAKE_IVL: 5000,
+    zmq.LINGER: _milliseconds(timing.LINGER_SECONDS),
+    zmq.HANDSHAKE_IVL: _milliseconds(timing.HANDSHAKE_SECONDS),
     zmq.TCP_KEEPALIVE: 1,
-    zmq.TCP_KEEPALIVE_IDLE: 5,
-    zmq.TCP_KEEPALIVE_INTVL: 2,
-    zmq.TCP_KEEPALIVE_CNT: 3,
-    zmq.RECONNECT_IVL: 20,
-    zmq.RECONNECT_IVL_MAX: 500,
+    zmq.TCP_KEEPALIVE_IDLE: round(timing.KEEPALIVE_SECONDS),
+    zmq.TCP_KEEPALIVE_INTVL: round(timing.KEEPALIVE_PROBE_SECONDS),
+    zmq.TCP_KEEPALIVE_CNT: timing.KEEPALIVE_PROBES,
+    zmq.RECONNECT_IVL: _milliseconds(timing.RECONNECT_SECONDS),
+    zmq.RECONNECT_IVL_MAX: _milliseconds(timing.RECONNECT_MOST_SECONDS),
 }
 
 Message = TypeVar("Message")
@@ -49,7 +53,7 @@ _OPEN: WeakSet[ChannelSocket[Any]] = WeakSet()  # sockets that were not closed y
 
 @atexit.register
 def _transmit_rest() -> None:
-    """Wait until the messages that closed sockets have queued are transmitted, at most `LINGER_MILLISECONDS`.
+    """Wait until the messages that closed sockets have queued are transmitted, at most `LINGER_SECONDS`.
 
     They are transmitted by a thread of ZeroMQ from the memory of Python, which is freed when the process ends.
     """
@@ -100,7 +104,7 @@ class ChannelSocket(Generic[Message]):
             self._socket.close()
             # libzmq stops listening some time later, and would remove the socket file of the next one with its own.
             # Unbinding first would be faster, but drops queued messages.
-            self._read_events(2 * LINGER_MILLISECONDS, until=lambda event: event.stopped)
+            self._read_events(2 * timing.LINGER_SECONDS, until=lambda event: event.stopped)
             self._listens = False
         elif not self._socket.closed:
             self._socket.disable_monitor()
@@ -158,7 +162,7 @@ class ChannelSocket(Generic[Message]):
     def _wait(self, seconds: float) -> bool:
         """Whether something arrives within so many seconds; handles the events of connections first."""
         self._read_events()
-        return bool(self._socket.poll(max(0, round(seconds * 1000))))
+        return bool(self._socket.poll(_milliseconds(seconds)))
 
     def _decode(
         self, data: bytes | memoryview, *kinds: type[Kind], check: Callable[[Kind], None] | None = None
@@ -195,7 +199,7 @@ class ChannelSocket(Generic[Message]):
         self.rejected += 1
         reject(self.channel.name, reason, text)
 
-    def _read_events(self, milliseconds: int = 0, until: Callable[[Event], bool] = lambda _: False) -> None:
+    def _read_events(self, seconds: float = 0.0, until: Callable[[Event], bool] = lambda _: False) -> None:
         """Handle what was reported about connections; wait so long for each event, until a certain one.
 
         Raises
@@ -205,7 +209,7 @@ class ChannelSocket(Generic[Message]):
         """
         if self._monitor is None:
             return
-        for event in self._monitor.events(milliseconds):
+        for event in self._monitor.events(_milliseconds(seconds)):
             if event.disconnected:
                 self._disconnected()
             elif self._listens:

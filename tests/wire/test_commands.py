@@ -72,7 +72,7 @@ def test_a_command_sent_before_the_pipeline_runs_is_answered_as_soon_as_it_does(
 @pytest.fixture
 def slow_network(monkeypatch):
     """Lets so much time pass before a question is repeated on the same connection that no test sees it."""
-    monkeypatch.setattr(commands, "_BYTES_PER_SECOND", 1e-6)
+    monkeypatch.setattr(commands, "RETRY_BYTES_PER_SECOND", 1e-6)
 
 
 @pytest.mark.usefixtures("slow_network")

@@ -15,7 +15,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages.kinds import ObjectPosition, Position, Stored
-from catstream.wire.go_back_n import HELLO, PATIENCE, Deliver, ReceiveWindow, Reject, Reply, SendWindow
+from catstream.wire.go_back_n import HELLO, Deliver, ReceiveWindow, Reject, Reply, SendWindow
+from catstream.wire.timing import PATIENCE_SECONDS
 
 STRANGER = b"stranger"
 
@@ -119,10 +120,11 @@ class Histories(RuleBasedStateMachine):
         if self.resumed and not self.sender.full:
             self.sender.push(self.sender.sent + 1, payload(self.sender.sent + 1))
 
-    @rule(seconds=st.sampled_from([0.01, PATIENCE / 2, 2 * PATIENCE]))
+    @rule(seconds=st.sampled_from([0.01, PATIENCE_SECONDS / 2, 2 * PATIENCE_SECONDS]))
     def time_passes(self, seconds):
         self.now += seconds
         if not self.resumed or self.sender.must_ask(self.now):
+            self.sender.position_requested(self.now)
             self.to_receiver.append((self.peer, HELLO))
         self.transmit()
 
@@ -178,13 +180,13 @@ class Histories(RuleBasedStateMachine):
         self.start_sender()
 
     @rule()
-    def sender_asks_for_the_samples_of_what_was_taken(self):
+    def sender_asks_for_the_count_samples_what_was_taken(self):
         """A sample counts from the message that led to it, or an earlier one; none counts that was not made."""
         seq = self.sender.taken
         if seq <= max(self.known, self.asked):
             return
         self.asked = seq
-        samples, led_to = self.sender.samples_of(seq), made_by(seq)
+        samples, led_to = self.sender.count_samples(seq), made_by(seq)
         for name in samples.keys() & led_to.keys():
             assert samples[name] >= led_to[name]
         for version in samples.values():
@@ -234,7 +236,7 @@ class Histories(RuleBasedStateMachine):
         if not self.senders:
             return
         for _ in range(20):
-            self.time_passes(2 * PATIENCE)
+            self.time_passes(2 * PATIENCE_SECONDS)
             while self.to_receiver or self.to_sender:
                 if self.to_receiver:
                     self.frame_arrives(twice=False)
@@ -283,8 +285,8 @@ def test_a_message_that_is_missing_is_reported_at_once_and_then_only_now_and_the
     window.receive(b"peer", 1, now=0.0)
     report = [Reply(b"peer", Position())]
     assert window.receive(b"peer", 3, now=0.0) == report
-    assert window.receive(b"peer", 4, now=PATIENCE) == []
-    assert window.receive(b"peer", 5, now=PATIENCE + 0.01) == report
+    assert window.receive(b"peer", 4, now=PATIENCE_SECONDS) == []
+    assert window.receive(b"peer", 5, now=PATIENCE_SECONDS + 0.01) == report
 
 
 def test_a_message_that_was_received_before_is_acknowledged_again_each_time():
@@ -321,7 +323,9 @@ def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_pati
     window = SendWindow("features", 4, now=0.0)
     assert not window.must_ask(99.0)
     window.push(1, payload(1))
-    assert [window.must_ask(now) for now in (99.0, 99.1, 99.15, 99.3)] == [True, False, False, True]
+    assert window.must_ask(99.0)
+    window.position_requested(99.0)
+    assert [window.must_ask(now) for now in (99.1, 99.15, 99.3)] == [False, False, True]
     window.push(2, payload(2))
     window.receive(Stored(1, 1), now=99.4)
     assert [window.must_ask(now) for now in (99.55, 99.65)] == [False, True]
@@ -421,7 +425,7 @@ def test_a_sample_counts_from_the_message_that_led_to_it_or_an_earlier_one():
         window.receive(reply, now=0.0)
     assert window.versions == {"anna": 5, "ben": 2}
     first, second, third = {"anna": 1}, {"anna": 1, "ben": 2}, {"anna": 5, "ben": 2}
-    assert [window.samples_of(seq) for seq in range(1, 10)] == [*[first] * 3, second, *[third] * 5]
+    assert [window.count_samples(seq) for seq in range(1, 10)] == [*[first] * 3, second, *[third] * 5]
     assert not window._changes, "what was asked for is forgotten"
 
 
@@ -429,7 +433,7 @@ def test_an_object_that_the_receiver_does_not_name_any_more_has_no_newest_sample
     window = filled(size=4, count=4)
     window.receive(Stored(0, 1, {"anna": 1, "ben": 2}), now=0.0)
     window.receive(Stored(0, 2, {"ben": 2}), now=0.0)
-    assert window.versions == window.samples_of(2) == {"ben": 2}
+    assert window.versions == window.count_samples(2) == {"ben": 2}
 
 
 def test_of_a_flood_of_samples_that_nobody_asks_for_only_some_are_remembered():
@@ -437,4 +441,4 @@ def test_of_a_flood_of_samples_that_nobody_asks_for_only_some_are_remembered():
     for version in range(1, 70_000):
         window.receive(Stored(0, 0, {"anna": version}), now=0.0)
     assert len(window._changes) == 65536
-    assert window.samples_of(1) == window.versions == {"anna": 69_999}
+    assert window.count_samples(1) == window.versions == {"anna": 69_999}

@@ -146,7 +146,7 @@ def test_a_sender_knows_which_sample_its_messages_led_to(endpoint, until):
             sender.send(tracks(seq))
             until(lambda seq=seq: sender.taken == seq, turn)
         for seq in range(1, 8):
-            led_to.append(sender.samples_of(seq).get("", 0))
+            led_to.append(sender.count_samples(seq).get("", 0))
     assert led_to == [0, 1, 1, 2, 2, 3, 3]
 
 
