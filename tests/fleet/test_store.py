@@ -177,7 +177,7 @@ def test_of_many_claimants_at_once_only_the_last_one_writes(tmp_path):
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a\n", "é", "x" * 65])
 def test_an_invalid_name_of_a_stream_is_refused(tmp_path, name):
-    with pytest.raises(FleetError, match="is no name of a stream"):
+    with pytest.raises(FleetError, match="is not a valid name of a stream"):
         Store(str(tmp_path)).claim(name, "node-1")
 
 
