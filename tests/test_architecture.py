@@ -81,7 +81,7 @@ IMPORTERS = {
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],
     "uvicorn": ["catstream/web/server.py", "catstream/web/connections.py"],
-    "prometheus_client": ["catstream/web/metrics.py", "catstream/web/fleet_metrics.py"],
+    "prometheus_client": ["catstream/web/metrics.py"],
     "rich": ["catstream/cli"],
 }
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["fleet"]
 
-#: Subcommand -> module that holds it, where it is not this one; the module is imported when it is called.
-_ELSEWHERE = {"view": "fleet_view", "merge": "fleet_merge"}
+#: Subcommand -> module that holds it, where it is not this one, and its name there; imported when it is called.
+_ELSEWHERE = {"view": ("view", "fleet_view"), "merge": ("fleet_merge", "merge")}
 
 _SUMMARIES = {
     "up": "Start the streams of a file, or apply its changes.",
@@ -54,7 +54,8 @@ class _Fleet(click.Group):
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
         if name in _ELSEWHERE:
-            command: click.Command = getattr(import_module(f"catstream.cli.{_ELSEWHERE[name]}"), name)
+            module, attribute = _ELSEWHERE[name]
+            command: click.Command = getattr(import_module(f"catstream.cli.{module}"), attribute)
             return command
         return super().get_command(context, name)
 

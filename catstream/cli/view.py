@@ -1,15 +1,19 @@
-"""`catstream view`: serve a web page for a running pipeline."""
+"""`catstream view` and `catstream fleet view`: serve a web page of a running pipeline, or of all streams of a fleet."""
 
 from __future__ import annotations
 
 import signal
+from typing import TYPE_CHECKING
 
 import click
 
 from catstream.cli.attach import with_endpoint
-from catstream.cli.serving import PORT, with_token
+from catstream.cli.serving import PORT, Address, AddressType, with_token
 
-__all__ = ["view"]
+if TYPE_CHECKING:
+    from catstream.web.server import Site
+
+__all__ = ["fleet_view", "view"]
 
 
 @click.command()
@@ -53,10 +57,61 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
       VIEW_TOKEN_FILE=my-token catstream view
     """
     from catstream.web.app import pipeline_site
+
+    _serve(pipeline_site(endpoint, keys), Address(host, port), token)
+
+
+@click.command("view")
+@click.option(
+    "--fleet",
+    default="",
+    metavar="ADDRESS",
+    help="HOST:PORT of the fleet, or the name of one of yours; not needed if only one runs.",
+)
+@click.option("--keys", default="", metavar="DIR", help="Folder of keys, if the fleet requires keys.")
+@click.option(
+    "--listen",
+    default=f"127.0.0.1:{PORT}",
+    show_default=True,
+    type=AddressType(),
+    help="Address to listen on; port 0 for any free port.",
+)
+@with_token()
+def fleet_view(fleet: str, keys: str, listen: Address, token: str | None) -> None:
+    """Watch all streams of a fleet in a browser.
+
+    The page shows the state and a small picture of each stream, those in
+    trouble first, and the nodes. Each stream links to its own page, which is
+    that of catstream view. If the fleet does not answer, the page keeps its
+    last state and waits. Ctrl-C ends the server; the fleet continues. Token
+    and encryption are as for catstream view.
+
+    \b
+    Serves
+      /                 the page of the fleet
+      /streams/NAME/    the page of a stream
+      /metrics          metrics of all streams and nodes for Prometheus
+      /healthz          200 while this server runs
+      /readyz           200 while the fleet answers
+
+    \b
+    EXAMPLES
+      catstream fleet view
+      catstream fleet view --fleet head.example.org:5690 --keys my-keys
+      catstream fleet view --listen 0.0.0.0:8000
+      VIEW_TOKEN_FILE=my-token catstream fleet view
+    """
+    from catstream.web.app import fleet_site
+
+    _serve(fleet_site(fleet, keys), listen, token)
+
+
+def _serve(site: Site, address: Address, token: str | None) -> None:
+    """Print the links of a site, and serve it until Ctrl-C or SIGTERM."""
     from catstream.web.server import Server
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    server = Server(pipeline_site(endpoint, keys), host=host, port=port, token=token)
+    server = Server(site, host=address.host, port=address.port, token=token)
     for url in server.urls:
         click.echo(url)
     server.run()

@@ -1,81 +1,105 @@
-"""The web application of one pipeline: the page, its events and pictures, control, and metrics.
+"""The web application: the page of a pipeline, or the page of a fleet and below it that of each of its streams.
 
 /                 the page
 /events           updates of the page as server-sent events, at most ten per second
+/metrics          metrics for Prometheus
+/healthz          200 while this server runs
+/readyz           200 while all processes of the pipeline send health reports, or while the fleet answers
+
+of a pipeline only
+
 /pictures/N.jpg   the picture of frame N
 /live.mjpeg       the newest pictures with their tracks drawn in, as an MJPEG stream
 /control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ...}
-/metrics          metrics for Prometheus
-/healthz          200 while this server runs
-/readyz           200 while all processes of the pipeline send health reports
+
+of a fleet only
+
+/streams/NAME/              all of the above for the pipeline of a stream
+/streams/NAME/picture.jpg   a small picture of its newest frame; 204 if there is none
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import monotonic
+from typing import Annotated, Literal
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import Mount, Route
+from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
-from starlette.types import Lifespan
 
+from catstream.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
-from catstream.messages.kinds import Answer
-from catstream.messages.names import check_name
+from catstream.messages.kinds import Answer, ObjectName
+from catstream.messages.schema import OnlyWith
 from catstream.video.annotate import draw_preview
 from catstream.web import metrics
-from catstream.web.feed import Feed
-from catstream.web.guard import TokenBucket, body_of, too_many
+from catstream.web.connections import body_of
+from catstream.web.feed import Feed, PipelineFeed
+from catstream.web.guard import TokenBucket, too_many
 from catstream.web.server import Site
+from catstream.web.streams import FleetFeed
 from catstream.web.viewers import UPDATE_SECONDS
-from catstream.wire.channels import CHANNELS
+from catstream.wire.codec import decode_json
 
-__all__ = ["pipeline_app", "pipeline_site"]
+__all__ = ["fleet_site", "pipeline_site"]
 
 _PAGE = Path(__file__).with_name("page")
 _COMMANDS, _COMMANDS_PER_SECOND = 20, 5
-_VERBS = ("set-box", "forget", "pause", "resume", "stop")
-_DEFAULTS: dict[str, object] = {"verb": "", "object": "", "box": None, "keep": False}  # of the fields of a command
 
 
 def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
-    """Return the site of the pipeline at an endpoint, as in `Feed`."""
-    feed = Feed(endpoint, keys)
+    """Return the site of the pipeline at an endpoint, as in `PipelineFeed`."""
+    return _site(PipelineFeed(endpoint, keys))
+
+
+def fleet_site(fleet: str = "", keys: str = "") -> Site:
+    """Return the site of a fleet, which may start later; the arguments are those of `FleetFeed`."""
+    return _site(FleetFeed(fleet, keys))
+
+
+def _site(feed: PipelineFeed | FleetFeed) -> Site:
+    """Return the site whose first page shows what this feed has."""
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         async with feed.running():
             yield
 
-    return Site(pipeline_app(feed, lifespan), feed.viewers.close)
+    return Site(Starlette(lifespan=lifespan, routes=_routes(feed)), feed.close_viewers)
 
 
-def pipeline_app(feed: Feed, lifespan: Lifespan[Starlette] | None = None) -> Starlette:
-    """Return the application of the page that a feed keeps up to date; its URLs are relative, so it can be mounted."""
+def _routes(feed: PipelineFeed | FleetFeed) -> list[BaseRoute]:
     pages = _Pages(feed)
-    return Starlette(
-        lifespan=lifespan,
-        routes=[
-            Route("/", pages.index),
-            Route("/events", pages.events),
-            Route("/live.mjpeg", pages.live),
-            Route("/pictures/{frame:int}.jpg", pages.picture),
-            Route("/control", pages.control, methods=["POST"]),
-            Route("/metrics", pages.metrics),
-            Route("/healthz", pages.healthz),
-            Route("/readyz", pages.readyz),
-            Mount("/page", StaticFiles(directory=_PAGE)),
-        ],
-    )
+    common = [
+        Route("/", pages.index),
+        Route("/events", pages.events),
+        Route("/metrics", pages.metrics),
+        Route("/healthz", pages.healthz),
+        Route("/readyz", pages.readyz),
+        Mount("/page", StaticFiles(directory=_PAGE)),
+    ]
+    of_pipeline = [
+        *common,
+        Route("/pictures/{frame:int}.jpg", pages.picture),
+        Route("/live.mjpeg", pages.live),
+        Route("/control", pages.control, methods=["POST"]),
+    ]
+    if isinstance(feed, PipelineFeed):
+        return of_pipeline
+    return [
+        *common,
+        Route("/streams/{stream}/picture.jpg", partial(_small_picture, feed)),
+        Mount("/streams/{stream}", routes=of_pipeline),
+    ]
 
 
 class _Pages:
@@ -85,52 +109,48 @@ class _Pages:
         self._feed = feed
         self._commands = TokenBucket(_COMMANDS, _COMMANDS_PER_SECOND)
 
-    async def index(self, _: Request) -> Response:
+    async def index(self, request: Request) -> Response:
+        self._feed_of(request)
         return FileResponse(_PAGE / "index.html")
 
-    async def events(self, _: Request) -> Response:
-        return self._feed.viewers.events(self._feed.dashboard.updates)
+    async def events(self, request: Request) -> Response:
+        feed = self._feed_of(request)
+        return feed.viewers.events(feed.dashboard)
 
-    async def live(self, _: Request) -> Response:
-        return self._feed.viewers.too_many() or StreamingResponse(
-            self._annotated_stream(), media_type="multipart/x-mixed-replace; boundary=picture"
-        )
+    async def metrics(self, request: Request) -> Response:
+        text = metrics.text(self._feed_of(request))
+        return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
-    async def _annotated_stream(self) -> AsyncIterator[bytes]:
-        shown = None
-        with self._feed.viewers.counted():
-            yield b"--picture\r\n"
-            while not self._feed.viewers.closed:
-                newest = self._feed.dashboard.newest
-                if newest is not None and newest != shown:
-                    shown = newest
-                    jpeg = await run_in_threadpool(draw_preview, *newest, self._feed.dashboard.objects.colours)
-                    # The boundary after the picture is sent with it: many clients show a picture only after it.
-                    yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (
-                        len(jpeg),
-                        jpeg,
-                    )
-                await asyncio.sleep(UPDATE_SECONDS)
+    async def healthz(self, _: Request) -> Response:
+        return PlainTextResponse("ok\n")
+
+    async def readyz(self, request: Request) -> Response:
+        problem = self._feed_of(request).problem
+        return PlainTextResponse(f"{problem or 'ok'}\n", 503 if problem else 200)
 
     async def picture(self, request: Request) -> Response:
-        preview = self._feed.dashboard.picture(request.path_params["frame"])
+        preview = self._pipeline(request).dashboard.picture(request.path_params["frame"])
         if preview is None:
             return PlainTextResponse("this picture is no longer available\n", 404)
         return Response(preview.jpeg, media_type="image/jpeg")
 
+    async def live(self, request: Request) -> Response:
+        feed = self._pipeline(request)
+        return feed.viewers.too_many() or StreamingResponse(
+            _annotated_stream(feed), media_type="multipart/x-mixed-replace; boundary=picture"
+        )
+
     async def control(self, request: Request) -> Response:
+        feed = self._pipeline(request)
         # A page of another origin cannot send this content type without a CORS preflight request.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return _refused(415, "expected application/json")
         if wait := self._commands.wait(monotonic()):
             return too_many(wait)
-        self._commands.take()
+        self._commands.take(monotonic())
         try:
             command = _command(await body_of(request))
-        except ValueError as error:
-            return _refused(400, str(error))
-        try:
-            answer = await run_in_threadpool(_execute, self._feed, command)
+            answer = await run_in_threadpool(_execute, feed, command)
         except CommandRejectedError as error:
             return _refused(409, str(error))
         except ProtocolError as error:
@@ -142,52 +162,59 @@ class _Pages:
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
         return JSONResponse({"done": True} | result)
 
-    async def metrics(self, _: Request) -> Response:
-        return Response(metrics.text(self._feed), media_type="text/plain; version=0.0.4; charset=utf-8")
+    def _feed_of(self, request: Request) -> Feed:
+        """Return the feed of the page that a request is about."""
+        return self._pipeline(request) if "stream" in request.path_params else self._feed
 
-    async def healthz(self, _: Request) -> Response:
-        return PlainTextResponse("ok\n")
+    def _pipeline(self, request: Request) -> PipelineFeed:
+        """Return the feed of the stream that a request names, or of the only one."""
+        return self._feed.pipeline(request.path_params.get("stream", ""))
 
-    async def readyz(self, _: Request) -> Response:
-        silent = [name for name in CHANNELS["health"].senders if name not in self._feed.dashboard.last_reports]
-        return (
-            PlainTextResponse(f"no health report from: {', '.join(silent)}\n", 503)
-            if silent
-            else PlainTextResponse("ok\n")
-        )
+
+async def _small_picture(feed: FleetFeed, request: Request) -> Response:
+    try:
+        jpeg = await feed.picture(request.path_params["stream"])
+    except CatstreamError as error:
+        return PlainTextResponse(f"{error}\n", 503)
+    return Response(status_code=204) if jpeg is None else Response(jpeg, media_type="image/jpeg")
+
+
+async def _annotated_stream(feed: PipelineFeed) -> AsyncIterator[bytes]:
+    """Yield the parts of an MJPEG stream."""
+    shown = None
+    with feed.viewers.counted():
+        yield b"--picture\r\n"
+        while not feed.viewers.closed:
+            newest = feed.dashboard.newest
+            if newest is not None and newest != shown:
+                shown = newest
+                jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.objects.colours)
+                # The boundary after the picture is sent with it: many clients show a picture only after it.
+                yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (len(jpeg), jpeg)
+            await asyncio.sleep(UPDATE_SECONDS)
 
 
 @dataclass(frozen=True, slots=True)
-class _Command:
-    """A posted command: verb, name of the object, and the arguments of `Control.set_box`."""
+class Command:
+    """A command of the page: the fields of `catstream.messages.kinds.Command` that it may set."""
 
-    verb: str
-    object: str
-    box: list[float] | None
-    keep: bool
+    verb: Literal["set-box", "forget", "pause", "resume", "stop"]
+    object: ObjectName = ""
+    box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
+    keep: bool = False
 
 
-def _command(body: bytes | None) -> _Command:
-    """Return a posted command. Raises ValueError if it is not valid."""
+def _command(body: bytes | None) -> Command:
+    """Return a posted command. Raises ProtocolError if it is not valid."""
     if body is None:
-        raise ValueError("expected a command, got more than 4096 bytes")
-    try:
-        # An integer that is too large becomes infinite, and is rejected.
-        command: object = json.loads(body, parse_int=float)
-    except (RecursionError, ValueError) as error:
-        raise ValueError(f"expected a command in JSON: {error}") from None
-    if not isinstance(command, dict) or command.get("verb") not in _VERBS:
-        raise ValueError(f'expected "verb": one of {", ".join(_VERBS)}')
-    verb, name, box, keep = (command.get(key, default) for key, default in _DEFAULTS.items())
-    numbers = isinstance(box, list) and len(box) == 4 and all(type(side) is float for side in box)
-    if (verb == "set-box") != numbers or not isinstance(keep, bool) or (box is not None and not numbers):
-        raise ValueError('expected "box": [x, y, w, h] with set-box and with nothing else, and "keep": true or false')
-    if not isinstance(name, str) or (name and verb not in ("set-box", "forget")):
-        raise ValueError('expected "object": the name of an object, with set-box and forget and with nothing else')
-    return _Command(verb, check_name(name), box, keep)
+        raise ProtocolError("expected a command, got more than 4096 bytes")
+    command = decode_json(body, Command)
+    if command.object and command.verb not in ("set-box", "forget"):
+        raise ProtocolError(f"expected the name of an object with set-box and forget, got one with {command.verb}")
+    return command
 
 
-def _execute(feed: Feed, command: _Command) -> Answer:
+def _execute(feed: PipelineFeed, command: Command) -> Answer:
     """Send a command and wait for its answer."""
     with feed.control() as pipeline:
         if command.box is not None:

@@ -1,100 +1,113 @@
-"""HTTP connections with time-outs and a limit on their number, so that one client cannot block the server."""
+"""Time-outs of connections and a limit on their number, so that one client cannot block the server.
+
+The server waits for a client until its request is complete, and while the client does not read the response. If more
+than `MAX_CONNECTIONS` are open, the one whose client it has waited for longest is closed. A new client is therefore
+always answered, even if many open connections come from one address, as behind a proxy.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from typing import cast
+from typing import Any
 
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-__all__ = ["MAX_CONNECTIONS", "Connection"]
+__all__ = ["MAX_CONNECTIONS", "Connections", "body_of"]
 
 #: Maximum number of open connections.
 MAX_CONNECTIONS = 256
 
-_REQUEST_SECONDS = 5.0  # time-out for a client to send a request with its body
+_REQUEST_SECONDS = 5.0  # time-out for a client to send a request, and its body
 _ANSWER_SECONDS = 20.0  # time-out for a client that does not read its response
+_MAX_BODY = 4096  # bytes
 
 
-class Connection(H11Protocol):
-    """An HTTP/1.1 connection with time-outs for its client.
+class Connections:
+    """The open connections of a server; it is the server's application, and passes each request on to another one."""
 
-    If more than `MAX_CONNECTIONS` are open, the one that has kept the server waiting for longest is closed.
-    A new client is therefore always answered, even if many open connections come from one address, as behind a proxy. A
-    connection whose response is in preparation is never closed.
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self.open: dict[tuple[str, int], _Connection] = {}  # by the address and port of the client
+        self.waiting: dict[_Connection, asyncio.TimerHandle] = {}  # those that wait for their client, longest first
 
-    waiting_since : time at which the server began to wait for this client, by the clock of the event loop: for a
-        request, for the rest of one, or for the client to read the response. None while it does not wait
-    """
+    def protocol(self, **of_uvicorn: Any) -> asyncio.Protocol:
+        """Return the protocol of a new connection."""
+        return _Connection(self, H11Protocol(**of_uvicorn))
 
-    waiting_since: float | None = None
-    _timer: asyncio.TimerHandle | None = None
-    _closed = False
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        connection = self.open.get(scope["client"]) if scope.get("client") else None
+        if connection is not None:
+            connection.change(answering=True)
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            if connection is not None:
+                connection.change(answering=False)
+
+
+class _Connection(asyncio.Protocol):
+    """One connection: passes everything on to uvicorn's protocol, and measures how long it waits for the client."""
+
+    def __init__(self, all_: Connections, inner: asyncio.Protocol) -> None:
+        self._all, self._inner = all_, inner
+        self._answering = self._paused = False
+
+    def change(self, *, answering: bool | None = None, paused: bool | None = None) -> None:
+        """Start or stop a time-out: the application is answering, or the client does not read."""
+        self._answering = self._answering if answering is None else answering
+        self._paused = self._paused if paused is None else paused
+        if (timer := self._all.waiting.pop(self, None)) is not None:
+            timer.cancel()
+        if self._address in self._all.open and (self._paused or not self._answering):
+            seconds = _ANSWER_SECONDS if self._paused else _REQUEST_SECONDS
+            self._all.waiting[self] = asyncio.get_running_loop().call_later(seconds, self._abort)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
-        super().connection_made(transport)
-        self._wait_for_client(_REQUEST_SECONDS)
-        others = [cast(Connection, other) for other in self.connections]
-        there = [other for other in others if not other._closed]
-        waiting = [other for other in there if other.waiting_since is not None]
-        if len(there) > MAX_CONNECTIONS:  # `waiting` is not empty: this new connection waits for its request
-            min(waiting, key=lambda other: other.waiting_since or 0.0).abort()
+        self._transport, self._address = transport, tuple(transport.get_extra_info("peername")[:2])
+        self._all.open[self._address] = self
+        self._inner.connection_made(transport)
+        self.change()
+        if len(self._all.open) > MAX_CONNECTIONS:
+            next(iter(self._all.waiting))._abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._stop_waiting()
-        super().connection_lost(exc)
+        self._all.open.pop(self._address, None)
+        self.change()
+        self._inner.connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        if self._timer is None and self._between_requests:
-            self._wait_for_client(_REQUEST_SECONDS)  # the first bytes of the next request
-        super().data_received(data)
-        self._update_wait()
+        self._inner.data_received(data)
 
-    def on_response_complete(self) -> None:
-        super().on_response_complete()
-        self._update_wait()
+    def eof_received(self) -> bool | None:
+        return self._inner.eof_received()
 
     def pause_writing(self) -> None:
-        super().pause_writing()
-        self._wait_for_client(_ANSWER_SECONDS)
+        self._inner.pause_writing()
+        self.change(paused=True)
 
     def resume_writing(self) -> None:
-        super().resume_writing()
-        self._stop_waiting()
-        self._update_wait()
+        self._inner.resume_writing()
+        self.change(paused=False)
 
-    def abort(self) -> None:
+    def _abort(self) -> None:
         """Close the connection at once, and drop unsent data."""
-        self._closed = True
-        self._stop_waiting()
-        self.transport.abort()
+        self._all.open.pop(self._address, None)
+        self.change()
+        self._transport.abort()
 
-    @property
-    def _between_requests(self) -> bool:
-        return self.cycle is not None and self.cycle.response_complete and not self.cycle.more_body
 
-    def _update_wait(self) -> None:
-        """Start or stop the time-out, by whether the server waits for the client now."""
-        if self._closed or self.flow.write_paused:
-            return
-        if self.cycle is not None and not self.cycle.more_body and not self.cycle.response_complete:
-            self._stop_waiting()
-        elif (
-            self._between_requests and not self.conn.trailing_data[0]
-        ):  # an idle connection has the time-out `timeout_keep_alive`
-            self._stop_waiting()
-            self.waiting_since = self.loop.time()
-        elif self._timer is None:
-            self._wait_for_client(_REQUEST_SECONDS)
-
-    def _wait_for_client(self, seconds: float) -> None:
-        """Start a time-out for the client."""
-        self._stop_waiting()
-        self.waiting_since = self.loop.time()
-        self._timer = self.loop.call_later(seconds, self.abort)
-
-    def _stop_waiting(self) -> None:
-        self.waiting_since = None
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+async def body_of(request: Request) -> bytes | None:
+    """Return the body of a request, None if it is longer than 4096 bytes."""
+    body = b""
+    try:
+        async with asyncio.timeout(_REQUEST_SECONDS):
+            async for part in request.stream():
+                body += part
+                if len(body) > _MAX_BODY:
+                    return None
+    except TimeoutError:
+        raise HTTPException(408, "the request was not complete in time\n") from None
+    return body

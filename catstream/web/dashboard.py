@@ -1,19 +1,23 @@
-"""The state of the web page, computed from the messages of a pipeline. It uses no socket and no clock."""
+"""The state of a page: of a pipeline, computed from its messages, and of a fleet. It uses no socket and no clock."""
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict, deque
-from typing import Literal
+from collections import OrderedDict, deque
+from typing import Any, Literal
 
 from catstream.messages.heads import TREES
-from catstream.messages.kinds import End, Features, Health, Model, Preview, Track
+from catstream.messages.kinds import End, Features, FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
 from catstream.web.objects import Objects
 from catstream.web.surprising import SurprisingFrames
+from catstream.web.viewers import Parts
 
-__all__ = ["SILENCE_SECONDS", "Dashboard", "Phase"]
+__all__ = ["RUNNING", "SILENCE_SECONDS", "Dashboard", "FleetDashboard"]
 
-#: Phase of the pipeline: no message yet, running, silent for some seconds, ended.
+#: Phase of a pipeline or a fleet: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
+
+#: States in which the pipeline of a stream runs.
+RUNNING = ("running", "waiting", "paused")
 
 #: A process without a health report for this long counts as silent; each process sends one every second.
 SILENCE_SECONDS = 4.0
@@ -30,7 +34,7 @@ _PICTURES = 8  # number of pictures that a page may still request
 _Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
 
 
-class Dashboard:
+class Dashboard(Parts):
     """Receives messages, and returns the updates for each open page.
 
     It shows one pipeline. It keeps the last picture and figures until the first track or health report of another
@@ -44,10 +48,21 @@ class Dashboard:
     """
 
     def __init__(self) -> None:
+        super().__init__(
+            {
+                "pipeline": lambda _: self._revisions["pipeline"],  # the number of pipelines so far; clears a page
+                "status": self._status_part,
+                "tracks": self._tracks_part,
+                "picture": self._picture_part,
+                "points": self._points_part,
+                "trees": self._trees_part,
+                "surprising": self._surprising_part,
+            }
+        )
+        self._mark_changed("pipeline", "trees")
         self.endpoint = self._attached = ""
         self._run = ""  # id of the run that is shown
         self._runs_before: set[str] = set()  # ids of those before it, whose last messages may still arrive
-        self._revisions: Counter[str] = Counter(pipeline=1, trees=1)  # `pipeline` is the first update: it clears a page
         self._reset()
 
     def _reset(self) -> None:
@@ -117,9 +132,7 @@ class Dashboard:
 
     def rate(self, now: float) -> float:
         """Return the frames per second over the last two seconds."""
-        while self._moments and now - self._moments[0] > _RATE_SECONDS:
-            self._moments.popleft()
-        return len(self._moments) / _RATE_SECONDS
+        return sum(now - moment <= _RATE_SECONDS for moment in self._moments) / _RATE_SECONDS
 
     def counter(self, process: str, name: str) -> float | None:
         """Return a counter from the last health report of a process, None if there is none."""
@@ -144,20 +157,6 @@ class Dashboard:
             return None
         tracks = self._tracks.get(preview.frame, {}).values()
         return preview, [track for track in tracks if track.object in self.objects.shown]
-
-    def updates(self, seen: dict[str, int]) -> dict[str, object]:
-        """Return the parts that have changed since the last call for this page, as JSON values.
-
-        Parameters
-        ----------
-        seen : revisions that the page has received; empty at first, updated by this call
-        """
-        parts = {}
-        for name, revision in self._revisions.items():
-            if seen.get(name) != revision:
-                parts[name] = getattr(self, f"_{name}_part")(revision - seen.get(name, 0))
-                seen[name] = revision
-        return parts
 
     def _add_health(self, health: Health, now: float) -> None:
         self.health[health.process] = health
@@ -203,6 +202,8 @@ class Dashboard:
         if len(self._tracks) > _TRACKS:
             self._tracks.popitem(last=False)
         self._moments.append(now)
+        while now - self._moments[0] > _RATE_SECONDS:
+            self._moments.popleft()
         self._arrivals[track.frame] = now
         if len(self._arrivals) > _FRAMES:
             self._arrivals.popitem(last=False)
@@ -232,16 +233,12 @@ class Dashboard:
         self._points.append((now, self.rate(now), objects))
         self._mark_changed("points")
 
-    def _mark_changed(self, *parts: str) -> None:
-        self._revisions.update(parts)
-
     def _status_part(self, _: int) -> dict[str, object]:
         return {
             "phase": self.phase,
             "reason": self.reason,
             "endpoint": self.endpoint,
             "source": self.source,
-            "processes": sorted(self.last_reports),
             "paused": bool(self.counter("detector", "paused")),
             "waiting": bool(self.counter("detector", "waiting")),
             "lost_seconds": self.counter("detector", "lost_seconds"),
@@ -255,10 +252,6 @@ class Dashboard:
             for name, each in self.objects.shown.items()
         ]
         return {"frame": frame, "time": time, "objects": objects}
-
-    def _pipeline_part(self, _: int) -> int:
-        """Return the number of pipelines shown so far; if it changes, all parts are sent again."""
-        return self._revisions["pipeline"]
 
     def _picture_part(self, _: int) -> dict[str, object] | None:
         if self.newest is None:
@@ -299,3 +292,68 @@ class Dashboard:
 
 def _rounded(value: float | None) -> float | None:
     return round(value, 3) if isinstance(value, float) else value
+
+
+class FleetDashboard(Parts):
+    """Receives the status of a fleet, and returns the updates for each open page: all streams and nodes, once a second.
+
+    It keeps the last status while the fleet does not answer.
+
+    Attributes
+    ----------
+    status : the last status, None before the first
+    phase, reason : phase of the fleet, and the reason why it does not answer
+    age : seconds since the last status arrived, 0 while the fleet answers
+    """
+
+    def __init__(self) -> None:
+        super().__init__({"fleet": self._fleet_part, "streams": self._streams_part, "nodes": self._nodes_part})
+        self.status: FleetStatus | None = None
+        self.phase: Phase = "waiting"
+        self.reason = ""
+        self.age = self._arrived = 0.0
+        self._mark_changed("fleet")
+
+    def take(self, status: FleetStatus, now: float) -> None:
+        """Process a status that arrived at the time `now`, in seconds of a monotonic clock."""
+        self.status, self.phase, self.reason, self.age, self._arrived = status, "running", "", 0.0, now
+        self._mark_changed("fleet", "streams", "nodes")
+
+    def mark_silent(self, reason: str, now: float) -> None:
+        """Record that the fleet did not answer at the time `now`."""
+        self.reason = reason
+        if self.status is not None:
+            self.phase, self.age = "silent", now - self._arrived
+        self._mark_changed("fleet")
+
+    def _fleet_part(self, _: int) -> dict[str, object]:
+        name = self.status.name if self.status is not None else ""
+        return {"name": name, "phase": self.phase, "reason": self.reason, "age": int(self.age)}
+
+    def _streams_part(self, _: int) -> dict[str, dict[str, Any]]:
+        return {name: _stream(each) for name, each in self.status.streams.items()} if self.status is not None else {}
+
+    def _nodes_part(self, _: int) -> dict[str, dict[str, Any]]:
+        return {name: _node(each) for name, each in self.status.nodes.items()} if self.status is not None else {}
+
+
+def _stream(stream: StreamStatus) -> dict[str, Any]:
+    """Return what the page shows of a stream; `picture` is whether it can show one of its newest frame."""
+    names = ("state", "trouble", "node", "source", "restarts", "skipped", "lost_frames")
+    return {name: getattr(stream, name) for name in names} | {
+        "rate": round(stream.rate, 1),
+        "lost_seconds": round(stream.lost_seconds, 1),
+        "stored_seconds": stream.stored_seconds,
+        "models": list(stream.models.items()),
+        "picture": bool(stream.endpoint) and stream.state in RUNNING,
+    }
+
+
+def _node(node: NodeStatus) -> dict[str, Any]:
+    """Return what the page shows of a node."""
+    names = ("state", "trouble", "address", "streams")
+    return {name: getattr(node, name) for name in names} | {
+        "cores": round(node.cores, 2),
+        "used": round(node.used, 2),
+        "labels": [f"{name}={value}" for name, value in sorted(node.labels.items())],
+    }

@@ -1,10 +1,11 @@
-"""Feeds the messages of a pipeline to the dashboard, and reconnects after each end, silence or restart."""
+"""Keeps the state of a page up to date: that of a pipeline, with its messages."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator
 from time import monotonic
 
@@ -14,14 +15,15 @@ from catstream.client.subscription import AnyMessage, Subscription
 from catstream.errors import CatstreamError
 from catstream.messages.kinds import End
 from catstream.web.dashboard import SILENCE_SECONDS, Dashboard
-from catstream.web.viewers import Viewers
+from catstream.web.viewers import Parts, Viewers
+from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 
-__all__ = ["Feed"]
+__all__ = ["Feed", "PipelineFeed"]
 
 _log = logging.getLogger(__name__)
 
-_PAUSE_SECONDS = 0.5
+_PAUSE_SECONDS = 0.5  # before a pipeline is looked up again
 _DRAIN_SECONDS = 2.0  # time for the last messages to arrive after the end
 
 #: Channels that show that a pipeline runs; those that are read while it runs; and those that are read only while a page
@@ -29,28 +31,32 @@ _DRAIN_SECONDS = 2.0  # time for the last messages to arrive after the end
 _LIVENESS, _PERMANENT, _FOR_VIEWERS = ("tracks", "health"), ("models",), ("previews", "features")
 
 
-class Feed:
-    """Feeds a dashboard while `run` runs.
-
-    Parameters
-    ----------
-    endpoint : endpoint of the pipeline, or address of a stream of a fleet; empty for the only running pipeline of this
-        user. It is looked up at each connection
-    keys : folder of the keys of this client, if the pipeline requires keys
+class Feed(ABC):
+    """Keeps a dashboard up to date while it runs.
 
     Attributes
     ----------
-    dashboard : the dashboard
-    place : endpoint of the current connection, with its keys; None if there is none
-    viewers : the open pages; pictures and features are received while there is one
+    dashboard : the state of the page
+    viewers : the open pages
     """
 
-    def __init__(self, endpoint: str = "", keys: str = "") -> None:
-        self._endpoint, self._keys = endpoint, keys
-        self.dashboard = Dashboard()
-        self.place: Endpoint | None = None
+    dashboard: Parts
+
+    def __init__(self) -> None:
         self.viewers = Viewers()
-        self._is_running = asyncio.Event()
+
+    @property
+    @abstractmethod
+    def problem(self) -> str:
+        """What is missing until everything runs; empty if nothing is. It names no address, and no stream."""
+
+    @abstractmethod
+    def pipeline(self, stream: str) -> PipelineFeed:
+        """Return the feed of a stream; this one, if it is that of a pipeline."""
+
+    def close_viewers(self) -> None:
+        """End the updates of open pages."""
+        self.viewers.closed = True
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -63,26 +69,75 @@ class Feed:
             with contextlib.suppress(asyncio.CancelledError):
                 await task
 
+    async def run(self) -> None:
+        """Feed the dashboard until cancelled; each error is shown on the page, and then it goes on."""
+        while True:
+            try:
+                await self._feed()
+            except CatstreamError as error:
+                self._mark_silent(str(error))
+            except Exception as error:  # an unexpected error must not end the feed silently
+                _log.exception("The page lost what it shows, and tries again.")
+                self._mark_silent(f"{type(error).__name__}: {error}")
+            await asyncio.sleep(self._pause)
+
+    #: Seconds between two calls of `_feed`.
+    _pause: float
+
+    @abstractmethod
+    async def _feed(self) -> None:
+        """Feed the dashboard, until the connection is lost or the answer is complete."""
+
+    @abstractmethod
+    def _mark_silent(self, reason: str) -> None:
+        """Tell the dashboard that nothing arrives."""
+
+
+class PipelineFeed(Feed):
+    """Receives the messages of a pipeline, and reconnects after each end, silence or restart.
+
+    Parameters
+    ----------
+    endpoint : endpoint of the pipeline, or address of a stream of a fleet; empty for the only running pipeline of this
+        user. It is looked up at each connection
+    keys : folder of the keys of this client, if the pipeline requires keys
+
+    Attributes
+    ----------
+    place : endpoint of the current connection, with its keys; None if there is none
+    """
+
+    dashboard: Dashboard
+    _pause = _PAUSE_SECONDS
+
+    def __init__(self, endpoint: str = "", keys: str = "") -> None:
+        super().__init__()
+        self._endpoint, self._keys = endpoint, keys
+        self.dashboard = Dashboard()
+        self.place: Endpoint | None = None
+        self._is_running = asyncio.Event()
+
+    @property
+    def problem(self) -> str:
+        silent = [name for name in CHANNELS["health"].senders if name not in self.dashboard.last_reports]
+        return f"no health report from: {', '.join(silent)}" if silent else ""
+
+    def pipeline(self, stream: str) -> PipelineFeed:  # noqa: ARG002  # there is one
+        return self
+
     def control(self) -> Control:
         """Connect to the pipeline to send commands."""
         return Control(self.place or self._endpoint, keys=self._keys)
 
-    async def run(self) -> None:
-        """Connect, and reconnect after each loss, until cancelled."""
-        while True:
-            try:
-                self.place = await asyncio.to_thread(locate, self._endpoint, self._keys)
-                self.dashboard.attach(str(self.place))
-                await self._run_attached(self.place)
-            except CatstreamError as error:
-                self.dashboard.mark_silent(str(error))
-            except Exception as error:  # an unexpected error must not end the feed silently
-                _log.exception("The page lost the pipeline and reconnects.")
-                self.dashboard.mark_silent(f"{type(error).__name__}: {error}")
-            self.place = None
-            await asyncio.sleep(_PAUSE_SECONDS)
+    def _mark_silent(self, reason: str) -> None:
+        self.dashboard.mark_silent(reason)
 
-    async def _run_attached(self, place: Endpoint) -> None:
+    async def _feed(self) -> None:
+        self.place = await asyncio.to_thread(locate, self._endpoint, self._keys)
+        self.dashboard.attach(str(self.place))
+        await self._receive(self.place)
+
+    async def _receive(self, place: Endpoint) -> None:
         """Receive all channels until the pipeline ends or is silent."""
         self._is_running.clear()
         tasks = [
@@ -95,6 +150,7 @@ class Feed:
             # After the end, the last health report, with the final size of the trees, and the last picture may follow.
             await asyncio.wait(rest, timeout=_DRAIN_SECONDS)
         finally:
+            self.place = None
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)

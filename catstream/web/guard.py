@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from catstream.errors import ServiceError
 
-__all__ = ["Guard", "TokenBucket", "body_of", "is_loopback", "too_many"]
+__all__ = ["Guard", "TokenBucket", "is_loopback", "too_many"]
 
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
 _PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline runs
@@ -26,7 +26,6 @@ _NEEDED = "a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN\n"
 _WRONG = "this is not the token that this page was started with\n"
 
 _MIN_TOKEN_LENGTH = 16
-_MAX_BODY = 4096  # bytes
 _MAX_GUESSES, _GUESSES_PER_SECOND = 8, 0.2  # wrong tokens from one address
 _ADDRESSES = 1024  # number of addresses with wrong tokens that are kept
 
@@ -50,17 +49,15 @@ class TokenBucket:
 
     def __init__(self, size: float, rate: float) -> None:
         self._size, self._rate = size, rate
-        self._level, self._moment = size, float("-inf")
+        self._full_at = float("-inf")  # time from which it is full
 
     def wait(self, now: float) -> float:
         """Return the seconds until the next request is allowed, 0 if it is allowed now."""
-        self._level = min(self._size, self._level + (now - self._moment) * self._rate)
-        self._moment = now
-        return max(0.0, 1 - self._level) / self._rate
+        return max(0.0, self._full_at - now - (self._size - 1) / self._rate)
 
-    def take(self) -> None:
+    def take(self, now: float) -> None:
         """Count a request."""
-        self._level -= 1
+        self._full_at = max(self._full_at, now) + 1 / self._rate
 
 
 class Guard:
@@ -144,18 +141,8 @@ class Guard:
             self._guesses.popitem(last=False)
         wait = guesses.wait(now)
         if not wait:
-            guesses.take()
+            guesses.take(now)
         return wait
-
-
-async def body_of(request: Request) -> bytes | None:
-    """Return the body of a request, None if it is longer than 4096 bytes."""
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > _MAX_BODY:
-            return None
-    return body
 
 
 def too_many(wait: float) -> Response:

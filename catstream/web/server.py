@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import fcntl
 import socket
@@ -9,13 +10,14 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import cast
 from urllib.parse import quote
 
 import uvicorn
 from starlette.types import ASGIApp
 
 from catstream.errors import ServiceError
-from catstream.web.connections import MAX_CONNECTIONS, Connection
+from catstream.web.connections import MAX_CONNECTIONS, Connections
 from catstream.web.guard import Guard, is_loopback
 
 __all__ = ["Server", "Site"]
@@ -64,7 +66,7 @@ class Server:
                 f"{host} can be reached from other machines, and anyone who opens the page may steer: serve it with a "
                 "token (without --no-token), or listen on 127.0.0.1"
             )
-        guard = Guard(site.app, token)
+        connections = Connections(Guard(site.app, token))
         self._socket = _listen(host, port)
         bound = self._socket.getsockname()[1]
         end = f":{bound}/" + (f"?token={quote(token, safe='')}" if token else "")
@@ -76,8 +78,8 @@ class Server:
         self.urls = [f"http://{name}{end}" for name in hosts]
         self.url = self.urls[0]
         config = uvicorn.Config(
-            guard,
-            http=Connection,
+            connections,
+            http=cast("type[asyncio.Protocol]", connections.protocol),  # uvicorn only calls it
             ws="none",
             log_level="warning",
             access_log=False,

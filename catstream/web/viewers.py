@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from time import monotonic
-from typing import Any
 
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
-__all__ = ["UPDATE_SECONDS", "Viewers"]
+__all__ = ["UPDATE_SECONDS", "Parts", "Viewers"]
 
 #: Seconds between two updates of an open page.
 UPDATE_SECONDS = 0.1
@@ -20,8 +20,36 @@ _KEEP_ALIVE_SECONDS = 5.0  # an idle stream sends a comment after this time, whi
 _MAX_VIEWERS = 64
 
 
+class Parts:
+    """The state of a page, in parts that are sent to each open page when they have changed.
+
+    Parameters
+    ----------
+    parts : of each part the function that returns it as JSON values; its argument is the number of changes since the
+        page has received it. The parts are sent in this order
+    """
+
+    def __init__(self, parts: Mapping[str, Callable[[int], object]]) -> None:
+        self._parts = parts
+        self._revisions: Counter[str] = Counter()
+
+    def updates(self, seen: dict[str, int]) -> dict[str, object]:
+        """Return the parts that have changed since the last call for this page.
+
+        Parameters
+        ----------
+        seen : revisions that the page has received; empty at first, updated by this call
+        """
+        news = {name: self._revisions[name] - seen.get(name, 0) for name in self._parts}
+        seen.update(self._revisions)
+        return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
+
+    def _mark_changed(self, *parts: str) -> None:
+        self._revisions.update(parts)
+
+
 class Viewers:
-    """Counts the open pages of a site, and streams updates to them.
+    """Counts the open pages, and streams updates to them.
 
     Attributes
     ----------
@@ -33,10 +61,6 @@ class Viewers:
         self.count = 0
         self.closed = False
         self._exist = asyncio.Event()
-
-    def close(self) -> None:
-        """End the streams of open pages."""
-        self.closed = True
 
     async def wait(self) -> None:
         """Wait until there is a viewer."""
@@ -60,31 +84,25 @@ class Viewers:
             return None
         return PlainTextResponse(f"{_MAX_VIEWERS} pages or live pictures are open already\n", 503)
 
-    def events(self, updates: Callable[[dict[str, Any]], Mapping[str, object]]) -> Response:
-        """Return the response to a page that asks for its updates.
+    def events(self, page: Parts) -> Response:
+        """Return the response to a page that asks for its updates."""
+        return self.too_many() or StreamingResponse(self._stream(page), media_type="text/event-stream")
 
-        Parameters
-        ----------
-        updates : returns the parts that have changed since the last call with the same dictionary, which is empty at
-            first and updated by each call
-        """
-        return self.too_many() or StreamingResponse(self._stream(updates), media_type="text/event-stream")
-
-    async def _stream(self, updates: Callable[[dict[str, Any]], Mapping[str, object]]) -> AsyncIterator[str]:
-        known: dict[str, Any] = {}
+    async def _stream(self, page: Parts) -> AsyncIterator[str]:
+        seen: dict[str, int] = {}
         last_sent = monotonic()
         with self.counted():
             yield "retry: 1000\n\n"
             while not self.closed:
-                if parts := updates(known):
+                if parts := page.updates(seen):
                     last_sent = monotonic()
                     yield _event(parts)
                 elif monotonic() - last_sent > _KEEP_ALIVE_SECONDS:
                     last_sent = monotonic()
                     yield ":\n\n"
                 await asyncio.sleep(UPDATE_SECONDS)
-            yield _event({**updates(known), "closed": True})
+            yield _event({**page.updates(seen), "closed": True})
 
 
-def _event(parts: Mapping[str, object]) -> str:
+def _event(parts: dict[str, object]) -> str:
     return f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"

@@ -27,8 +27,7 @@ from catstream.messages.kinds import (
     Track,
     TrainingRows,
 )
-from catstream.web.app import pipeline_site
-from catstream.web.fleet_app import fleet_site
+from catstream.web.app import fleet_site, pipeline_site
 from catstream.web.server import Server
 from catstream.wire.channels import HEALTH, PREVIEWS
 from catstream.wire.endpoint import Endpoint

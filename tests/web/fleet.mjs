@@ -60,13 +60,13 @@ try {
   await until(() => document.querySelector(".cards li:not([hidden])"));
   say("back", [await page.inputValue("#search"), ...(await shown())]);
   await page.goto(new URL("streams/cam-7/", url).href);
-  await page.click("#fleet");
+  await page.click("#all");
   await until(() => document.querySelector(".cards li:not([hidden])"));
   say("fleet", await shown());
   console.log('["silence"]');
-  await page.waitForSelector("main.old", patience);
+  await page.waitForSelector("#streams.old", patience);
   await page.evaluate(axe);
-  say("silent", await page.locator("#message").innerText());
+  say("silent", await page.locator("#silence").innerText());
   await check("silent");
   say("errors", wrong.filter((text) => !/404/.test(text))); // a picture may be gone when it is asked for
 } finally {

@@ -53,7 +53,7 @@ try {
   await page.waitForSelector('.choose[aria-pressed="true"]:has-text("object-2")', patience);
   console.log("objects", (await page.locator(".objects b").allInnerTexts()).join());
   await click('[aria-label="Forget object-2"]');
-  await click("#forget-dialog .danger");
+  await click("dialog .danger");
   await page.waitForSelector("#objects", { state: "hidden", ...patience });
   console.log("forgotten", (await page.locator("#message").innerText()).replace(/\d+$/, "N"));
   await page.waitForSelector("#message.faded", { state: "attached", ...patience });
@@ -61,7 +61,7 @@ try {
   await is("absent");
   console.log("state", await state.innerText());
   await page.waitForSelector(".tree .node", { state: "attached", ...patience });
-  await page.waitForSelector(".surprising li canvas", patience);
+  await page.waitForSelector(".surprising li svg", patience);
   console.log("surprising", (await page.locator(".surprising li").count()) > 0);
 
   console.log("kill");

@@ -14,7 +14,7 @@ const PAGES = process.env.EVERY_SIZE
   ? [["light", DESKTOP], ["dark", PHONE], ["light", PHONE], ["dark", DESKTOP]] : [["light", DESKTOP], ["dark", PHONE]];
 
 const status = {
-  phase: "running", reason: "", endpoint: "/tmp/catstream-a1", source: "/videos/walk.mp4", processes: [], paused: false,
+  phase: "running", reason: "", endpoint: "/tmp/catstream-a1", source: "/videos/walk.mp4", paused: false,
   waiting: false, lost_seconds: 0, skipped: null,
 };
 const anna = { name: "anna", colour: "#ff922b", state: "present", score: 0.93, version: 12 };
@@ -90,7 +90,7 @@ const doing = {
     await page.press("#name", "Escape");
     await page.click('[aria-label="Forget ben"]');
   },
-  "two objects": (page) => page.click("#forget-dialog .danger"),
+  "two objects": (page) => page.click("dialog .danger"),
   "drawing the next one while the answer comes": async (page) => {
     let answer;
     answered = new Promise((resolve) => { answer = resolve; });
@@ -109,7 +109,7 @@ const doing = {
     await page.click("#cancel");
     await page.click("#stop");
   },
-  "the end": (page) => page.click("#stop-dialog button:not(.danger)"),
+  "the end": (page) => page.click("dialog button:not(.danger)"),
   "the end, and of the server": (page) => page.evaluate(() => events.onerror()),
 };
 

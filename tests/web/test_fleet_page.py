@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.web import fleet_feed
+from catstream.web import streams
 
 pytestmark = pytest.mark.system
 
@@ -24,7 +24,7 @@ def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_s
     node, chromium = shutil.which("node"), shutil.which("chromium")
     if node is None or chromium is None or not (HERE / "node_modules" / "axe-core").exists():
         pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
-    monkeypatch.setattr(fleet_feed, "_TIMEOUT_SECONDS", 1.0)
+    monkeypatch.setattr(streams, "_TIMEOUT_SECONDS", 1.0)
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
     fleet.node("south", "dead", cores=4.0, trouble="no answer since 02:14:07")
     fleet.stream("cam-7", node="north", endpoint=str(folder), models={"anna": 3}, rate=25.0, stored_seconds=2.0)
@@ -50,9 +50,9 @@ def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_s
     assert (said["search"], said["node"], said["trouble"]) == ([["cam-7"]], [["cam-10"]], [["cam-9"]])
     assert said["none"] == ["No stream matches “nowhere”."]
     assert said["page"] == [["/streams/cam-7/", "cam-7 – catstream"]]
-    assert said["back"] == [["cam", "cam-7"]]
+    assert said["back"] == [["cam running", "cam-7"]]
     assert said["fleet"] == said["all"]
-    assert said["silent"][0].startswith("The fleet does not answer. This is its state of ")
+    assert said["silent"][0].startswith("The fleet does not answer. This page shows the state of ")
     assert [each for each in said["violations"] if each] == [], "found by axe"
     assert set(said["too wide"]) == {0}
     assert said["errors"] == [[]]

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from catstream.cli.fleet_view import view
-from catstream.web import fleet_feed, fleet_pictures, fleet_streams
-from catstream.web.feed import Feed
-from catstream.web.fleet_streams import StreamPages
+from catstream.cli.view import fleet_view
+from catstream.web import streams
+from catstream.web.feed import PipelineFeed
+from catstream.web.streams import StreamFeeds
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, allowed, create, public_key, synchronise
 
 TOKEN = "correct-horse-battery"
 PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events", "/streams/cam-7/picture.jpg"]
-METRICS = Path(__file__).parents[2] / "docs" / "how-to" / "fleet-view.md"
+VIEW = Path(__file__).parents[2] / "docs" / "how-to" / "view.md"
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def first_update(page, path="/events"):
 
 def shown(page, until):
     """The first update of a page once the registry has answered."""
-    return until(lambda: (told := first_update(page)).get("order") and told)
+    return until(lambda: (told := first_update(page)).get("streams") and told)
 
 
 def source(page):
@@ -97,7 +97,7 @@ def test_a_new_page_is_told_of_all_streams_and_nodes(fleet, page, until):
         fleet.stream(f"cam-{number}", node="north", trouble="it is late" if number == 400 else "")
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"})
     told = until(lambda: (told := shown(page, until)).get("nodes") and told)  # the node joined last
-    assert (len(told["streams"]), told["order"][:3]) == (500, ["cam-400", "cam-0", "cam-1"])
+    assert (len(told["streams"]), told["streams"]["cam-400"]["trouble"]) == (500, "it is late")
     assert told["nodes"]["north"]["labels"] == ["site=north"]
 
 
@@ -114,10 +114,10 @@ def test_the_picture_of_a_stream_is_small_and_has_the_boxes_of_its_objects(fleet
 
 def test_no_more_pictures_are_made_than_the_limit_allows(fleet, serve_fleet, camera, folder, until, monkeypatch):
     made = []
-    monkeypatch.setattr(fleet_pictures, "draw_boxes", lambda *_: made.append(1) or b"picture %d" % len(made))
-    monkeypatch.setattr(fleet_pictures, "_FRESH_SECONDS", 0.0)
-    monkeypatch.setattr(fleet_pictures, "_BURST", 2)
-    monkeypatch.setattr(fleet_pictures, "_PER_SECOND", 1e-6)
+    monkeypatch.setattr(streams, "draw_boxes", lambda *_: made.append(1) or b"picture %d" % len(made))
+    monkeypatch.setattr(streams, "_FRESH_SECONDS", 0.0)
+    monkeypatch.setattr(streams, "_BURST", 2)
+    monkeypatch.setattr(streams, "_PER_SECOND", 1e-6)
     fleet.stream("cam-7", endpoint=str(folder))
     page = serve_fleet()
     shown(page, until)
@@ -163,7 +163,8 @@ def test_metrics_are_documented_with_their_labels(fleet, page, until):
     shown(page, until)
     samples = re.findall(r"^(catstream_\w+)(?:\{(.*)\})? (.*)", page.get("/metrics").text, re.MULTILINE)
     labels = {name: set(re.findall(r"(\w+)=", text)) for name, text, _ in samples}
-    documented = re.findall(r"`(catstream_\w+)(?:\{([\w,]+)\})?`", METRICS.read_text())
+    table = VIEW.read_text().partition("| metric of a fleet |")[2].partition("\n\n")[0]
+    documented = re.findall(r"`(catstream_\w+)(?:\{([\w,]+)\})?`", table)
     assert {name: set(filter(None, text.split(","))) for name, text in documented} == labels
     assert ("catstream_model_version", 'node="north",object="anna",stream="cam-7"', "3.0") in samples
 
@@ -171,7 +172,7 @@ def test_metrics_are_documented_with_their_labels(fleet, page, until):
 def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams(
     fleet, manager, serve_fleet, until, monkeypatch
 ):
-    monkeypatch.setattr(fleet_feed, "_TIMEOUT_SECONDS", 1.0)
+    monkeypatch.setattr(streams, "_TIMEOUT_SECONDS", 1.0)
     fleet.stream("cam-7")
     page = serve_fleet()
     shown(page, until)
@@ -187,17 +188,17 @@ def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams
 
 
 def test_pages_of_streams_are_closed_when_nobody_looks_at_them(folder, monkeypatch):
-    monkeypatch.setattr(fleet_streams, "_MAX_PAGES", 2)
-    monkeypatch.setattr(fleet_streams, "_IDLE_SECONDS", 0.0)
-    monkeypatch.setattr(fleet_streams, "_CHECK_SECONDS", 0.01)
+    monkeypatch.setattr(streams, "_MAX_FEEDS", 2)
+    monkeypatch.setattr(streams, "_IDLE_SECONDS", 0.0)
+    monkeypatch.setattr(streams, "_CHECK_SECONDS", 0.01)
     feeds = {}
 
     def make_feed(name):
-        feeds[name] = Feed(str(folder))
+        feeds[name] = PipelineFeed(str(folder))
         return feeds[name]
 
     async def use():
-        pages = StreamPages(make_feed)
+        pages = StreamFeeds(make_feed)
         first = pages.open("cam-1")
         with feeds["cam-1"].viewers.counted():
             assert pages.open("cam-2") is not None
@@ -215,5 +216,5 @@ def test_pages_of_streams_are_closed_when_nobody_looks_at_them(folder, monkeypat
 
 
 def test_a_public_address_requires_a_token():
-    result = CliRunner().invoke(view, ["--listen", "0.0.0.0:0", "--no-token"])
+    result = CliRunner().invoke(fleet_view, ["--listen", "0.0.0.0:0", "--no-token"])
     assert "without --no-token" in str(result.exception)

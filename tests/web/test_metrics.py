@@ -10,7 +10,7 @@ import pytest
 
 from catstream.messages.kinds import Health
 from catstream.web import metrics
-from catstream.web.feed import Feed
+from catstream.web.feed import PipelineFeed
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -18,7 +18,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 @pytest.fixture
 def labels(facts):
     """The labels of each metric, by name, of a pipeline that tracks two objects in a live source."""
-    feed = Feed()
+    feed = PipelineFeed()
     names, trees = ("anna", "ben"), ("object", "background", "loss", "extent", "size", "aspect")
     report = facts.tracking(6.0, *names)
     report.counters.update(taken=5.0, stored=4.0, skipped=1.0, lost_seconds=0.0, reopened=0.0)
@@ -35,7 +35,9 @@ def labels(facts):
 
 def test_the_page_documents_each_metric_with_its_labels(labels):
     text = (DOCS / "how-to" / "view.md").read_text()
-    documented = re.findall(r"`(catstream_\w+)(?:\{([\w,]+)\})?`", text.partition("| metric |")[2].partition("\n\n")[0])
+    documented = re.findall(
+        r"`(catstream_\w+)(?:\{([\w,]+)\})?`", text.partition("| metric of a pipeline |")[2].partition("\n\n")[0]
+    )
     assert {name: tuple(filter(None, text.split(","))) for name, text in documented} == labels
 
 

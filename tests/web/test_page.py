@@ -103,7 +103,7 @@ def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_
                     until(lambda: "state present" in lines[seen:] and said("errors []"))
                     break
     assert lines[0] == "state waiting for a box"
-    assert "refused 'no name' is not a name: expected" in "\n".join(lines)
+    assert "refused command object: 'no name' is not a name: expected" in "\n".join(lines)
     assert "objects object without a name,object-2" in lines
     assert "forgotten object-2 is no longer tracked after frame N" in lines
     assert "surprising true" in lines

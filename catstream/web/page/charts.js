@@ -1,6 +1,6 @@
 // Four charts of the last two minutes of one object: score, frames a second, latency, model.
 
-import { figure, make } from "./svg.js";
+import { figure, make } from "./dom.js";
 
 const [FEWEST, SECONDS] = [15, 120]; // minimum and maximum time span of a chart
 const [LEFT, TOP, BOTTOM] = [34, 8, 18];
@@ -16,12 +16,7 @@ export class Charts {
   constructor(element) {
     this.rows = [];
     this.name = null;
-    this.charts = CHARTS.map((chart) => {
-      const drawing = make("svg", { role: "img" });
-      const parts = figure("chart", chart.title, drawing);
-      element.append(parts.element);
-      return { ...chart, drawing, ...parts };
-    });
+    this.charts = CHARTS.map((chart) => ({ ...chart, ...figure(element, "chart", chart.title) }));
   }
 
   clear() {

@@ -1,4 +1,4 @@
-// Helpers for HTML elements.
+// Helpers for the elements of the page.
 
 /** Append a new element, with some of its properties. */
 export function add(parent, tag, properties = {}) {
@@ -7,13 +7,52 @@ export function add(parent, tag, properties = {}) {
   return child;
 }
 
+/** A new SVG element with its attributes and children. */
+export function make(name, attributes = {}, ...children) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.append(...children);
+  return element;
+}
+
 /** Change the text of an element, if it is another one. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** Give an element these children in this order, if it has others. */
-export function arrange(element, children) {
-  const shown = element.children;
-  if (children.length !== shown.length || children.some((child, place) => child !== shown[place])) element.replaceChildren(...children);
+/** A figure with a left and a right caption, and an SVG drawing below. */
+export function figure(parent, className, title) {
+  const element = add(parent, "figure", { className });
+  const caption = add(element, "figcaption");
+  const left = add(caption, "span", { textContent: title });
+  const right = add(caption, "b", { textContent: "–" });
+  const drawing = make("svg", { role: "img" });
+  element.append(drawing);
+  return { caption, left, right, drawing };
+}
+
+/** The children of an element by name: each is made when its name is first shown, and removed when it is shown no longer. */
+export class Items {
+  /** make(name, value) returns an item with its `element`; fill(item, value) shows a value in it; drop(item) is called when it is removed. */
+  constructor(parent, { make, fill, drop }) {
+    Object.assign(this, { parent, make, fill, drop, items: new Map() });
+  }
+
+  /** Show these pairs of name and value, in this order; only elements whose place has changed are moved. */
+  show(pairs) {
+    const items = new Map(pairs.map(([name, value]) => [name, this.items.get(name) ?? this.make(name, value)]));
+    for (const [name, item] of this.items) {
+      if (items.has(name)) continue;
+      this.drop?.(item);
+      item.element.remove();
+    }
+    this.items = items;
+    let next = this.parent.firstElementChild;
+    for (const [name, value] of pairs) {
+      const item = items.get(name);
+      this.fill?.(item, value);
+      if (item.element === next) next = next.nextElementSibling;
+      else this.parent.insertBefore(item.element, next);
+    }
+  }
 }

@@ -1,11 +1,12 @@
 // The list of the objects: colour, name, state, score and model of each, one of them chosen, and a button that drops it.
 
-import { add, arrange, write } from "./dom.js";
+import { add, Items, write } from "./dom.js";
 
 export class Objects {
   /** actions: choose(name) is called if another object is chosen; forget(name) if the button of an object is pressed. */
   constructor(element, actions) {
-    Object.assign(this, { element, actions, list: [], chosen: null, items: new Map() });
+    Object.assign(this, { actions, list: [], chosen: null });
+    this.items = new Items(element, { make: (name) => this.make(name), fill: (item, one) => this.fill(item, one) });
   }
 
   /** Whether there is nothing to choose: no object, or one without a name. */
@@ -22,20 +23,12 @@ export class Objects {
     for (let number = this.list.length + 1; ; number++) if (!this.get(`object-${number}`)) return `object-${number}`;
   }
 
-  clear() {
-    this.show([]);
-  }
-
   /** Show these objects. If the chosen one is not among them, the first one is chosen, or the one to choose next. */
   show(list) {
     this.list = list;
-    if (this.next !== undefined && this.get(this.next)) {
-      this.choose(this.next);
-    } else if (!this.get(this.chosen)) this.choose(list[0]?.name ?? null);
-    const items = new Map(list.map((one) => [one.name, this.items.get(one.name) ?? this.make(one.name)]));
-    this.items = items;
-    for (const one of list) this.fill(items.get(one.name), one);
-    arrange(this.element, [...items.values()].map((item) => item.element));
+    if (this.next !== undefined && this.get(this.next)) this.choose(this.next);
+    else if (!this.get(this.chosen)) this.choose(list[0]?.name ?? null);
+    this.items.show(list.map((one) => [one.name, one]));
   }
 
   /** Choose an object, now or as soon as it is shown. */
@@ -43,14 +36,13 @@ export class Objects {
     this.next = name === null || this.get(name) ? undefined : name;
     if (this.next !== undefined || name === this.chosen) return;
     this.chosen = name;
-    for (const [other, { choose }] of this.items) choose.setAttribute("aria-pressed", String(other === name));
+    this.items.show(this.list.map((one) => [one.name, one]));
     this.actions.choose(name);
   }
 
   make(name) {
     const element = document.createElement("li");
     const choose = add(element, "button", { type: "button", className: "choose", onclick: () => this.choose(name) });
-    choose.setAttribute("aria-pressed", String(name === this.chosen));
     add(choose, "i", { className: "swatch" });
     add(choose, "b", { textContent: name || "object without a name" });
     const about = add(choose, "span", { className: "state" });
@@ -62,7 +54,8 @@ export class Objects {
     return { element, choose, state, model, score, share };
   }
 
-  fill({ element, state, model, score, share }, one) {
+  fill({ element, choose, state, model, score, share }, one) {
+    choose.setAttribute("aria-pressed", String(one.name === this.chosen));
     element.style.setProperty("--colour", one.colour);
     element.dataset.state = one.state;
     share.style.width = `${100 * Math.max(0, Math.min(1, one.score))}%`;

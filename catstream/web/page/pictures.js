@@ -7,9 +7,9 @@ const AFTER_AN_ERROR = 5000;
 
 export class Pictures {
   constructor() {
-    this.items = new Map(); // picture element -> name, card, image, and the time before which it is not asked for again
     this.paused = false;
     this.pending = 0;
+    this.items = new Map(); // element -> the card: its name, what it shows, its image, and a time before which it is not loaded again
     this.visible = new Set();
     this.observer = new IntersectionObserver((entries) => {
       for (const { target, isIntersecting } of entries) this.visible[isIntersecting ? "add" : "delete"](target);
@@ -17,16 +17,15 @@ export class Pictures {
     setInterval(() => this.load(), 1000 / PER_SECOND);
   }
 
-  add(name, { element, image, card }) {
-    this.items.set(element, { name, image, card, after: 0 });
-    this.observer.observe(element);
+  add(item) {
+    this.items.set(item.element, Object.assign(item, { after: 0 }));
+    this.observer.observe(item.element);
   }
 
-  remove(_, { element, image }) {
+  remove({ element }) {
     this.observer.unobserve(element);
     this.visible.delete(element);
     this.items.delete(element);
-    if (image.src) URL.revokeObjectURL(image.src);
   }
 
   /** Load the picture that has waited longest. */
@@ -39,16 +38,14 @@ export class Pictures {
     item.after = now + AFTER_AN_ERROR;
     this.pending += 1;
     try {
-      const response = await fetch(`streams/${encodeURIComponent(item.name)}/picture.jpg`);
-      if (response.status !== 200) return; // there is none yet
-      const before = item.image.src;
-      item.image.src = URL.createObjectURL(await response.blob());
-      await item.image.decode();
+      const image = Object.assign(new Image(), { alt: "", src: `streams/${encodeURIComponent(item.name)}/picture.jpg?${now}` });
+      await image.decode();
       item.image.parentElement.classList.add("loaded");
-      if (before) URL.revokeObjectURL(before);
+      item.image.replaceWith(image);
+      item.image = image;
       item.after = Date.now() + APART;
     } catch {
-      // tried again after a while
+      // there is none yet, or the server does not answer: tried again after a while
     } finally {
       this.pending -= 1;
     }

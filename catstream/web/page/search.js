@@ -1,16 +1,15 @@
-// The search field, and the buttons that select the streams in a state. Both are kept in the address of the page.
+// The search field, and buttons that search for the streams in a state. The search is kept in the address of the page.
 
-import { arrange, write } from "./dom.js";
+import { Items, write } from "./dom.js";
 
-const STATES = ["failed", "unplaced", "running", "waiting", "paused", "starting", "moving", "ended"];
+const STATES = ["trouble", "failed", "unplaced", "running", "waiting", "paused", "starting", "moving", "ended"];
 
 export class Search {
   /** changed() is called whenever another search is made. */
   constructor(field, buttons, changed) {
-    Object.assign(this, { field, buttons, changed, made: new Map() });
-    const address = new URLSearchParams(location.search);
-    field.value = address.get("search") ?? "";
-    this.state = address.get("state") ?? "";
+    Object.assign(this, { field, changed });
+    this.buttons = new Items(buttons, { make: (state) => this.make(state), fill: ({ element }, text) => write(element, text) });
+    field.value = new URLSearchParams(location.search).get("search") ?? "";
     field.addEventListener("input", () => this.tell());
     field.addEventListener("keydown", (event) => event.key === "Escape" && this.ask(""));
     document.addEventListener("keydown", (event) => {
@@ -20,60 +19,48 @@ export class Search {
     });
   }
 
-  /** Search for a text, in any state. */
-  ask(text) {
-    this.field.value = text;
-    this.state = "";
-    this.tell();
+  get text() {
+    return this.field.value.trim();
   }
 
-  choose(state) {
-    this.state = this.state === state ? "" : state;
+  get words() {
+    return this.text.toLowerCase().split(/\s+/).filter(Boolean);
+  }
+
+  /** Search for a text. */
+  ask(text) {
+    this.field.value = text;
     this.tell();
   }
 
   tell() {
-    const address = new URLSearchParams(Object.entries({ search: this.field.value.trim(), state: this.state }).filter(([, value]) => value));
-    history.replaceState(null, "", address.size ? `?${address}` : location.pathname);
-    for (const [state, button] of this.made) button.setAttribute("aria-pressed", String(state === this.state));
+    history.replaceState(null, "", this.text ? `?${new URLSearchParams({ search: this.text })}` : location.pathname);
+    this.mark();
     this.changed();
   }
 
-  get words() {
-    return this.field.value.toLowerCase().split(/\s+/).filter(Boolean);
-  }
-
-  /** Whether a stream is in the chosen state, and all words are in its name, state, node, labels or objects. */
+  /** Whether all words are among those of a card. */
   matches(card) {
-    return inState(card, this.state) && this.words.every((word) => card.words.includes(word));
-  }
-
-  get description() {
-    return [this.field.value.trim() && `“${this.field.value.trim()}”`, this.state && `the state “${this.state}”`].filter(Boolean).join(" and ");
+    return this.words.every((word) => card.words.includes(word));
   }
 
   /** Show a button for each state that streams are in, and how many there are. */
   offer(cards) {
-    const counts = new Map(["", "trouble", ...STATES].map((state) => [state, cards.filter((card) => inState(card, state)).length]));
-    const offered = [...counts].filter(([state, count]) => count || state === "" || state === this.state);
-    const buttons = offered.map(([state, count]) => {
-      const button = this.made.get(state) ?? this.make(state);
-      const label = `${state === "" ? "all" : state === "trouble" ? "in trouble" : state} ${count}`;
-      write(button, label);
-      return button;
-    });
-    arrange(this.buttons, buttons);
+    const counts = STATES.map((state) => [state, cards.filter((card) => (state === "trouble" ? card.level : card.state === state)).length]);
+    const shown = counts.filter(([state, count]) => count || this.words.includes(state));
+    this.buttons.show(shown.map(([state, count]) => [state, `${state === "trouble" ? "in trouble" : state} ${count}`]));
+    this.mark();
   }
 
+  /** A button that adds its state to the words, in place of another one, or removes it. */
   make(state) {
-    const button = Object.assign(document.createElement("button"), { type: "button", onclick: () => this.choose(state) });
-    button.dataset.state = state;
-    button.setAttribute("aria-pressed", String(state === this.state));
-    this.made.set(state, button);
-    return button;
+    const press = () => this.ask([...this.words.filter((word) => !STATES.includes(word)), ...(this.words.includes(state) ? [] : [state])].join(" "));
+    const element = Object.assign(document.createElement("button"), { type: "button", onclick: press });
+    element.dataset.state = state;
+    return { element };
   }
-}
 
-function inState(card, state) {
-  return state === "" || (state === "trouble" ? card.level > 0 : card.state === state);
+  mark() {
+    for (const [state, { element }] of this.buttons.items) element.setAttribute("aria-pressed", String(this.words.includes(state)));
+  }
 }

@@ -1,17 +1,22 @@
 // The live picture with the boxes of its objects, and the box that the user draws with mouse, touch or keyboard.
 
+import { make } from "./dom.js";
+
 const STEP = 0.02; // distance of an arrow key, as a share of the picture's shorter side
 const SMALLEST = 6; // minimum side of a box in pixels of the frame
 const STILL = 4; // pixels of the screen that a pointer may move in a click
+const TEXT = 13; // height of a name in pixels of the screen
 
 export class Stage {
   /**
    * objects: the list of the objects. actions: pause() pauses the pipeline and returns {frame, leave}; follow(box, leave)
    * sends the box; changed(drawing, box) is called whenever the drawing changes.
    */
-  constructor(element, canvas, objects, actions) {
-    Object.assign(this, { element, canvas, objects, actions });
-    this.picture = this.bitmap = this.box = this.start = this.still = null;
+  constructor(element, objects, actions) {
+    Object.assign(this, { element, objects, actions });
+    this.image = element.querySelector("img");
+    this.boxes = element.querySelector("svg"); // over the image, in pixels of the frame
+    this.picture = this.box = this.start = this.still = null;
     this.drawing = this.loading = false;
     this.turn = 0; // number of pipelines shown before
     element.addEventListener("pointerdown", (event) => this.press(event));
@@ -22,16 +27,16 @@ export class Stage {
   }
 
   get hasPicture() {
-    return this.bitmap !== null;
+    return this.picture !== null;
   }
 
   /** Clear the picture, because another pipeline is shown. */
   clear() {
     this.cancel(false);
-    this.bitmap?.close();
-    this.picture = this.bitmap = this.next = null;
+    this.picture = this.next = null;
     this.turn += 1;
-    this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
+    this.image.removeAttribute("src");
+    this.boxes.replaceChildren();
   }
 
   /** Load and show a picture; while another one is loading, only the newest is loaded next. */
@@ -40,18 +45,14 @@ export class Stage {
     if (this.loading) return;
     this.loading = true;
     while (this.next) {
-      const [wanted, turn] = [this.next, this.turn];
+      const [wanted, turn, image] = [this.next, this.turn, new Image()];
       this.next = null;
-      const response = await fetch(`pictures/${wanted.frame}.jpg`).catch(() => null);
-      if (!response?.ok || (this.still && this.still.frame < wanted.frame)) continue; // the picture is frozen for drawing
-      const bitmap = await createImageBitmap(await response.blob()).catch(() => null);
-      if (!bitmap) continue;
-      if (turn !== this.turn) { // a picture of the previous pipeline
-        bitmap.close();
-        continue;
-      }
-      this.bitmap?.close();
-      [this.picture, this.bitmap] = [wanted, bitmap];
+      Object.assign(image, { id: this.image.id, alt: "", draggable: false, src: `pictures/${wanted.frame}.jpg` });
+      const loaded = await image.decode().then(() => true, () => false);
+      // A picture of the previous pipeline is not shown, nor a newer one than that on which a box is drawn.
+      if (!loaded || turn !== this.turn || (this.still && this.still.frame < wanted.frame)) continue;
+      this.image.replaceWith(image);
+      [this.picture, this.image] = [wanted, image];
       this.draw();
     }
     this.loading = false;
@@ -124,12 +125,12 @@ export class Stage {
   /** Choose the object whose box contains a place; the smallest one, if there are several. */
   choose({ x, y }) {
     const inside = ([, [left, top, w, h]]) => x >= left && x <= left + w && y >= top && y <= top + h;
-    const found = this.boxes.filter(inside).sort(([, one], [, other]) => one[2] * one[3] - other[2] * other[3]);
+    const found = this.shown.filter(inside).sort(([, one], [, other]) => one[2] * one[3] - other[2] * other[3]);
     if (found.length) this.objects.choose(found[0][0]);
   }
 
   /** The boxes of the picture, by name; those of objects that were dropped are left out, and the chosen one is last. */
-  get boxes() {
+  get shown() {
     const boxes = Object.entries(this.picture?.boxes ?? {}).filter(([name]) => this.objects.get(name));
     return boxes.sort(([name], [other]) => (name === this.objects.chosen) - (other === this.objects.chosen));
   }
@@ -162,13 +163,9 @@ export class Stage {
 
   /** Position of a pointer in the frame. */
   place(event) {
-    const view = this.canvas.getBoundingClientRect();
-    const { width, height } = this.picture;
-    const scale = Math.min(view.width / width, view.height / height); // object-fit: contain
-    const left = view.left + (view.width - width * scale) / 2;
-    const top = view.top + (view.height - height * scale) / 2;
+    const { x, y } = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.boxes.getScreenCTM().inverse());
     const inside = (value, most) => Math.max(0, Math.min(most, value));
-    return { x: inside((event.clientX - left) / scale, width), y: inside((event.clientY - top) / scale, height) };
+    return { x: inside(x, this.picture.width), y: inside(y, this.picture.height) };
   }
 
   tell() {
@@ -176,57 +173,36 @@ export class Stage {
     this.draw();
   }
 
+  /** Draw the box of each object with its name, and the box of the user, over a darker picture. */
   draw() {
-    if (!this.bitmap) return;
-    const { canvas, bitmap, picture } = this;
-    const wide = Math.max(bitmap.width, Math.round(Math.min(canvas.clientWidth, 1280) * Math.min(devicePixelRatio, 2)));
-    const tall = Math.round((wide * picture.height) / picture.width);
-    if (canvas.width !== wide || canvas.height !== tall) [canvas.width, canvas.height] = [wide, tall];
-    const context = canvas.getContext("2d");
-    const scale = wide / picture.width;
-    context.drawImage(bitmap, 0, 0, wide, tall);
-    context.fillStyle = "#0007";
-    if (this.drawing) context.fillRect(0, 0, wide, tall);
-    if (!this.drawing || !this.objects.single) this.outlines(context, scale, wide);
-    if (!this.drawing || !this.box) return;
-    const { x, y, w, h } = this.box;
-    const own = bitmap.width / picture.width;
-    context.drawImage(bitmap, x * own, y * own, w * own, h * own, x * scale, y * scale, w * scale, h * scale);
-    outline(context, [x, y, w, h].map((side) => side * scale), "#ffffff", wide / 260);
-  }
-
-  /** Draw the box of each object with its name; the chosen one is thicker. */
-  outlines(context, scale, wide) {
+    if (!this.picture) return;
+    const { width, height } = this.picture;
+    this.boxes.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    this.boxes.replaceChildren();
+    const { x, y, w, h } = this.box ?? { x: 0, y: 0, w: 0, h: 0 };
+    if (this.drawing) this.boxes.append(make("path", { class: "shade", d: `M0 0H${width}V${height}H0ZM${x} ${y}v${h}h${w}v${-h}Z` }));
     const { single, chosen } = this.objects;
-    for (const [name, box] of this.boxes) {
+    for (const [name, box] of this.drawing && single ? [] : this.shown) {
       const { colour } = this.objects.get(name);
-      const scaled = box.map((side) => side * scale);
-      outline(context, scaled, colour, wide / (single || name !== chosen ? 260 : 170));
-      const size = Math.max((13 * wide) / this.canvas.clientWidth, wide / 48);
-      if (!single) label(context, scaled, name || "no name", colour, size, wide);
+      this.outline(box, colour, !single && name === chosen);
+      if (!single) this.label(box, name || "no name", colour);
     }
+    if (this.box) this.outline([x, y, w, h], "#fff");
   }
-}
 
-function outline(context, box, colour, width) {
-  const thin = Math.max(2, width);
-  context.lineWidth = thin * 2.2;
-  context.strokeStyle = "#000b";
-  context.strokeRect(...box);
-  context.lineWidth = thin;
-  context.strokeStyle = colour;
-  context.strokeRect(...box);
-}
+  outline([x, y, width, height], colour, thick = false) {
+    for (const stroke of ["#000b", colour]) this.boxes.append(make("rect", { class: thick ? "thick" : "", x, y, width, height, stroke }));
+  }
 
-/** Write a name above a box, or below its upper side if there is no room. */
-function label(context, [x, y], name, colour, size, wide) {
-  context.font = `600 ${size}px system-ui, "DejaVu Sans", sans-serif`;
-  const [across, down] = [Math.min(context.measureText(name).width + 0.8 * size, wide), 1.45 * size];
-  const left = Math.max(0, Math.min(x - 1, wide - across));
-  const top = y >= down ? y - down : y;
-  context.fillStyle = colour;
-  context.fillRect(left, top, across, down);
-  context.fillStyle = "#111";
-  context.textBaseline = "middle";
-  context.fillText(name, left + 0.4 * size, top + 0.53 * down, across);
+  /** Write a name above a box, or below its upper side if there is no room. */
+  label([x, y], name, colour) {
+    const size = TEXT / (this.boxes.getScreenCTM()?.a || 1);
+    const text = make("text", { "font-size": size }, name);
+    const back = make("rect", { class: "name", fill: colour, height: 1.45 * size });
+    this.boxes.append(back, text);
+    const across = text.getComputedTextLength() + 0.8 * size;
+    const [left, top] = [Math.max(0, Math.min(x, this.picture.width - across)), y >= 1.45 * size ? y - 1.45 * size : y];
+    for (const [key, value] of Object.entries({ x: left, y: top, width: across })) back.setAttribute(key, value);
+    for (const [key, value] of Object.entries({ x: left + 0.4 * size, y: top + 1.05 * size })) text.setAttribute(key, value);
+  }
 }

@@ -1,18 +1,14 @@
 // The frames with the largest surprise, each cropped around the box of its object.
 
-import { arrange } from "./dom.js";
+import { add, Items, make } from "./dom.js";
 
 const AROUND = 2.6; // width of a picture in box widths
-const [WIDTH, HEIGHT] = [304, 205];
+const SHAPE = 3 / 2; // width / height of a picture
 
 export class SurprisingFrames {
   constructor(element, measured) {
-    Object.assign(this, { element, measured, items: new Map() });
-  }
-
-  clear() {
-    this.items = new Map();
-    this.element.replaceChildren();
+    this.measured = measured;
+    this.items = new Items(element, { make: (_, { frame }) => picture(frame), fill: ({ share }, { part }) => { share.style.width = `${100 * part}%`; } });
   }
 
   show({ measured, frames }) {
@@ -20,65 +16,33 @@ export class SurprisingFrames {
       ? `The ${frames.length} largest of ${measured.toLocaleString("en")} measured frames; those of one object are at least a second apart.`
       : "None yet: the first model is needed to measure.";
     const most = Math.max(...frames.map((frame) => frame.surprise));
-    const now = new Map();
-    for (const frame of frames) {
-      const id = `${frame.frame} ${frame.object} ${frame.surprise}`;
-      const item = this.items.get(id) ?? this.make(frame);
-      item.share.style.width = `${(100 * frame.surprise) / most}%`;
-      now.set(id, item);
-    }
-    this.items = now;
-    arrange(this.element, [...now.values()].map((item) => item.element));
+    this.items.show(frames.map((frame) => [`${frame.frame} ${frame.object} ${frame.surprise}`, { frame, part: frame.surprise / most }]));
   }
+}
 
-  make(frame) {
-    const element = document.createElement("li");
-    const canvas = Object.assign(document.createElement("canvas"), { width: WIDTH, height: HEIGHT });
-    canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", `${frame.object || "the object"} in frame ${frame.frame}`);
-    const caption = document.createElement("p");
-    const [when, surprise] = [document.createElement("span"), document.createElement("b")];
-    when.textContent = `frame ${frame.frame}`;
-    surprise.textContent = frame.surprise.toPrecision(3);
-    caption.append(when, surprise);
-    const share = document.createElement("i");
-    element.append(canvas, share, caption);
-    if (frame.object) {
-      element.style.setProperty("--colour", frame.colour);
-      const name = Object.assign(document.createElement("p"), { className: "name" });
-      name.append(Object.assign(document.createElement("i"), { className: "swatch" }), frame.object);
-      element.append(name);
-    }
-    const item = { element, canvas, share, frame };
-    this.load(item);
-    return item;
+function picture(frame) {
+  const element = document.createElement("li");
+  element.style.setProperty("--colour", frame.colour);
+  element.append(cropped(frame));
+  const share = add(element, "i");
+  const caption = add(element, "p");
+  add(caption, "span", { textContent: `frame ${frame.frame}` });
+  add(caption, "b", { textContent: frame.surprise.toPrecision(3) });
+  if (frame.object) {
+    const name = add(element, "p", { className: "name" });
+    add(name, "i", { className: "swatch" });
+    name.append(frame.object);
   }
+  return { element, share };
+}
 
-  async load(item) {
-    const response = await fetch(`pictures/${item.frame.frame}.jpg`).catch(() => null);
-    item.bitmap = response?.ok ? await createImageBitmap(await response.blob()).catch(() => null) : null;
-    this.paint(item);
-  }
-
-  draw() {
-    for (const item of this.items.values()) this.paint(item);
-  }
-
-  paint({ canvas, bitmap, frame }) {
-    if (!bitmap) return;
-    const scale = bitmap.width / frame.width;
-    const [x, y, w, h] = frame.box.map((side) => side * scale);
-    const zoom = Math.min(WIDTH / (AROUND * w), HEIGHT / (AROUND * h));
-    // Centred on the box, and shifted to stay inside the picture.
-    const inside = (centre, side, whole) => (side > whole ? whole / 2 : Math.min(Math.max(centre, side / 2), whole - side / 2));
-    const [across, down] = [inside(x + w / 2, WIDTH / zoom, bitmap.width), inside(y + h / 2, HEIGHT / zoom, bitmap.height)];
-    const context = canvas.getContext("2d");
-    context.clearRect(0, 0, WIDTH, HEIGHT);
-    context.setTransform(zoom, 0, 0, zoom, WIDTH / 2 - zoom * across, HEIGHT / 2 - zoom * down);
-    context.drawImage(bitmap, 0, 0);
-    context.lineWidth = 4 / zoom;
-    context.strokeStyle = frame.colour;
-    context.strokeRect(x, y, w, h);
-    context.setTransform(1, 0, 0, 1, 0, 0);
-  }
+/** The part of a picture around the box, centred on it and shifted to stay inside the picture. */
+function cropped({ frame, object, colour, box: [x, y, w, h], width, height }) {
+  const own = Math.max(w, SHAPE * h); // width of the smallest view that has the whole box
+  const wide = Math.max(own, Math.min(AROUND * own, width, SHAPE * height));
+  const inside = (centre, side, whole) => (side > whole ? (whole - side) / 2 : Math.min(Math.max(centre - side / 2, 0), whole - side));
+  const view = [inside(x + w / 2, wide, width), inside(y + h / 2, wide / SHAPE, height), wide, wide / SHAPE];
+  return make("svg", { role: "img", "aria-label": `${object || "the object"} in frame ${frame}`, viewBox: view.join(" ") },
+    make("image", { href: `pictures/${frame}.jpg`, width, height, preserveAspectRatio: "none" }),
+    make("rect", { x, y, width: w, height: h, stroke: colour }));
 }

@@ -1,7 +1,7 @@
 // The coreset trees. Of a tree its leaves are known: the levels of its nodes are the binary digits of their number,
 // since two nodes of a level are always merged. So each node, kept or merged, has its place above its leaves.
 
-import { figure, make } from "./svg.js";
+import { add, figure, make } from "./dom.js";
 
 const [HEIGHT, EDGE] = [120, 8];
 const CLOSEST = 7; // pixels between two nodes of a level that is still drawn
@@ -35,13 +35,10 @@ export class Trees {
   }
 
   add(title, meaning) {
-    const drawing = make("svg", { role: "img" });
-    const parts = figure("tree", "", drawing);
-    parts.left.textContent = title;
+    const parts = figure(this.element, "tree", title);
     parts.left.className = "label";
-    parts.caption.append(Object.assign(document.createElement("small"), { textContent: meaning }));
-    this.element.append(parts.element);
-    return { drawing, ...parts, leaves: -1 };
+    add(parts.caption, "small", { textContent: meaning });
+    return { ...parts, leaves: -1 };
   }
 
   redraw() {

@@ -1,0 +1,48 @@
+// Connects to the server, and passes its updates to the page of a stream or to that of a fleet.
+
+import { write } from "./dom.js";
+import { FleetPage } from "./fleet.js";
+import { StreamPage } from "./stream.js";
+
+let page = null; // made with the first update, which tells what there is
+let events = null; // the connection to the server, null while the page is hidden
+const server = { closed: false, silent: null }; // whether it has announced its shutdown; time since which it does not answer
+
+function take({ closed, ...parts }) {
+  page ??= "fleet" in parts ? new FleetPage(server) : new StreamPage(server);
+  if (closed) server.closed = true;
+  page.take(parts);
+}
+
+function listen() {
+  events = new EventSource("events");
+  events.onopen = () => {
+    Object.assign(server, { closed: false, silent: null });
+    page?.showState();
+  };
+  events.onmessage = (event) => take(JSON.parse(event.data));
+  events.onerror = () => {
+    server.silent ??= Date.now();
+    if (page) page.lose();
+    else write(document.querySelector("#state b"), "page stopped");
+    if (events?.readyState !== EventSource.CLOSED) return;
+    stop();
+    setTimeout(async () => {
+      const answer = await fetch(".").catch(() => null);
+      if (answer && answer.status === 401) location.reload();
+      else if (!events && !document.hidden) listen();
+    }, 2000);
+  };
+}
+
+function stop() {
+  events?.close();
+  events = null;
+}
+
+document.addEventListener("visibilitychange", () => { // a browser opens few connections to a server, over all its tabs
+  if (document.hidden && !page?.busy) stop();
+  else if (!document.hidden && !events) listen();
+});
+addEventListener("pageshow", (event) => event.persisted && !events && listen());
+if (!document.hidden) listen();

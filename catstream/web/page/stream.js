@@ -1,0 +1,262 @@
+// The page of a stream: passes updates to the parts of the page, and commands of the user to the pipeline.
+
+import { BoxForm } from "./boxform.js";
+import { Charts } from "./charts.js";
+import { write } from "./dom.js";
+import { Objects } from "./objects.js";
+import { Stage } from "./stage.js";
+import { SurprisingFrames } from "./surprising.js";
+import { Trees } from "./trees.js";
+
+const MESSAGE_SECONDS = 8;
+const $ = (selector) => document.querySelector(selector);
+
+export class StreamPage {
+  /** server: {closed, silent}, whether it has announced its shutdown, and the time since which it does not answer. */
+  constructor(server) {
+    this.server = server;
+    this.name = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // empty if there is one stream
+    this.status = { phase: "waiting" };
+    this.frame = null; // number and time of the newest frame
+    this.paused = false;
+    this.charts = new Charts($(".charts"));
+    this.trees = new Trees($(".trees"), $("#tree-summary"));
+    this.surprising = new SurprisingFrames($(".surprising"), $("#surprising-summary"));
+    this.objects = new Objects($(".objects"), { choose: (name) => this.showChosen(name), forget: (name) => this.askToForget(name) });
+    this.form = new BoxForm(this.objects);
+    this.stage = new Stage($("#stage"), this.objects, { pause: () => this.pause(), follow: (box, leave) => this.follow(box, leave),
+      changed: (drawing, box) => this.showDrawing(drawing, box) });
+    $("#stream").hidden = false;
+    $("#all").hidden = !this.name;
+    this.listen();
+    this.showState();
+  }
+
+  /** Attach the handlers of the controls. */
+  listen() {
+    $("#draw").onclick = () => { $("#stage").focus(); this.stage.begin(); };
+    $("#follow").onclick = () => this.stage.accept();
+    $("#cancel").onclick = () => this.stage.cancel();
+    this.form.name.onkeydown = ({ key }) => {
+      if (key === "Enter") this.stage.accept();
+      if (key === "Escape") this.stage.cancel();
+    };
+    $("#pause").onclick = () => this.send(this.paused ? "resume" : "pause");
+    $("#stop").onclick = () => this.ask("Stop the pipeline?", "Everything learned is stored first. The pipeline cannot be restarted from this page.",
+      "Stop it", "Continue", () => this.send("stop"));
+    const trees = $("#trees details");
+    trees.open = matchMedia("(min-width: 40rem)").matches; // on a phone, they are much longer than the rest
+    trees.ontoggle = () => this.trees.redraw();
+    addEventListener("resize", () => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
+  }
+
+  /** Whether the page must stay connected, although it is hidden. */
+  get busy() {
+    return this.stage.drawing;
+  }
+
+  /** Show the parts that have changed; `pipeline` is sent if all that was shown is of another one. */
+  take({ pipeline, status, tracks, picture, points, trees, surprising }) {
+    if (pipeline !== undefined) this.clear();
+    if (status) {
+      if (status.phase !== "running" && this.status.phase === "running") this.stage.cancel(false);
+      this.status = status;
+      this.showPaused(Boolean(status.paused));
+    }
+    if (tracks) {
+      this.frame = tracks.frame === null ? null : { number: tracks.frame, time: tracks.time };
+      this.objects.show(tracks.objects);
+      this.showObjects();
+      this.showFrame();
+      this.showState();
+    }
+    if (picture) this.stage.show(picture).then(() => this.showState());
+    if (points) this.charts.add(points);
+    if (trees) this.trees.show(trees);
+    if (surprising) this.surprising.show(surprising);
+  }
+
+  clear() {
+    this.stage.clear();
+    this.charts.clear();
+    this.surprising.show({ measured: 0, frames: [] });
+    this.objects.show([]);
+    this.frame = null;
+    this.showMessage("");
+    this.showFrame();
+  }
+
+  /** The server does not answer. */
+  lose() {
+    this.stage.cancel(false);
+    this.showState();
+  }
+
+  /** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
+  async send(verb, more = {}) {
+    let answer;
+    try {
+      const response = await fetch("control", {
+        method: "POST",
+        headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ verb, ...more }),
+      });
+      const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
+      answer = json ? await response.json() : { done: false, reason: (await response.text()).trim() };
+    } catch {
+      answer = { done: false, reason: "the server of this page does not answer" };
+    }
+    this.showMessage(answer.reason, !answer.done);
+    if (!answer.done) return null;
+    if (verb === "pause" || verb === "resume") this.showPaused(verb === "pause");
+    return answer;
+  }
+
+  /** Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. */
+  async pause() {
+    if (this.isWaiting) return { frame: Infinity, leave: null };
+    const before = this.paused;
+    const answer = await this.send("pause");
+    if (!answer) return null;
+    this.showMessage("Paused for your box.", false, false);
+    // A paused pipeline holds the frame after the last tracked one; the box applies to that frame.
+    return { frame: answer.frame + 1, leave: before ? null : () => this.send("resume") };
+  }
+
+  /** Send the box, as that of a new object or of the chosen one. */
+  async follow(box, leave) {
+    if (this.form.error) {
+      this.showMessage(this.form.error, true);
+      this.form.name.focus();
+      return false;
+    }
+    const answer = await this.send("set-box", { ...this.form.fields, box: box.map((side) => Math.round(side * 10) / 10) });
+    if (!answer) return false;
+    this.objects.choose(answer.object);
+    if (leave) {
+      await leave();
+      this.showMessage(answer.reason);
+    }
+    return true;
+  }
+
+  askToForget(name) {
+    this.ask(`Forget ${name || "the object without a name"}?`,
+      "It is no longer tracked, and everything learned about it is dropped. The other objects continue.", "Forget it", "Keep it",
+      () => this.send("forget", { object: name }));
+  }
+
+  /** Ask a question, and act if the answer is yes. */
+  ask(question, consequence, yes, no, act) {
+    const dialog = $("dialog");
+    for (const [selector, text] of [["h2", question], ["p", consequence], [".danger", yes], ["[value='']", no]]) write(dialog.querySelector(selector), text);
+    dialog.returnValue = "";
+    dialog.onclose = () => dialog.returnValue && act();
+    dialog.showModal();
+  }
+
+  /** Show a message until the next one; one that nothing has to be done about fades. */
+  showMessage(text, wrong = false, fades = !wrong) {
+    const message = $("#message");
+    message.textContent = text;
+    message.classList.toggle("wrong", wrong);
+    message.classList.remove("faded");
+    clearTimeout(this.fading);
+    if (fades) this.fading = setTimeout(() => message.classList.add("faded"), MESSAGE_SECONDS * 1000);
+  }
+
+  showDrawing(drawing, box) {
+    if (drawing && $("#drawing").hidden) this.form.begin();
+    $("#watching").hidden = drawing;
+    $("#drawing").hidden = !drawing;
+    $("#follow").disabled = !box;
+  }
+
+  /** Show the charts and the trees of another object. */
+  showChosen(name) {
+    this.charts.choose(name);
+    this.trees.choose(name);
+    if (this.stage.drawing) this.form.offer();
+    this.showFrame();
+    this.showObjects();
+  }
+
+  /** Show the list, unless the only object has no name. */
+  showObjects() {
+    const { single, chosen, list } = this.objects;
+    const shown = [single, chosen, ...list.map((one) => one.name)].join();
+    if (shown === this.shown) return;
+    this.shown = shown;
+    $("#objects").hidden = single;
+    $("#stream").classList.toggle("several", !single);
+    for (const target of document.querySelectorAll(".of")) target.textContent = single ? "" : ` of ${chosen || "the object without a name"}`;
+    this.stage.draw();
+  }
+
+  showFrame() {
+    const model = this.objects.get(this.objects.chosen)?.version;
+    const { number, time } = this.frame ?? {};
+    write($("#frame"), this.frame ? `frame ${number}, ${time.toFixed(1)} s${model === undefined ? "" : `, model ${model}`}` : "");
+  }
+
+  showPaused(now) {
+    this.paused = now;
+    write($("#pause"), now ? "Resume" : "Pause");
+    $("#pause").setAttribute("aria-pressed", String(now));
+    this.showState();
+  }
+
+  showState() {
+    const { status, stage, server } = this;
+    const running = status.phase === "running" && server.silent === null;
+    const [state, words] = this.state(running);
+    $("#state").dataset.state = state;
+    write($("#state b"), words);
+    this.showSource();
+    write($("#overlay"), this.overlay(running));
+    $("#stage").classList.toggle("over", status.phase === "ended" && stage.hasPicture);
+    $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // else there is no need of one
+    for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
+  }
+
+  /** The state of the pipeline for its colour, and in words. */
+  state(running) {
+    const { status, server, objects: { list } } = this;
+    if (server.silent !== null && status.phase !== "ended") return ["silent", "page stopped"];
+    if (!running) return [status.phase, status.phase === "silent" ? "pipeline silent" : status.phase];
+    if (status.lost_seconds > 0) return ["silent", `source lost for ${Math.round(status.lost_seconds)} s`];
+    if (this.isWaiting) return ["waiting", "waiting for a box"];
+    const state = ["present", "bootstrapping", "absent"].find((each) => list.some((one) => one.state === each)) ?? "waiting";
+    const words = list.length > 1 ? `${list.filter((one) => one.state !== "absent").length} of ${list.length} present` : state;
+    return [state, this.paused ? `paused, ${words}` : words];
+  }
+
+  /** Whether there is no object. The status is one of each second, so after the first box the tracks are newer. */
+  get isWaiting() {
+    return this.status.waiting && !this.objects.list.length;
+  }
+
+  /** The name of the source; its whole address and the endpoint of the pipeline as the tooltip. */
+  showSource() {
+    const { source = "", endpoint, skipped } = this.status;
+    const last = source.includes("://") ? source : source.split("/").filter(Boolean).at(-1) || source;
+    const shown = [this.name, /^\d+$/.test(last) ? `camera ${last}` : last || (this.name ? "" : endpoint)].filter(Boolean).join(", ");
+    write($("#source"), shown && `${shown}${(skipped ?? null) === null ? "" : `, ${skipped} frames skipped`}`);
+    $("#source").title = source && endpoint ? `${source}, followed by the pipeline at ${endpoint}` : "";
+    document.title = shown ? `${this.name || shown} – catstream` : "catstream";
+  }
+
+  /** Text over the picture: the reason why it does not change. */
+  overlay(running) {
+    const { status, stage, server: { closed, silent } } = this;
+    if (status.phase === "ended") {
+      const page = closed ? "The server of this page has ended too" : silent !== null ? "The server of this page does not answer" : "";
+      return `The end: ${status.reason}. ${page ? `${page}: this is the last picture.` : "This page waits for the next pipeline."}`;
+    }
+    if (closed) return "The server of this page was stopped: this is the last picture. The pipeline may still run.";
+    if (silent !== null) return "The server of this page does not answer. This page tries again.";
+    if (status.phase === "waiting") return status.reason || "Waiting for a pipeline";
+    if (status.phase === "silent") return "The pipeline does not send messages. This page waits for it.";
+    return running && !stage.hasPicture ? "Waiting for a picture" : "";
+  }
+}

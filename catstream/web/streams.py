@@ -1,0 +1,251 @@
+"""The streams of a fleet: the feed of its page, those of the pages of single streams, and small pictures."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from time import monotonic
+
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+
+from catstream.client.registry import Registry, address_of
+from catstream.messages.kinds import FleetStatus, Preview, StreamStatus
+from catstream.video.annotate import draw_boxes
+from catstream.video.palette import Colours
+from catstream.web.dashboard import FleetDashboard
+from catstream.web.feed import Feed, PipelineFeed
+from catstream.web.guard import TokenBucket
+from catstream.wire.channels import PREVIEWS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import Subscriber
+from catstream.wire.readable import readable
+
+__all__ = ["FleetFeed", "StreamFeeds"]
+
+_PERIOD_SECONDS, _TIMEOUT_SECONDS = 1.0, 2.0  # of the questions to the registry
+
+_MAX_FEEDS = 32
+_IDLE_SECONDS, _CHECK_SECONDS = 60.0, 5.0
+
+_WIDTH = 320  # pixels of a small picture
+_BURST, _PER_SECOND = 24, 10  # pictures that are made, of all streams together
+_FRESH_SECONDS = 1.0  # a picture is not made again within this time
+_FIRST_SECONDS, _NEXT_SECONDS = 2.0, 0.4  # time-outs for the first and the second preview of a stream
+_KEPT = 1024  # pictures
+
+
+class FleetFeed(Feed):
+    """Asks the registry of a fleet once a second for all streams and nodes.
+
+    Parameters
+    ----------
+    fleet : address of the fleet, as for `Registry`; the fleet may start later
+    keys : folder of the keys of this client, if the fleet requires keys
+    """
+
+    dashboard: FleetDashboard
+    _pause = _PERIOD_SECONDS
+
+    def __init__(self, fleet: str = "", keys: str = "") -> None:
+        super().__init__()
+        self._fleet, self._keys = fleet, keys
+        self._registry: Registry | None = None
+        self.dashboard = FleetDashboard()
+        self._feeds = StreamFeeds(lambda name: PipelineFeed(address_of(fleet, name), keys))
+        self._pictures = Pictures(self._endpoint_of)
+
+    @property
+    def problem(self) -> str:
+        return "" if self.dashboard.phase == "running" else "the fleet does not answer"
+
+    def pipeline(self, stream: str) -> PipelineFeed:
+        feed = self._feeds.open(self._status_of(stream).name)
+        if feed is None:
+            raise HTTPException(503, "too many pages of streams are open already\n")
+        return feed
+
+    async def picture(self, stream: str) -> bytes | None:
+        """Return a small picture of the newest frame of a stream as a JPEG file, None if there is none yet."""
+        return await self._pictures.get(self._status_of(stream))
+
+    def close_viewers(self) -> None:
+        super().close_viewers()
+        self._feeds.close_viewers()
+
+    def _status_of(self, stream: str) -> StreamStatus:
+        status = self.dashboard.status
+        if status is None or stream not in status.streams:
+            raise HTTPException(404, f"this fleet has no stream {stream!r}\n")
+        return status.streams[stream]
+
+    def _endpoint_of(self, stream: StreamStatus) -> Endpoint | None:
+        """Return the endpoint of the pipeline of a stream, with the keys to connect with; None if it does not run."""
+        return self._registry.place_of(stream).endpoint if self._registry is not None else None
+
+    async def run(self) -> None:
+        try:
+            with ThreadPoolExecutor(1, "registry") as self._thread:
+                await super().run()
+        finally:
+            await self._feeds.stop()
+            if self._registry is not None:
+                self._registry.close()
+
+    async def _feed(self) -> None:
+        status = await asyncio.get_running_loop().run_in_executor(self._thread, self._ask)
+        self.dashboard.take(status, monotonic())
+
+    def _ask(self) -> FleetStatus:
+        """Return the status of the fleet; called in the thread."""
+        if self._registry is None:
+            self._registry = Registry(self._fleet, self._keys, timeout=_TIMEOUT_SECONDS)
+        return self._registry.streams()
+
+    def _mark_silent(self, reason: str) -> None:
+        self.dashboard.mark_silent(reason, monotonic())
+
+
+@dataclass(slots=True)
+class _Open:
+    """A feed that runs.
+
+    used  time of the last request to the page of its stream
+    task  runs the feed
+    """
+
+    feed: PipelineFeed
+    used: float
+    task: asyncio.Task[None] | None = None
+
+    def is_unused(self, seconds: float) -> bool:
+        """Return whether nobody looks at the page, and the last request to it was so many seconds ago."""
+        return not self.feed.viewers.count and monotonic() - self.used >= seconds
+
+
+class StreamFeeds:
+    """The feeds of single streams: each is opened by the first request, and closed a minute after the last one.
+
+    Parameters
+    ----------
+    make_feed : returns a feed of the stream with this name
+    """
+
+    def __init__(self, make_feed: Callable[[str], PipelineFeed]) -> None:
+        self._make_feed = make_feed
+        self._open: dict[str, _Open] = {}
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def open(self, name: str) -> PipelineFeed | None:
+        """Return the feed of a stream, None if too many are open, and somebody looks at each of their pages."""
+        if name not in self._open:
+            if len(self._open) >= _MAX_FEEDS and not self._close_one():
+                return None
+            opened = self._open[name] = _Open(self._make_feed(name), monotonic())
+            opened.task = asyncio.create_task(self._run(name, opened))
+        self._open[name].used = monotonic()
+        return self._open[name].feed
+
+    def close_viewers(self) -> None:
+        """End the updates of all open pages."""
+        for opened in self._open.values():
+            opened.feed.close_viewers()
+
+    async def stop(self) -> None:
+        """End all feeds."""
+        tasks = [opened.task for opened in self._open.values() if opened.task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        self._open.clear()  # a task that was cancelled before it began has not done this
+
+    async def _run(self, name: str, opened: _Open) -> None:
+        """Run a feed until it is unused for a while."""
+        try:
+            async with opened.feed.running():
+                while not opened.is_unused(_IDLE_SECONDS):
+                    await asyncio.sleep(_CHECK_SECONDS)
+        finally:
+            if self._open.get(name) is opened:
+                del self._open[name]
+
+    def _close_one(self) -> bool:
+        """Close the feed that has been unused for longest; return False if all are used."""
+        unused = [name for name, opened in self._open.items() if opened.is_unused(0.0)]
+        if not unused:
+            return False
+        opened = self._open.pop(min(unused, key=lambda name: self._open[name].used))
+        if opened.task is not None:
+            opened.task.cancel()
+        return True
+
+
+class Pictures:
+    """Makes small pictures of the newest frames of streams on request, at most ten a second of all streams together.
+
+    Parameters
+    ----------
+    endpoint_of : returns the endpoint of the pipeline of a stream, None if it does not run
+    """
+
+    def __init__(self, endpoint_of: Callable[[StreamStatus], Endpoint | None]) -> None:
+        self._endpoint_of = endpoint_of
+        self._limit = TokenBucket(_BURST, _PER_SECOND)
+        self._kept: OrderedDict[str, tuple[float, bytes]] = OrderedDict()  # the time at which it was made, and JPEG
+        self._pending: dict[str, asyncio.Task[bytes | None]] = {}
+
+    async def get(self, stream: StreamStatus) -> bytes | None:
+        """Return the picture of a stream as a JPEG file, None if there is none yet.
+
+        It may be an older one if it is not older than a second, or too many pictures were made in the last second.
+        """
+        name = stream.name
+        made, jpeg = self._kept.get(name, (float("-inf"), None))
+        if name not in self._pending:
+            if monotonic() - made < _FRESH_SECONDS or self._limit.wait(monotonic()):
+                return jpeg
+            self._limit.take(monotonic())
+            self._pending[name] = asyncio.create_task(self._make(stream))
+        return await asyncio.shield(self._pending[name]) or jpeg
+
+    async def _make(self, stream: StreamStatus) -> bytes | None:
+        """Make a picture and keep it; return None if the stream does not run, or sends no preview in time."""
+        try:
+            endpoint = self._endpoint_of(stream)
+            preview = await _newest_preview(endpoint) if endpoint is not None else None
+            if preview is None:
+                return None
+            colours = Colours()
+            for name in stream.models:  # in the order in which they began, as on the page of the stream
+                colours.of(name)
+            jpeg = await run_in_threadpool(draw_boxes, preview, colours, _WIDTH)
+            self._kept[stream.name] = monotonic(), jpeg
+            self._kept.move_to_end(stream.name)
+            if len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+            return jpeg
+        finally:
+            del self._pending[stream.name]
+
+
+async def _newest_preview(endpoint: Endpoint) -> Preview | None:
+    """Subscribe to the previews of a pipeline for a moment, and return the newest one, None if none arrives in time.
+
+    The first one may be old: the last one is sent again to each new subscriber. The second one is new, but a paused
+    pipeline sends none.
+    """
+    with Subscriber(PREVIEWS, endpoint) as previews:
+        first = await _next(previews, _FIRST_SECONDS)
+        return first and (await _next(previews, _NEXT_SECONDS) or first)
+
+
+async def _next(previews: Subscriber[Preview], seconds: float) -> Preview | None:
+    deadline = monotonic() + seconds
+    while (preview := previews.receive(0)) is None and monotonic() < deadline:
+        await readable([previews], deadline - monotonic())
+    return preview
