@@ -31,6 +31,7 @@ from typing import Annotated, Literal
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Mount, Route
@@ -55,6 +56,9 @@ __all__ = ["fleet_site", "pipeline_site"]
 _PAGE = Path(__file__).with_name("page")
 _COMMANDS, _COMMANDS_PER_SECOND = 20, 5
 
+#: Status code of the answer to a request that ends with an error: that of its first class here.
+_CODES = {CommandRejectedError: 409, ProtocolError: 400, SilenceError: 504, CatstreamError: 503}
+
 
 def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
     """Return the site of the pipeline at an endpoint, as in `PipelineFeed`."""
@@ -71,10 +75,13 @@ def _site(feed: PipelineFeed | FleetFeed) -> Site:
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        async with feed.running():
-            yield
+        running = asyncio.create_task(feed.run())
+        yield
+        running.cancel()
+        await asyncio.wait([running])
 
-    return Site(Starlette(lifespan=lifespan, routes=_routes(feed)), feed.close_viewers)
+    app = Starlette(lifespan=lifespan, routes=_routes(feed), exception_handlers={CatstreamError: _failed})
+    return Site(app, feed.close_viewers)
 
 
 def _routes(feed: PipelineFeed | FleetFeed) -> list[BaseRoute]:
@@ -144,21 +151,14 @@ class _Pages:
         feed = self._pipeline(request)
         # A page of another origin cannot send this content type without a CORS preflight request.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-            return _refused(415, "expected application/json")
+            raise HTTPException(415, "expected application/json\n")
         if wait := self._commands.wait(monotonic()):
             return too_many(wait)
         self._commands.take(monotonic())
-        try:
-            command = _command(await body_of(request))
-            answer = await run_in_threadpool(_execute, feed, command)
-        except CommandRejectedError as error:
-            return _refused(409, str(error))
-        except ProtocolError as error:
-            return _refused(400, str(error))
-        except SilenceError as error:
-            return _refused(504, str(error))
-        except CatstreamError as error:
-            return _refused(503, str(error))
+        command = decode_json(await body_of(request), Command)
+        if command.object and command.verb not in ("set-box", "forget"):
+            raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")
+        answer = await run_in_threadpool(_execute, feed, command)
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
         return JSONResponse({"done": True} | result)
 
@@ -172,10 +172,7 @@ class _Pages:
 
 
 async def _small_picture(feed: FleetFeed, request: Request) -> Response:
-    try:
-        jpeg = await feed.picture(request.path_params["stream"])
-    except CatstreamError as error:
-        return PlainTextResponse(f"{error}\n", 503)
+    jpeg = await feed.picture(request.path_params["stream"])
     return Response(status_code=204) if jpeg is None else Response(jpeg, media_type="image/jpeg")
 
 
@@ -204,16 +201,6 @@ class Command:
     keep: bool = False
 
 
-def _command(body: bytes | None) -> Command:
-    """Return a posted command. Raises ProtocolError if it is not valid."""
-    if body is None:
-        raise ProtocolError("expected a command, got more than 4096 bytes")
-    command = decode_json(body, Command)
-    if command.object and command.verb not in ("set-box", "forget"):
-        raise ProtocolError(f"expected the name of an object with set-box and forget, got one with {command.verb}")
-    return command
-
-
 def _execute(feed: PipelineFeed, command: Command) -> Answer:
     """Send a command and wait for its answer."""
     with feed.control() as pipeline:
@@ -224,5 +211,7 @@ def _execute(feed: PipelineFeed, command: Command) -> Answer:
         return {"pause": pipeline.pause, "resume": pipeline.resume, "stop": pipeline.stop}[command.verb]()
 
 
-def _refused(code: int, reason: str) -> Response:
-    return JSONResponse({"done": False, "reason": reason}, code)
+def _failed(_: Request, error: Exception) -> Response:
+    """Return the answer to a request that has failed."""
+    code = next(code for kind, code in _CODES.items() if isinstance(error, kind))
+    return JSONResponse({"done": False, "reason": str(error)}, code)

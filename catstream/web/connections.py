@@ -15,6 +15,8 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from catstream.errors import ProtocolError
+
 __all__ = ["MAX_CONNECTIONS", "Connections", "body_of"]
 
 #: Maximum number of open connections.
@@ -99,15 +101,15 @@ class _Connection(asyncio.Protocol):
         self._transport.abort()
 
 
-async def body_of(request: Request) -> bytes | None:
-    """Return the body of a request, None if it is longer than 4096 bytes."""
+async def body_of(request: Request) -> bytes:
+    """Return the body of a request, of at most 4096 bytes."""
     body = b""
     try:
         async with asyncio.timeout(_REQUEST_SECONDS):
             async for part in request.stream():
                 body += part
                 if len(body) > _MAX_BODY:
-                    return None
+                    raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
     except TimeoutError:
         raise HTTPException(408, "the request was not complete in time\n") from None
     return body

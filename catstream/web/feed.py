@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator
 from time import monotonic
 
 from catstream.client.control import Control
@@ -57,17 +55,6 @@ class Feed(ABC):
     def close_viewers(self) -> None:
         """End the updates of open pages."""
         self.viewers.closed = True
-
-    @contextlib.asynccontextmanager
-    async def running(self) -> AsyncIterator[None]:
-        """Run inside an `async with`."""
-        task = asyncio.create_task(self.run())
-        try:
-            yield
-        finally:
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
 
     async def run(self) -> None:
         """Feed the dashboard until cancelled; each error is shown on the page, and then it goes on."""

@@ -29,7 +29,7 @@ __all__ = ["FleetFeed", "StreamFeeds"]
 _PERIOD_SECONDS, _TIMEOUT_SECONDS = 1.0, 2.0  # of the questions to the registry
 
 _MAX_FEEDS = 32
-_IDLE_SECONDS, _CHECK_SECONDS = 60.0, 5.0
+_IDLE_SECONDS = 60.0  # after which a feed that nobody looks at is closed
 
 _WIDTH = 320  # pixels of a small picture
 _BURST, _PER_SECOND = 24, 10  # pictures that are made, of all streams together
@@ -96,6 +96,7 @@ class FleetFeed(Feed):
                 self._registry.close()
 
     async def _feed(self) -> None:
+        self._feeds.close_unused()
         status = await asyncio.get_running_loop().run_in_executor(self._thread, self._ask)
         self.dashboard.take(status, monotonic())
 
@@ -113,21 +114,17 @@ class FleetFeed(Feed):
 class _Open:
     """A feed that runs.
 
+    task  runs it
     used  time of the last request to the page of its stream
-    task  runs the feed
     """
 
     feed: PipelineFeed
-    used: float
-    task: asyncio.Task[None] | None = None
-
-    def is_unused(self, seconds: float) -> bool:
-        """Return whether nobody looks at the page, and the last request to it was so many seconds ago."""
-        return not self.feed.viewers.count and monotonic() - self.used >= seconds
+    task: asyncio.Task[None]
+    used: float = 0.0
 
 
 class StreamFeeds:
-    """The feeds of single streams: each is opened by the first request, and closed a minute after the last one.
+    """The feeds of single streams: each is opened by the first request to the page of its stream.
 
     Parameters
     ----------
@@ -144,12 +141,21 @@ class StreamFeeds:
     def open(self, name: str) -> PipelineFeed | None:
         """Return the feed of a stream, None if too many are open, and somebody looks at each of their pages."""
         if name not in self._open:
-            if len(self._open) >= _MAX_FEEDS and not self._close_one():
+            if len(self) >= _MAX_FEEDS:
+                self.close_unused(0.0)
+            if len(self) >= _MAX_FEEDS:
                 return None
-            opened = self._open[name] = _Open(self._make_feed(name), monotonic())
-            opened.task = asyncio.create_task(self._run(name, opened))
+            feed = self._make_feed(name)
+            self._open[name] = _Open(feed, asyncio.create_task(feed.run()))
         self._open[name].used = monotonic()
         return self._open[name].feed
+
+    def close_unused(self, seconds: float = _IDLE_SECONDS) -> None:
+        """End the feeds that nobody looks at, and to which the last request was so many seconds ago."""
+        for name, opened in list(self._open.items()):
+            if not opened.feed.viewers.count and monotonic() - opened.used >= seconds:
+                opened.task.cancel()
+                del self._open[name]
 
     def close_viewers(self) -> None:
         """End the updates of all open pages."""
@@ -158,31 +164,11 @@ class StreamFeeds:
 
     async def stop(self) -> None:
         """End all feeds."""
-        tasks = [opened.task for opened in self._open.values() if opened.task is not None]
+        tasks = [opened.task for opened in self._open.values()]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        self._open.clear()  # a task that was cancelled before it began has not done this
-
-    async def _run(self, name: str, opened: _Open) -> None:
-        """Run a feed until it is unused for a while."""
-        try:
-            async with opened.feed.running():
-                while not opened.is_unused(_IDLE_SECONDS):
-                    await asyncio.sleep(_CHECK_SECONDS)
-        finally:
-            if self._open.get(name) is opened:
-                del self._open[name]
-
-    def _close_one(self) -> bool:
-        """Close the feed that has been unused for longest; return False if all are used."""
-        unused = [name for name, opened in self._open.items() if opened.is_unused(0.0)]
-        if not unused:
-            return False
-        opened = self._open.pop(min(unused, key=lambda name: self._open[name].used))
-        if opened.task is not None:
-            opened.task.cancel()
-        return True
+        self._open.clear()
 
 
 class Pictures:

@@ -189,28 +189,30 @@ def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams
 
 def test_pages_of_streams_are_closed_when_nobody_looks_at_them(folder, monkeypatch):
     monkeypatch.setattr(streams, "_MAX_FEEDS", 2)
-    monkeypatch.setattr(streams, "_IDLE_SECONDS", 0.0)
-    monkeypatch.setattr(streams, "_CHECK_SECONDS", 0.01)
-    feeds = {}
+    made = {}
 
     def make_feed(name):
-        feeds[name] = PipelineFeed(str(folder))
-        return feeds[name]
+        made[name] = PipelineFeed(str(folder))
+        return made[name]
 
     async def use():
-        pages = StreamFeeds(make_feed)
-        first = pages.open("cam-1")
-        with feeds["cam-1"].viewers.counted():
-            assert pages.open("cam-2") is not None
-            assert pages.open("cam-3") is not None, "in place of one that nobody looks at"
-            assert pages.open("cam-1") is first
-            with feeds["cam-3"].viewers.counted():
-                assert pages.open("cam-4") is None
-        while len(pages):
-            await asyncio.sleep(0.01)
-        pages.open("cam-1")
-        await pages.stop()
-        assert not len(pages)
+        feeds = StreamFeeds(make_feed)
+        first = feeds.open("cam-1")
+        with first.viewers.counted():
+            assert feeds.open("cam-2") is not None
+            assert feeds.open("cam-3") is not None, "in place of one that nobody looks at"
+            assert feeds.open("cam-1") is first
+            with made["cam-3"].viewers.counted():
+                assert feeds.open("cam-4") is None
+                feeds.close_unused(0.0)
+                assert len(feeds) == 2
+        feeds.close_unused(60.0)
+        assert len(feeds) == 2, "they were used just now"
+        feeds.close_unused(0.0)
+        assert not len(feeds)
+        feeds.open("cam-1")
+        await feeds.stop()
+        assert not len(feeds)
 
     asyncio.run(use())
 
