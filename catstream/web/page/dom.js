@@ -38,7 +38,7 @@ export class Items {
     Object.assign(this, { parent, make, fill, drop, items: new Map() });
   }
 
-  /** Show these pairs of name and value, in this order; only elements whose place has changed are moved. */
+  /** Show these pairs of name and value, in this order; only values and places that have changed are touched. */
   show(pairs) {
     const items = new Map(pairs.map(([name, value]) => [name, this.items.get(name) ?? this.make(name, value)]));
     for (const [name, item] of this.items) {
@@ -49,8 +49,9 @@ export class Items {
     this.items = items;
     let next = this.parent.firstElementChild;
     for (const [name, value] of pairs) {
-      const item = items.get(name);
-      this.fill?.(item, value);
+      const item = items.get(name), text = JSON.stringify(value);
+      if (item.text !== text) this.fill?.(item, value);
+      item.text = text;
       if (item.element === next) next = next.nextElementSibling;
       else this.parent.insertBefore(item.element, next);
     }

@@ -6,7 +6,7 @@ export class Objects {
   /** actions: choose(name) is called if another object is chosen; forget(name) if the button of an object is pressed. */
   constructor(element, actions) {
     Object.assign(this, { actions, list: [], chosen: null });
-    this.items = new Items(element, { make: (name) => this.make(name), fill: (item, one) => this.fill(item, one) });
+    this.items = new Items(element, { make: (name) => this.make(name), fill });
   }
 
   /** Whether there is nothing to choose: no object, or one without a name. */
@@ -28,7 +28,7 @@ export class Objects {
     this.list = list;
     if (this.next !== undefined && this.get(this.next)) this.choose(this.next);
     else if (!this.get(this.chosen)) this.choose(list[0]?.name ?? null);
-    this.items.show(list.map((one) => [one.name, one]));
+    this.draw();
   }
 
   /** Choose an object, now or as soon as it is shown. */
@@ -36,8 +36,12 @@ export class Objects {
     this.next = name === null || this.get(name) ? undefined : name;
     if (this.next !== undefined || name === this.chosen) return;
     this.chosen = name;
-    this.items.show(this.list.map((one) => [one.name, one]));
+    this.draw();
     this.actions.choose(name);
+  }
+
+  draw() {
+    this.items.show(this.list.map((one) => [one.name, { ...one, chosen: one.name === this.chosen }]));
   }
 
   make(name) {
@@ -53,14 +57,14 @@ export class Objects {
     forget.setAttribute("aria-label", `Forget ${name || "the object without a name"}`);
     return { element, choose, state, model, score, share };
   }
+}
 
-  fill({ element, choose, state, model, score, share }, one) {
-    choose.setAttribute("aria-pressed", String(one.name === this.chosen));
-    element.style.setProperty("--colour", one.colour);
-    element.dataset.state = one.state;
-    share.style.width = `${100 * Math.max(0, Math.min(1, one.score))}%`;
-    write(state, one.state);
-    write(model, `, model ${one.version}`);
-    write(score, one.score.toFixed(2));
-  }
+function fill({ element, choose, state, model, score, share }, one) {
+  choose.setAttribute("aria-pressed", String(one.chosen));
+  element.style.setProperty("--colour", one.colour);
+  element.dataset.state = one.state;
+  share.style.width = `${100 * Math.max(0, Math.min(1, one.score))}%`;
+  write(state, one.state);
+  write(model, `, model ${one.version}`);
+  write(score, one.score.toFixed(2));
 }
