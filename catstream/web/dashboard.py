@@ -307,7 +307,11 @@ class FleetDashboard(Parts):
     """
 
     def __init__(self) -> None:
-        super().__init__({"fleet": self._fleet_part, "streams": self._streams_part, "nodes": self._nodes_part})
+        self._streams: dict[str, dict[str, Any]] = {}
+        self._nodes: dict[str, dict[str, Any]] = {}
+        super().__init__(
+            {"fleet": self._fleet_part, "streams": lambda _: self._streams, "nodes": lambda _: self._nodes}
+        )
         self.status: FleetStatus | None = None
         self.phase: Phase = "waiting"
         self.reason = ""
@@ -317,6 +321,8 @@ class FleetDashboard(Parts):
     def take(self, status: FleetStatus, now: float) -> None:
         """Process a status that arrived at the time `now`, in seconds of a monotonic clock."""
         self.status, self.phase, self.reason, self.age, self._arrived = status, "running", "", 0.0, now
+        self._streams = {name: _stream(each) for name, each in status.streams.items()}
+        self._nodes = {name: _node(each) for name, each in status.nodes.items()}
         self._mark_changed("fleet", "streams", "nodes")
 
     def mark_silent(self, reason: str, now: float) -> None:
@@ -329,12 +335,6 @@ class FleetDashboard(Parts):
     def _fleet_part(self, _: int) -> dict[str, object]:
         name = self.status.name if self.status is not None else ""
         return {"name": name, "phase": self.phase, "reason": self.reason, "age": int(self.age)}
-
-    def _streams_part(self, _: int) -> dict[str, dict[str, Any]]:
-        return {name: _stream(each) for name, each in self.status.streams.items()} if self.status is not None else {}
-
-    def _nodes_part(self, _: int) -> dict[str, dict[str, Any]]:
-        return {name: _node(each) for name, each in self.status.nodes.items()} if self.status is not None else {}
 
 
 def _stream(stream: StreamStatus) -> dict[str, Any]:
