@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict, deque
+from itertools import takewhile
 from typing import Any, Literal
 
 from catstream.messages.heads import TREES
@@ -77,8 +78,7 @@ class Dashboard(Parts):
         self._last: dict[str, Health] = {}  # like `health`, but kept while the pipeline is silent
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
-        self._moments: deque[float] = deque()
-        self._arrivals: OrderedDict[int, float] = OrderedDict()
+        self._arrivals: OrderedDict[int, float] = OrderedDict()  # of the first track of each frame, the newest last
         self._tracks: OrderedDict[int, dict[str, Track]] = OrderedDict()  # of the newest frames, by frame and object
         self._frame: tuple[int, float] | None = None  # number and time of the newest frame
 
@@ -114,7 +114,7 @@ class Dashboard(Parts):
             case Preview():
                 self._add_preview(message)
             case Features():
-                if self.surprising.add_features(message):
+                if self.surprising.add_features(message, self.objects.models):
                     self._mark_changed("surprising")
             case End() if self.phase != "ended":
                 self.phase, self.reason = "ended", message.reason
@@ -132,7 +132,8 @@ class Dashboard(Parts):
 
     def rate(self, now: float) -> float:
         """Return the frames per second over the last two seconds."""
-        return sum(now - moment <= _RATE_SECONDS for moment in self._moments) / _RATE_SECONDS
+        recent = takewhile(lambda moment: now - moment <= _RATE_SECONDS, reversed(self._arrivals.values()))
+        return len(list(recent)) / _RATE_SECONDS
 
     def counter(self, process: str, name: str) -> float | None:
         """Return a counter from the last health report of a process, None if there is none."""
@@ -186,8 +187,6 @@ class Dashboard(Parts):
             self._mark_changed("status")
         if self.objects.add_track(track):
             self.surprising.drop({track.object})
-            if (model := self.objects.shown[track.object].model) is not None:  # it arrived before the track
-                self.surprising.adopt(model)
             self._mark_changed("surprising")
         if self._frame is None or track.frame != self._frame[0]:
             self._begin_frame(track, now)
@@ -201,17 +200,14 @@ class Dashboard(Parts):
         self._tracks[track.frame] = {}
         if len(self._tracks) > _TRACKS:
             self._tracks.popitem(last=False)
-        self._moments.append(now)
-        while now - self._moments[0] > _RATE_SECONDS:
-            self._moments.popleft()
         self._arrivals[track.frame] = now
+        self._arrivals.move_to_end(track.frame)
         if len(self._arrivals) > _FRAMES:
             self._arrivals.popitem(last=False)
 
     def _add_model(self, model: Model, now: float) -> None:
         arrived = self._arrivals.get(model.frame)
-        if self.objects.add_model(model, None if arrived is None else now - arrived):
-            self.surprising.adopt(model)
+        self.objects.add_model(model, None if arrived is None else now - arrived)
 
     def _add_preview(self, preview: Preview) -> None:
         self.pictures[preview.frame] = preview

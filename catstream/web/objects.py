@@ -47,6 +47,11 @@ class Objects:
         self.colours = Colours()
         self._models: dict[str, Model] = {}  # newest models, also of objects without a track yet
 
+    @property
+    def models(self) -> dict[str, Model]:
+        """The newest model of each object that has one."""
+        return {name: each.model for name, each in self.shown.items() if each.model is not None}
+
     def add_track(self, track: Track) -> bool:
         """Add a track; return whether another object of this name begins with it."""
         name, before = track.object, self.shown.get(track.object)
@@ -59,23 +64,20 @@ class Objects:
         each.model = model if model is not None and model.began == track.began else None
         return begins
 
-    def add_model(self, model: Model, latency: float | None) -> bool:
+    def add_model(self, model: Model, latency: float | None) -> None:
         """Add a model that arrived `latency` seconds after the track of its frame, None if that is not known.
 
-        Returns
-        -------
-        False if the model is of another object that had the name before: it is ignored
+        It is ignored if it is of another object that had the name before.
         """
         name = model.object
         each, before = self.shown.get(name), self._models.get(name)
         if each is not None and each.began is not None and model.began < each.began:
-            return False
+            return
         self._models[name] = model
         if each is not None and each.began == model.began:
             each.model = model
             if latency is not None and (before is None or before.version != model.version):
                 each.model_latency = latency
-        return True
 
     def add_health(self, health: Health) -> set[str]:
         """Add the objects of the detector's health report that have no track yet; drop those that it does not track.

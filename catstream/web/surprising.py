@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -54,7 +54,6 @@ class SurprisingFrames:
     def __init__(self) -> None:
         self.frames: list[SurprisingFrame] = []  #: in the order of the video
         self._measured: Counter[str] = Counter()
-        self._models: dict[str, Model] = {}
         self._surprises: OrderedDict[int, tuple[float, dict[str, float]]] = OrderedDict()  # frame -> time, by object
         self._pictures: OrderedDict[int, Preview] = OrderedDict()
 
@@ -63,26 +62,26 @@ class SurprisingFrames:
         """Number of measured frames, summed over the objects."""
         return self._measured.total()
 
-    def adopt(self, model: Model) -> None:
-        """Measure the frames of its object with this model from now on."""
-        self._models[model.object] = model
-
     def drop(self, names: Iterable[str]) -> None:
         """Drop everything of these objects."""
         dropped = set(names)
         self.frames = [one for one in self.frames if one.object not in dropped]
         for name in dropped:
-            self._models.pop(name, None)
             del self._measured[name]
             for _, surprises in self._surprises.values():
                 surprises.pop(name, None)
 
-    def add_features(self, features: Features) -> bool:
-        """Add the features of a frame; return whether the selection has changed."""
+    def add_features(self, features: Features, models: Mapping[str, Model]) -> bool:
+        """Add the features of a frame; return whether the selection has changed.
+
+        Parameters
+        ----------
+        models : the newest model of each object that has one
+        """
         surprises = {
             name: surprise(training, model)
             for name, part in features.objects.items()
-            if (model := self._models.get(name)) is not None
+            if (model := models.get(name)) is not None
             and (training := part.training.get(APPEARANCE)) is not None
             and training.rows.shape[1] == len(model.weights)
         }
