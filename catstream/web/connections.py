@@ -42,12 +42,12 @@ class Connections:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         connection = self.open.get(scope["client"]) if scope.get("client") else None
         if connection is not None:
-            connection.change(answering=True)
+            connection.change(answering=1)
         try:
             await self._app(scope, receive, send)
         finally:
             if connection is not None:
-                connection.change(answering=False)
+                connection.change(answering=-1)
 
 
 class _Connection(asyncio.Protocol):
@@ -55,11 +55,12 @@ class _Connection(asyncio.Protocol):
 
     def __init__(self, all_: Connections, inner: asyncio.Protocol) -> None:
         self._all, self._inner = all_, inner
-        self._answering = self._paused = False
+        self._answering = 0  # requests; two if the application has not returned from the one before
+        self._paused = False
 
-    def change(self, *, answering: bool | None = None, paused: bool | None = None) -> None:
-        """Start or stop a time-out: the application is answering, or the client does not read."""
-        self._answering = self._answering if answering is None else answering
+    def change(self, *, answering: int = 0, paused: bool | None = None) -> None:
+        """Start or stop a time-out: an answer begins (1) or ends (-1); the client does not read, or reads again."""
+        self._answering += answering
         self._paused = self._paused if paused is None else paused
         if (timer := self._all.waiting.pop(self, None)) is not None:
             timer.cancel()

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 from contextlib import ExitStack, suppress
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 
 from catstream.messages.kinds import Preview
 from catstream.web import connections
 from catstream.web.dashboard import Dashboard
+from catstream.web.server import Server, Site
 
 TOKEN = "correct-horse-battery"
 HALF = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX-"
@@ -85,3 +88,26 @@ def test_an_open_page_stays_connected_while_others_open_connections(serve, conne
             connect(page).sendall(HALF)
         assert page.get("/healthz").status_code == 200
         assert any(line.startswith("data: ") for line in lines)
+
+
+async def late(scope, receive, send):  # noqa: ARG001
+    """Answers at once, and returns a while later; or answers in many parts, for longer than a request may take."""
+    if scope["type"] != "http":
+        return
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    if scope["path"] == "/healthz":
+        await send({"type": "http.response.body", "body": b"ok"})
+        await asyncio.sleep(0.1)
+        return
+    for _ in range(20):
+        await send({"type": "http.response.body", "body": b"part", "more_body": True})
+        await asyncio.sleep(0.05)
+    await send({"type": "http.response.body", "body": b"the end"})
+
+
+def test_a_response_is_not_cut_off_if_the_application_returns_late_from_the_request_before(monkeypatch):
+    monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.3)
+    server = Server(Site(late, lambda: None), port=0)
+    with server.in_background(), httpx.Client(base_url=server.url) as client:
+        assert client.get("/healthz").text == "ok"
+        assert client.get("/parts").text.endswith("partthe end")
