@@ -45,7 +45,7 @@ try {
   say("search", await shown());
   await page.keyboard.press("Escape");
   await page.click('#nodes button:text-is("south")');
-  say("node", await shown());
+  say("node", [await page.inputValue("#search"), ...(await shown())]);
   await page.fill("#search", "nowhere");
   say("none", await page.locator(".none").innerText());
   await page.fill("#search", "cam");

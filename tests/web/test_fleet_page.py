@@ -26,11 +26,12 @@ def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_s
         pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
     monkeypatch.setattr(streams, "_TIMEOUT_SECONDS", 1.0)
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
+    fleet.node("south-2", cores=4.0)
     fleet.node("south", "dead", cores=4.0, trouble="no answer since 02:14:07")
     fleet.stream("cam-7", node="north", endpoint=str(folder), models={"anna": 3}, rate=25.0, stored_seconds=2.0)
     fleet.stream("cam-10", "moving", node="south", restarts=1)
     fleet.stream("cam-9", "unplaced", trouble="cam-9 needs a node with site=west, there is none")
-    fleet.stream("dock", "waiting", node="north")
+    fleet.stream("dock", "waiting", node="south-2")
     link = str(serve_fleet(token=TOKEN).base_url.copy_set_param("token", TOKEN))
     words = [node, HERE / "fleet.mjs", link, chromium, tmp_path / "profile"]
     said = {}
@@ -46,8 +47,9 @@ def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_s
     over.set()
     turning.join()
     assert said["all"] == [["cam-9", "cam-7", "cam-10", "dock"]]
-    assert said["nodes"] == [["south", "north"]]
-    assert (said["search"], said["node"], said["trouble"]) == ([["cam-7"]], [["cam-10"]], [["cam-9"]])
+    assert said["nodes"] == [["south", "north", "south-2"]]
+    assert (said["search"], said["trouble"]) == ([["cam-7"]], [["cam-9"]])
+    assert said["node"] == [["node=south", "cam-10"]], "and no stream of the node south-2"
     assert said["none"] == ["No stream matches “nowhere”."]
     assert said["page"] == [["/streams/cam-7/", "cam-7 – catstream"]]
     assert said["back"] == [["cam running", "cam-7"]]

@@ -38,7 +38,7 @@ export class Streams {
     const pairs = inOrder(streams);
     for (const [name, card] of pairs) {
       const objects = card.models.map(([object]) => object);
-      card.words = [name, card.state, card.level ? "trouble" : "", card.node, ...(nodes[card.node]?.labels ?? []), ...objects].join(" ").toLowerCase();
+      card.words = [name, card.state, card.level ? "trouble" : "", `node=${card.node}`, ...(nodes[card.node]?.labels ?? []), ...objects].join(" ").toLowerCase();
     }
     this.cards = pairs.map(([, card]) => card);
     this.items.show(pairs);
@@ -85,7 +85,7 @@ function fillCard(item, card) {
 }
 
 export class Nodes {
-  /** search(name) is called if the name of a node is pressed. */
+  /** search(text) is called if the name of a node is pressed. */
   constructor(element, search) {
     this.search = search;
     this.rows = {};
@@ -111,7 +111,7 @@ export class Nodes {
   make(name) {
     const element = document.createElement("tr");
     const [node, cores, streams] = ["node", "number", "number"].map((className) => add(element, "td", { className }));
-    const button = add(node, "button", { type: "button", textContent: name, onclick: () => this.search(name) });
+    const button = add(node, "button", { type: "button", textContent: name, onclick: () => this.search(`node=${name}`) });
     return { element, button, state: pill(node), streams, labels: add(node, "p", { className: "quiet labels" }),
       trouble: add(node, "p", { className: "trouble" }), used: add(cores, "span"), bar: add(add(cores, "span", { className: "share" }), "i") };
   }

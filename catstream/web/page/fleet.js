@@ -13,7 +13,7 @@ export class FleetPage {
     this.fleet = { phase: "waiting", name: "", reason: "", age: 0 };
     this.streams = new Streams($(".cards"));
     this.search = new Search($("#search"), $(".states"), () => this.showMatching());
-    this.nodes = new Nodes($("#nodes"), (name) => this.search.ask(name));
+    this.nodes = new Nodes($("#nodes"), (text) => this.search.ask(text));
     $("#streams").hidden = false;
     addEventListener("pagehide", () => sessionStorage.setItem("top", String(scrollY)));
     setInterval(() => server.silent !== null && this.showState(), 1000);

@@ -39,9 +39,9 @@ export class Search {
     this.changed();
   }
 
-  /** Whether all words are among those of a card. */
+  /** Whether all words are found in the words of a card, those with an = as whole words. */
   matches(card) {
-    return this.words.every((word) => card.words.includes(word));
+    return this.words.every((word) => (word.includes("=") ? ` ${card.words} `.includes(` ${word} `) : card.words.includes(word)));
   }
 
   /** Show a button for each state that streams are in, and how many there are. */
