@@ -73,16 +73,22 @@ def facts():
 
 
 @pytest.fixture
-def serve(folder):
-    """Starts pages: what asks them, and where they are."""
+def serve_site():
+    """Serves sites: a client of each of them."""
     with ExitStack() as stack:
 
-        def start(**options):
-            server = Server(pipeline_site(str(folder)), port=0, **options)
+        def start(site, **options):
+            server = Server(site, port=0, **options)
             stack.enter_context(server.in_background())
             return stack.enter_context(httpx.Client(base_url=server.url.partition("?")[0], timeout=60, verify=False))
 
         yield start
+
+
+@pytest.fixture
+def serve(serve_site, folder):
+    """Starts pages of the pipeline in `folder`: a client of each of them."""
+    return lambda **options: serve_site(pipeline_site(str(folder)), **options)
 
 
 class Fleet:
@@ -129,16 +135,9 @@ def manager(fleet):
 
 
 @pytest.fixture
-def serve_fleet(fleet, manager):  # noqa: ARG001  # it answers
-    """Starts pages of the fleet: what asks them."""
-    with ExitStack() as stack:
-
-        def start(**options):
-            server = Server(fleet_site(fleet.address, fleet.keys_of_client), port=0, **options)
-            stack.enter_context(server.in_background())
-            return stack.enter_context(httpx.Client(base_url=server.url.partition("?")[0], timeout=60, verify=False))
-
-        yield start
+def serve_fleet(serve_site, fleet, manager):  # noqa: ARG001  # it answers
+    """Starts pages of the fleet: a client of each of them."""
+    return lambda **options: serve_site(fleet_site(fleet.address, fleet.keys_of_client), **options)
 
 
 @pytest.fixture

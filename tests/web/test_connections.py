@@ -7,13 +7,12 @@ import socket
 from contextlib import ExitStack, suppress
 from urllib.parse import urlsplit
 
-import httpx
 import pytest
 
 from catstream.messages.kinds import Preview
 from catstream.web import connections
 from catstream.web.dashboard import Dashboard
-from catstream.web.server import Server, Site
+from catstream.web.server import Site
 
 TOKEN = "correct-horse-battery"
 HALF = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX-"
@@ -105,9 +104,8 @@ async def late(scope, receive, send):  # noqa: ARG001
     await send({"type": "http.response.body", "body": b"the end"})
 
 
-def test_a_response_is_not_cut_off_if_the_application_returns_late_from_the_request_before(monkeypatch):
+def test_a_response_is_not_cut_off_if_the_application_returns_late_from_the_request_before(serve_site, monkeypatch):
     monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.3)
-    server = Server(Site(late, lambda: None), port=0)
-    with server.in_background(), httpx.Client(base_url=server.url) as client:
-        assert client.get("/healthz").text == "ok"
-        assert client.get("/parts").text.endswith("partthe end")
+    client = serve_site(Site(late, lambda: None))
+    assert client.get("/healthz").text == "ok"
+    assert client.get("/parts").text.endswith("partthe end")
