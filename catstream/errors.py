@@ -125,7 +125,6 @@ EXTRAS = {
     "supervision": ("to_supervision", ("supervision",)),
     "fleet": ("a fleet", ("fsspec", "ray")),
     "s3": ("a store on S3", ("s3fs",)),
-    "mot": ("the accuracy of several objects", ("motmetrics",)),
 }
 
 
