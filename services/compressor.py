@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from pathlib import Path
 
 from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
@@ -23,13 +22,12 @@ from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import FEATURES, SAMPLES
 from catstream.wire.newest import Publisher
 
-__all__ = ["main", "prepare", "reading_seconds"]
+__all__ = ["main", "prepare"]
 
 _SENDER_SECONDS = 5.0  # limit for the detector to send the end, once all processes were asked to end
 _END_SECONDS = 5.0  # limit for the end of the tracks, after that of the features
 _STORE_SECONDS = 60.0  # limit for a slow disk
 _MODEL_SECONDS = 60.0  # limit for reading a saved model and training from it
-_READ_SECONDS = 1e-7  # limit for reading one byte
 _LOCK_SECONDS = 10.0  # limit for an earlier compressor to end
 
 
@@ -71,7 +69,6 @@ class CompressorLoop:
         self._progress = Progress(position, position.seq, time.monotonic())
         self._recorder = None
         if job.record is not None:
-            process.allow(reading_seconds(job.record))
             writer = stack.enter_context(RecordingWriter(job.record, process.run, resume=True))
             self._recorder = stack.enter_context(Recorder(writer, endpoint))
         self._features = stack.enter_context(
@@ -168,8 +165,3 @@ class CompressorLoop:
 def _checkpoints(job: Job, stack: ExitStack) -> CheckpointStore | None:
     """The checkpoints of a run, locked for this process; None if the run has no state folder."""
     return None if job.state is None else CheckpointStore(stack.enter_context(locked(job.state / TREES, _LOCK_SECONDS)))
-
-
-def reading_seconds(file: Path) -> float:
-    """Limit for opening a recording, which is read up to its last whole message."""
-    return _STORE_SECONDS + (file.stat().st_size if file.exists() else 0) * _READ_SECONDS

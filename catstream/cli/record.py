@@ -34,7 +34,8 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
 
     Features, models, tracks and health are written when they arrive, with the
     settings of the pipeline; about 0.4 MB for each frame. The file is MCAP. After
-    a crash it can be read up to the last whole message.
+    a crash it can be read up to the last whole message. After 100 000 messages,
+    the recording continues in a second file, walk-2.mcap.
 
     The pipeline does not wait for the recording. Messages that were sent before it
     started, or that it received too slowly, are missing; their number is printed

@@ -6,7 +6,6 @@ import time
 
 import pytest
 
-from catstream.services.compressor import reading_seconds
 from catstream.services.detector import opening_seconds
 from catstream.services.watchdog import PATIENCE, Watchdog
 
@@ -70,9 +69,3 @@ def test_a_longer_time_limit_applies_to_each_iteration(watchdog):
 )
 def test_a_detector_has_time_for_each_frame_of_the_file_that_it_passes_over(part, first, passed_over, each):
     assert opening_seconds(part, first) == pytest.approx((60 + 0.1 * passed_over, 0.1 * each))
-
-
-def test_a_compressor_has_time_to_read_the_recording_that_it_continues(tmp_path):
-    with (tmp_path / "run.rec").open("wb") as file:
-        file.truncate(5_000_000_000)
-    assert reading_seconds(tmp_path / "run.rec") >= 500

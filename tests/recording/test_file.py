@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import resource
 from pathlib import Path
@@ -21,9 +20,9 @@ from catstream.box import Box
 from catstream.errors import RecordingError
 from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
 from catstream.settings import Settings
-from catstream.sinks.recording.container import MAGIC, pack
+from catstream.sinks.recording.container import INDEX_SIZE, MAGIC, Container, entries
 from catstream.sinks.recording.file import TOPICS, Recording, RecordingWriter
-from catstream.wire.codec import decode, encode
+from catstream.wire.codec import decode, encode, encode_json
 
 
 def features(seq, value=0.5):
@@ -38,6 +37,12 @@ def track(seq, name=""):
 
 def model(version, frame, name=""):
     return Model(version, frame, np.full(3, version, np.float32), 0.5, object=name)
+
+
+def places(path):
+    """Where the messages of a file begin and end."""
+    with path.open("rb") as file:
+        return [(entry.place, entry.end) for entry in entries(file)]
 
 
 def read(path):
@@ -58,11 +63,8 @@ def test_written_messages_are_read_back_with_the_settings(written):
 
 def test_a_crash_at_any_byte_leaves_all_messages_before_it(written, tmp_path):
     messages = [track(1), features(1), model(1, 0)]
-    path = written([])
-    ends = [Recording(path).size]
-    for message in messages:
-        written([message], resume=True)
-        ends.append(Recording(path).size)
+    path = written(messages)
+    ends = [end for _, end in places(path)]
     whole, cut = path.read_bytes(), tmp_path / "cut.rec"
     for size in [*range(ends[0], ends[-1]), *range(ends[-1], len(whole), 50)]:
         cut.write_bytes(whole[:size])
@@ -70,7 +72,7 @@ def test_a_crash_at_any_byte_leaves_all_messages_before_it(written, tmp_path):
         recording = Recording(cut)
         kinds = [type(message) for _, message in recording.messages()]
         assert kinds == [Run, *map(type, messages[:kept])]
-        assert recording.torn == size - ends[kept]
+        assert recording.torn == max(size - ends[kept] - INDEX_SIZE, 0)
         assert not any(recording.missing.values())
     assert Recording(path).torn == 0
 
@@ -89,34 +91,35 @@ def test_a_changed_bit_invalidates_its_own_message_only(tmp_path_factory, share,
     with RecordingWriter(path, Run.from_settings(Settings().portable())) as writer:
         for seq in range(1, 10):
             writer.write(track(seq))
-    content, (run, *places) = bytearray(path.read_bytes()), [row[:2] for row in Recording(path).index]
-    changed = len(MAGIC) + int(share * (len(content) - len(MAGIC) - run[1]))
-    changed += run[1] * (changed >= run[0])  # without the settings it is no recording
+    content, (run, *chunks) = bytearray(path.read_bytes()), places(path)
+    changed = len(MAGIC) + int(share * (len(content) - len(MAGIC) - run[1] + run[0]))
+    changed += (run[1] - run[0]) * (changed >= run[0])  # without the settings it is no recording
     content[changed] ^= 1 << bit
     path.write_bytes(content)
     recording = Recording(path)
-    kept = [not place <= changed < place + size for place, size in places]
-    assert read(path)[1:] == [track(seq) for seq, whole in enumerate(kept, 1) if whole]
-    if not all(kept):
-        size = places[kept.index(False)][1]
+    # Nothing depends on the times of a chunk, which are in its message too, nor on the index behind it.
+    hit = [begin <= changed < end and not begin + 9 <= changed < begin + 25 for begin, end in chunks]
+    assert read(path)[1:] == [track(seq) for seq, is_hit in enumerate(hit, 1) if not is_hit]
+    if any(hit):
+        begin, end = chunks[hit.index(True)]
+        size = end - begin + INDEX_SIZE
         assert (recording.damaged, recording.torn) == (size, 0)
         assert f"{size} damaged bytes skipped" in str(recording)
 
 
 def test_a_hole_costs_the_messages_that_lie_in_it(written):
     path = written([track(seq) for seq in range(1, 10)])
-    content, (_, *places) = bytearray(path.read_bytes()), [place for place, *_ in Recording(path).index]
-    content[places[3] + 7 : places[5] + 7] = bytes(places[5] - places[3])
+    content, (_, *begins) = bytearray(path.read_bytes()), [place for place, _ in places(path)]
+    content[begins[3] + 7 : begins[5] + 7] = bytes(begins[5] - begins[3])
     path.write_bytes(content)
     recording = Recording(path)
     assert [message.seq for message in read(path)[1:]] == [1, 2, 3, 7, 8, 9]
-    assert recording.damaged == places[6] - places[3]
+    assert recording.damaged == begins[6] - begins[3]
     assert recording.missing[Track] == 3
 
 
 def test_another_program_reads_it_by_topic_and_time(written):
-    path = written([track(1), features(1), model(1, 0)])
-    written([track(2), Health("trainer", 2.0, {"trained": 1.0}), End(3, "its end")], resume=True)
+    path = written([track(1), features(1), model(1, 0), track(2), Health("trainer", 2.0, {"trained": 1.0}), End(3, "")])
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
@@ -151,13 +154,54 @@ def test_another_program_reads_it_from_start_to_end(written):
     assert [record.sequence for record in records if isinstance(record, Message)] == [0, 1, 2, 3]
 
 
-def test_it_continues_after_the_last_whole_message(written):
+def test_it_continues_in_a_second_file_after_the_last_whole_message(written):
     path = written([features(1), features(2)])
     path.write_bytes(path.read_bytes()[: Recording(path).size - 7])
+    before = path.read_bytes()
     written([features(2), features(3)], resume=True)
+    written([End(4, "its end")], resume=True)
     recording = Recording(path)
+    assert [file.name for file in recording.files] == ["run.rec", "run-2.rec", "run-3.rec"]
     assert [message.seq for message in recording.features()] == [1, 2, 3]
-    assert recording.torn == 0
+    assert [type(message) for message in read(path)] == [Run, Features, Features, Features, End]
+    assert path.read_bytes() == before
+    assert recording.complete is False, "it has no tracks"
+    assert "in 3 files" in str(recording)
+    with recording.files[1].open("rb") as file:
+        assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 3, "each file is one for others too"
+
+
+def test_another_recording_whose_name_is_that_of_a_second_file_is_neither_read_nor_replaced(written):
+    path = written([features(1)])
+    other = path.with_name("run-2.rec")
+    with RecordingWriter(other, Recording(path).run) as writer:
+        writer.write(features(7))
+    path.with_name("run-3.rec").write_text("dear to somebody")
+    before = other.read_bytes()
+    written([features(2)], resume=True)
+    assert [file.name for file in Recording(path).files] == ["run.rec", "run-4.rec"]
+    assert [message.seq for message in Recording(path).features()] == [1, 2]
+    assert other.read_bytes() == before
+    assert [message.seq for message in Recording(other).features()] == [7]
+
+
+def test_a_second_file_whose_settings_are_damaged_is_read_too(written):
+    path = written([features(1)])
+    written([features(2)], resume=True)
+    second = path.with_name("run-2.rec")
+    content = bytearray(second.read_bytes())
+    content[places(second)[0][0] + 100] ^= 1
+    second.write_bytes(content)
+    assert [message.seq for message in Recording(path).features()] == [1, 2]
+
+
+def test_a_recording_of_many_messages_goes_on_in_further_files(written, monkeypatch):
+    monkeypatch.setattr("catstream.sinks.recording.file._MOST_MESSAGES", 4)
+    path = written([*(track(seq) for seq in range(1, 10)), End(10, "its end")])
+    recording = Recording(path)
+    assert len(recording.files) == 3
+    assert [message.seq for message in read(path)[1:]] == list(range(1, 11))
+    assert (recording.counts[Run], recording.damaged, recording.torn) == (1, 0, 0)
 
 
 def test_features_that_a_restarted_compressor_receives_again_replace_the_earlier_ones(written):
@@ -216,13 +260,19 @@ def test_another_program_tells_the_objects_apart_by_a_field_of_each_message(writ
     assert [(about, fields["object"]) for _, _, about, _, fields in models] == [("anna", "anna"), ("", "")]
 
 
+def with_message(folder, kind, data):
+    """A recording with a message of these bytes."""
+    kinds, path = list(TOPICS), folder / "run.rec"
+    container = Container(path, list(TOPICS.values()), {})
+    container.add(kinds.index(Run) + 1, 0, 0, encode_json(Run("", {})))
+    container.add(kinds.index(kind) + 1, 1, 0, data)
+    container.close()
+    return path
+
+
 @pytest.mark.parametrize("kind", [Features, Model])
-def test_a_recording_of_an_earlier_protocol_is_an_error_of_one_line(written, kind):
-    path = written([])
-    with path.open("r+b") as file:
-        file.truncate(Recording(path).size)
-        file.seek(0, os.SEEK_END)
-        file.write(pack(list(TOPICS).index(kind) + 1, 1, 0, msgpack.packb([2, kind.__name__.lower(), {}])))
+def test_a_recording_of_an_earlier_protocol_is_an_error_of_one_line(tmp_path, kind):
+    path = with_message(tmp_path, kind, msgpack.packb([2, kind.__name__.lower(), {}]))
     with pytest.raises(RecordingError, match=r"cannot read: expected version 4 of the protocol, got 2") as raised:
         Recording(path)
     assert "\n" not in str(raised.value)
@@ -244,8 +294,11 @@ def test_a_full_disk_is_an_error_and_leaves_the_file_whole(tmp_path):
                 writer.write(features(1))
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert writer.path.stat().st_size == size
+        writer.write(End(2, "its end"))  # by which a reader knows that features are missing
     recording = Recording(writer.path)
-    assert (recording.counts[Features], recording.size, recording.torn) == (0, size, 0)
+    assert (recording.counts[Features], recording.end, recording.torn) == (0, End(2, "its end"), 0)
+    assert recording.missing[Features] == 1
 
 
 def test_an_existing_file_is_not_overwritten(written):
@@ -262,12 +315,8 @@ def test_an_existing_file_is_not_overwritten(written):
     assert len(read(path)) == 2
 
 
-def test_a_message_that_this_version_cannot_read_is_an_error_of_one_line(written):
-    path = written([])
-    with path.open("r+b") as file:
-        file.truncate(Recording(path).size)
-        file.seek(0, os.SEEK_END)
-        file.write(pack(list(TOPICS).index(Model) + 1, 1, 0, b"of another version"))
+def test_a_message_that_this_version_cannot_read_is_an_error_of_one_line(tmp_path):
+    path = with_message(tmp_path, Model, b"of another version")
     with pytest.raises(RecordingError, match=r"holds a message at byte .* cannot read: expected model"):
         Recording(path)
 

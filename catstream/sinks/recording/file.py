@@ -1,4 +1,8 @@
-"""Recordings: an MCAP file of all messages of a run, each readable even if others are damaged or cut off.
+"""Recordings: MCAP files of all messages of a run, each readable even if others are damaged or cut off.
+
+A file that was closed or torn cannot be continued: a restarted compressor continues walk.mcap in walk-2.mcap, the next
+one in walk-3.mcap, and a file of very many messages is continued in the next one, too. A file belongs to a recording if
+the metadata of its topics has the same `recording`, a random number: another recording may be called walk-2.mcap.
 
 A topic for each kind of message. Messages without arrays are JSON objects of their fields, which Foxglove and other
 programs show as they are; features and models are msgpack, as on the wire. The tracks and models of all objects are in
@@ -14,7 +18,10 @@ import os
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from itertools import count, groupby, islice
 from pathlib import Path
+from secrets import token_hex
 from typing import BinaryIO, Self, TypeVar
 
 from catstream.errors import ProtocolError, RecordingError
@@ -23,16 +30,14 @@ from catstream.messages.names import counted
 from catstream.messages.storage import lock
 from catstream.settings import Settings
 from catstream.sinks.recording.container import (
+    INDEX_SIZE,
     MAGIC,
+    Container,
     Entry,
-    Index,
     Topic,
     end_of_data,
     entries,
     entry_at,
-    opening,
-    pack,
-    summary,
 )
 from catstream.wire.codec import decode, decode_json, encode, encode_json
 
@@ -57,6 +62,10 @@ _TOPICS = list(TOPICS.values())
 _NUMBERS = {kind: number for number, kind in enumerate(TOPICS, 1)}
 _KINDS = {number: kind for kind, number in _NUMBERS.items()}
 
+_SERIES = "recording"  # metadata of the topics: a random number, the same in all files of a recording
+_MOST_MESSAGES = 100_000  # in a file: its index takes 50 MB of memory until it is closed
+_Place = tuple[int, int]  # number of the file, and bytes from its start
+
 _NOUNS = {Features: "feature", Model: "model", Track: "track", Health: "health report"}
 
 
@@ -68,9 +77,9 @@ class RecordingWriter:
 
     Parameters
     ----------
-    path : of the file
+    path : of the first file
     run : the settings of the pipeline
-    resume : continue the file after its last whole message, if it exists
+    resume : continue the recording in its next file, if it exists
 
     Attributes
     ----------
@@ -83,29 +92,21 @@ class RecordingWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str], run: Run, *, resume: bool = False) -> None:
-        self.path = Path(path)
-        self.written = 0
-        continued = resume and self.path.exists() and self.path.stat().st_size > 0
-        try:
-            self._file = self.path.open("r+b" if continued else "wb" if resume else "xb", buffering=0)
-        except FileExistsError:
-            raise RecordingError(f"{path} exists already: give another name, or remove it") from None
-        except OSError as error:
-            raise RecordingError(
-                f"cannot record to {str(path)!r} ({error.strerror}): give a path that you may write to"
-            ) from None
-        if not lock(self._file.fileno()):
-            self._file.close()
-            raise RecordingError(f"another process records to {path}: give another name")
-        earlier = Recording(path) if continued else None  # nobody else may write to it from here on
-        if earlier is not None and earlier.run != run:
-            self._file.close()
-            raise RecordingError(f"{path} was recorded with other settings: give another file")
-        self._index, self._size = (earlier.index, earlier.size) if earlier is not None else (Index(), 0)
-        if earlier is None:
-            self._add(run, opening(_TOPICS))
-        else:
-            self._cut()
+        self.path, self.written, self._run = Path(path), 0, run
+        self._metadata = {_SERIES: token_hex(8)}
+        with ExitStack() as self._stack:
+            continues = resume and self.path.exists() and self.path.stat().st_size > 0
+            if resume and not continues:
+                self.path.unlink(missing_ok=True)  # its process was killed before it wrote anything
+            if continues:
+                self._lock()
+                earlier, self._metadata = _opening(self.path)
+                if earlier != run:
+                    raise RecordingError(f"{path} was recorded with other settings: give another file")
+            self._container = self._begin(may_exist=continues)
+            if not continues:
+                self._lock()
+            self._stack = self._stack.pop_all()
 
     def write(self, message: Recorded) -> None:
         """Append a message.
@@ -115,45 +116,48 @@ class RecordingWriter:
         RecordingError
             If the disk is full or fails; the file then ends with the message before.
         """
-        self._add(message)
+        if self._container.messages >= _MOST_MESSAGES and not isinstance(message, End):
+            full, self._container = self._container, self._begin(may_exist=True)
+            full.close()
+        self._add(self._container, message)
         self.written += 1
 
     def close(self) -> None:
         """Write the index, unless the disk is full, and close the file."""
-        if self._file.closed:
-            return
-        size = self._size
-        try:
-            for block in summary(_TOPICS, self._index, size):
-                self._append(block)
-        except RecordingError:  # the index can be made from the messages
-            self._size = size
-            self._cut()
-        self._file.close()
+        self._container.close()
+        self._stack.close()
 
-    def _add(self, message: Recorded, before: bytes = b"") -> None:
-        number, now = _NUMBERS[type(message)], time.time_ns()
+    def _begin(self, *, may_exist: bool) -> Container:
+        """Begin the next file of the series, with the settings."""
+        path = next(path for path in _numbered(self.path) if not (may_exist and path.exists()))
+        try:
+            container = Container(path, _TOPICS, self._metadata)
+        except FileExistsError:
+            raise RecordingError(f"{path} exists already: give another name, or remove it") from None
+        except OSError as error:
+            raise RecordingError(
+                f"cannot record to {str(path)!r} ({error.strerror}): give a path that you may write to"
+            ) from None
+        try:
+            self._add(container, self._run)
+        except RecordingError:
+            container.close()
+            path.unlink()
+            raise
+        return container
+
+    def _add(self, container: Container, message: Recorded) -> None:
         sequence = getattr(message, "seq", getattr(message, "version", 0))
         data = encode_json(message) if TOPICS[type(message)].encoding == "json" else encode(message)
-        entry = pack(number, sequence, now, data)
-        place = self._size + len(before)
-        self._append(before + entry)
-        self._index.add(place, len(entry), number, now)
-
-    def _append(self, data: bytes) -> None:
-        rest = memoryview(data)
         try:
-            while rest:  # a disk that becomes full takes a part, and then nothing
-                rest = rest[self._file.write(rest) :]
+            container.add(_NUMBERS[type(message)], sequence, time.time_ns(), data)
         except OSError as error:
-            self._cut()
             raise RecordingError(f"cannot record to {str(self.path)!r} any more: {error.strerror}") from None
-        self._size += len(data)
 
-    def _cut(self) -> None:
-        """Remove all bytes after those that were written whole."""
-        self._file.truncate(self._size)
-        self._file.seek(self._size)
+    def _lock(self) -> None:
+        """Keep other processes from recording to this series as long as this object is open."""
+        if not lock(self._stack.enter_context(self.path.open("rb")).fileno()):
+            raise RecordingError(f"another process records to {self.path}: give another name")
 
     def __enter__(self) -> Self:
         return self
@@ -167,6 +171,8 @@ class Recording:
 
     Attributes
     ----------
+    path : of its first file
+    files : all of its files, in order
     run : the settings of the pipeline
     counts : messages by kind, `counts[Features]` ...; of features and models those that `features` and `models` yield
     missing : frames whose features or tracks are missing, by the gaps in `seq`; also before the first and, if the end
@@ -174,40 +180,32 @@ class Recording:
     frames : number of frames that have a track
     end : the pipeline's `End`, None if the recording ended before it
     damaged : bytes between whole messages that are skipped
-    torn : bytes after the last whole message that are skipped
-    size : bytes up to the end of the last whole message
-    index : places of all whole messages
+    torn : bytes after the last whole message of a file that are skipped
+    size : bytes up to the end of the last whole message, of all files
 
     Raises
     ------
     RecordingError
-        If the file cannot be read, or is not a recording.
+        If a file cannot be read, or is not a recording.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        self.run, metadata = _opening(self.path)
+        self.files = [self.path, *_further(self.path, metadata)]
         self.counts: Counter[type] = Counter()
         self.end: End | None = None
-        self.index = Index()
-        self.size = self.damaged = 0
+        self.damaged = self.torn = 0
+        self._ends: list[int] = []  # of the last whole message of each file
         self._tracks: set[int] = set()
-        self._features: list[tuple[int, int]] = []  # seq and place of the features that the trees hold
+        self._features: list[tuple[int, _Place]] = []  # seq and place of the features that the trees hold
         # Of each object: number of features that a model was trained on, and its place.
-        self._models: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
-        with self._open() as file:
-            for entry in entries(file):
-                self.damaged += entry.place - (self.size or entry.place)
-                self.size = entry.place + entry.size
-                self.index.add(entry.place, entry.size, entry.channel, entry.time)
-                self._count(entry)
-            self._measure_tail(file)
-        _, first = next(self.messages(), (0.0, None))
-        if not isinstance(first, Run):
-            raise RecordingError(f"{path} holds no settings of a run: it was cut off or damaged at its start")
-        self.run = first
+        self._models: defaultdict[str, list[tuple[int, _Place]]] = defaultdict(list)
+        for number in range(len(self.files)):
+            self._read(number)
         self.counts[Features] = len(self._features)
         self.counts[Model] = sum(map(len, self._models.values()))
-        self.frames = len(self._tracks)
+        self.size, self.frames = sum(self._ends), len(self._tracks)
         self.missing = {
             Features: self._missing({seq for seq, _ in self._features}),
             Track: self._missing(self._tracks),
@@ -216,11 +214,12 @@ class Recording:
     def __str__(self) -> str:
         """A summary for a person."""
         counts = ", ".join(counted(self.counts[kind], noun) for kind, noun in _NOUNS.items())
+        files = f" in {len(self.files)} files" * (len(self.files) > 1)
         lost = [counted(number, _NOUNS[kind]) for kind, number in self.missing.items() if number]
         damaged = f"; {counted(self.damaged, 'damaged byte')} skipped" * bool(self.damaged)
-        torn = f"; {counted(self.torn, 'torn byte')} at its end skipped" * bool(self.torn)
+        torn = f"; {counted(self.torn, 'torn byte')} at the end of a file skipped" * bool(self.torn)
         cut = "; it ends before the run did" * (self.end is None)
-        return f"{counts}, {self.size / 1e6:.0f} MB; {' and '.join(lost) or 'none'} missing{cut}{damaged}{torn}"
+        return f"{counts}, {self.size / 1e6:.0f} MB{files}; {' and '.join(lost) or 'none'} missing{cut}{damaged}{torn}"
 
     @property
     def complete(self) -> bool:
@@ -240,13 +239,15 @@ class Recording:
         return Settings.from_values(self.run.settings)
 
     def messages(self) -> Iterator[tuple[float, Recorded]]:
-        """Each message in the order of recording, with its time in seconds since 1970."""
-        with self._open() as file:
-            for entry in entries(file):
-                if entry.channel in _KINDS:
-                    yield entry.time / 1e9, self._decode(entry, _KINDS[entry.channel])
-                if entry.place + entry.size >= self.size:  # the file may have grown since it was checked
-                    return
+        """Each message in the order of recording, with its time in seconds since 1970; the settings once, first."""
+        for number, path in enumerate(self.files):
+            with _open(path) as file:
+                for entry in entries(file):
+                    kind = _KINDS.get(entry.channel)
+                    if kind is not None and not (number and kind is Run):
+                        yield entry.time / 1e9, _decode(path, entry, kind)
+                    if entry.end >= self._ends[number]:  # the file may have grown since it was checked
+                        break
 
     def features(self) -> Iterator[Features]:
         """The features that the coreset trees hold, in order of `seq`, each once."""
@@ -256,70 +257,107 @@ class Recording:
         """The models of all objects that were trained on these features, in the order of recording."""
         return self._at(sorted(place for models in self._models.values() for _, place in models), Model)
 
-    def _at(self, places: Iterable[int], kind: type[_Kind]) -> Iterator[_Kind]:
-        with self._open() as file:
-            for place in places:
-                entry = entry_at(file, place)
-                if entry is None:
-                    raise RecordingError(f"{self.path} has changed since it was checked: read it again")
-                yield self._decode(entry, kind)
+    def _at(self, places: Iterable[_Place], kind: type[_Kind]) -> Iterator[_Kind]:
+        for number, group in groupby(places, key=lambda place: place[0]):
+            path = self.files[number]
+            with _open(path) as file:
+                for _, place in group:
+                    entry = entry_at(file, place)
+                    if entry is None:
+                        raise RecordingError(f"{path} has changed since it was checked: read it again")
+                    yield _decode(path, entry, kind)
 
-    def _decode(self, entry: Entry, kind: type[_Kind]) -> _Kind:
-        try:
-            return decode_json(entry.data, kind) if TOPICS[kind].encoding == "json" else decode(entry.data, kind)
-        except ProtocolError as error:
-            raise RecordingError(
-                f"{self.path} holds a message at byte {entry.place} that this version of catstream cannot read: {error}"
-            ) from None
+    def _read(self, number: int) -> None:
+        """Check a file, and take in its messages."""
+        with _open(self.files[number]) as file:
+            end = expected = len(MAGIC)
+            for entry in entries(file):
+                self.damaged += max(entry.place - expected, 0) if end > len(MAGIC) else 0
+                end, expected = entry.end, entry.end + INDEX_SIZE
+                self._count(entry, number)
+            self._ends.append(end)
+            closed = end_of_data(file)
+            if closed is not None and closed >= expected:
+                self.damaged += closed - expected
+            else:
+                self.torn += max(file.seek(0, os.SEEK_END) - expected, 0)
 
-    def _open(self) -> BinaryIO:
-        try:
-            file = self.path.open("rb")
-        except OSError as error:
-            raise RecordingError(f"cannot read the recording {self.path}: {error.strerror}") from None
-        if file.read(len(MAGIC)) != MAGIC:
-            file.close()
-            raise RecordingError(f"{self.path} is no recording of this catstream: `catstream record` makes one")
-        return file
-
-    def _count(self, entry: Entry) -> None:
-        """Take in an entry while the file is checked."""
-        kind = _KINDS.get(entry.channel)
-        if kind is None:  # of a later version
+    def _count(self, entry: Entry, number: int) -> None:
+        """Take in an entry while a file is checked."""
+        kind, place = _KINDS.get(entry.channel), (number, entry.place)
+        if kind is None or (number and kind is Run):  # of a later version, or repeated
             return
         self.counts[kind] += 1
         if kind is Features:
-            if (
-                not self._features
-            ):  # an earlier version of the protocol is rejected before anything is played or learned
-                self._decode(entry, Features)
+            if not self._features:  # an earlier protocol is rejected before anything is played or learned
+                _decode(self.files[number], entry, Features)
             for places in (self._features, *self._models.values()):
                 _drop_from(places, entry.sequence)
-            self._features.append((entry.sequence, entry.place))
+            self._features.append((entry.sequence, place))
         elif kind is Model:  # a restarted compressor may have it trained again
-            model = self._decode(entry, Model)
-            places, trained = self._models[model.object], model.frame + 1
-            _drop_from(places, trained)
-            places.append((trained, entry.place))
+            model = _decode(self.files[number], entry, Model)
+            models, trained = self._models[model.object], model.frame + 1
+            _drop_from(models, trained)
+            models.append((trained, place))
         elif kind is Track:
             self._tracks.add(entry.sequence)
         elif kind is End:
-            self.end = self._decode(entry, End)
-
-    def _measure_tail(self, file: BinaryIO) -> None:
-        """Count the bytes after the last whole message that are not the index."""
-        end = end_of_data(file)
-        if end is not None and end >= self.size:
-            self.damaged, self.torn = self.damaged + end - self.size, 0
-        else:
-            self.torn = file.seek(0, os.SEEK_END) - self.size
+            self.end = _decode(self.files[number], entry, End)
 
     def _missing(self, seqs: set[int]) -> int:
         last = self.end.seq - 1 if self.end else max(seqs, default=0)
         return last - len(seqs)
 
 
-def _drop_from(places: list[tuple[int, int]], seq: int) -> None:
+def _drop_from(places: list[tuple[int, _Place]], seq: int) -> None:
     """Remove the places of a `seq` and of all later ones."""
     while places and places[-1][0] >= seq:
         places.pop()
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    """Yield the names of the files of a series: walk.mcap, walk-2.mcap, walk-3.mcap ..."""
+    yield path
+    for number in count(2):
+        yield path.with_name(f"{path.stem}-{number}{path.suffix}")
+
+
+def _further(path: Path, metadata: dict[str, str]) -> Iterator[Path]:
+    """Yield the further files of a recording; also one whose beginning is damaged, so that it does not say of what."""
+    for other in islice(_numbered(path), 1, None):
+        if not other.exists():
+            return
+        with other.open("rb") as file:
+            if file.read(len(MAGIC)) == MAGIC:
+                first = next(entries(file), None)
+                if first is None or _KINDS.get(first.channel) is not Run or first.metadata == metadata:
+                    yield other
+
+
+def _opening(path: Path) -> tuple[Run, dict[str, str]]:
+    """Return the settings in the first message of a file, and the metadata of its topics."""
+    with _open(path) as file:
+        first = next(entries(file), None)
+    if first is None or _KINDS.get(first.channel) is not Run:
+        raise RecordingError(f"{path} holds no settings of a run: it was cut off or damaged at its start")
+    return _decode(path, first, Run), first.metadata
+
+
+def _open(path: Path) -> BinaryIO:
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise RecordingError(f"cannot read the recording {path}: {error.strerror}") from None
+    if file.read(len(MAGIC)) != MAGIC:
+        file.close()
+        raise RecordingError(f"{path} is no recording of this catstream: `catstream record` makes one")
+    return file
+
+
+def _decode(path: Path, entry: Entry, kind: type[_Kind]) -> _Kind:
+    try:
+        return decode_json(entry.data, kind) if TOPICS[kind].encoding == "json" else decode(entry.data, kind)
+    except ProtocolError as error:
+        raise RecordingError(
+            f"{path} holds a message at byte {entry.place} that this version of catstream cannot read: {error}"
+        ) from None
