@@ -7,9 +7,11 @@ from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.video.annotate import AnnotatedVideo
+from catstream.video.annotate import draw, drawn_size
 from catstream.video.frames import RATE, Frame
+from catstream.video.palette import Colours
 from catstream.video.source import is_live, open_source
+from catstream.video.writer import VideoWriter
 
 __all__ = ["VideoSink"]
 
@@ -39,8 +41,10 @@ class VideoSink:
         self._frames = open_source(source, part=part, image_rate=image_rate, skip_damaged=True, resize=True)
         self._frame: Frame | None = None  # the last one that has a track, which is not in the video yet
         self._tracks: list[Track] = []
+        self._colours = Colours()
         try:
-            self._video = AnnotatedVideo(path, self._frames.rate, self._frames.size, sound=self._frames.sound)
+            size = drawn_size(self._frames.size)
+            self._video = VideoWriter(path, self._frames.rate, size, sound=self._frames.sound)
         except VideoError:
             self._frames.close()
             raise
@@ -69,7 +73,8 @@ class VideoSink:
         frame, tracks = self._frame, self._tracks
         self._frame, self._tracks = None, []
         if frame is not None:
-            self._video.write(frame.image, tracks, tracks[0].time)
+            self._colours.keep(track.object for track in tracks)
+            self._video.write(draw(frame.image, tracks, self._colours), tracks[0].time)
 
     def _read(self, number: int) -> Frame:
         for frame in self._frames:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Self
 
 import cv2
 import numpy as np
@@ -15,9 +13,8 @@ from catstream.box import Box
 from catstream.messages.kinds import Preview, Track
 from catstream.messages.names import UNNAMED
 from catstream.video.palette import Colours, rgb
-from catstream.video.writer import VideoWriter
 
-__all__ = ["AnnotatedVideo", "draw", "draw_boxes", "draw_preview", "thumbnail"]
+__all__ = ["draw", "draw_boxes", "draw_preview", "drawn_size", "thumbnail"]
 
 #: Blue, green, red.
 _Point = tuple[float, float]
@@ -67,6 +64,12 @@ def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.nda
     else:
         _draw_scores(canvas[height:], drawn, unit)
     return canvas
+
+
+def drawn_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Return width and height in pixels of what `draw` returns for a frame of this width and height."""
+    width, height = size
+    return width, height + _text_height(width)
 
 
 def draw_preview(preview: Preview, tracks: Sequence[Track], colours: Colours) -> bytes:
@@ -239,40 +242,3 @@ def _draw_text(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -
     start = width - _text_width(end, unit) - round(10 * unit)
     if start > number + _text_width(score, unit):
         _write(canvas, end, start, unit)
-
-
-class AnnotatedVideo:
-    """Writes an MP4 of frames with their tracks drawn in, by `catstream.video.writer.VideoWriter`; a context manager.
-
-    Parameters
-    ----------
-    path : file to write
-    rate : frames per second, on average
-    size : (width, height) of the frames in pixels
-    sound : video file whose sound is copied, None for no sound
-
-    Raises
-    ------
-    VideoError
-        If the file cannot be written.
-    """
-
-    def __init__(self, path: str | Path, rate: float, size: tuple[int, int], *, sound: Path | None = None) -> None:
-        width, height = size
-        self._colours = Colours()
-        self._writer = VideoWriter(path, rate, (width, height + _text_height(width)), sound=sound)
-
-    def write(self, image: np.ndarray, tracks: Sequence[Track], time: float | None = None) -> None:
-        """Add a frame, uint8 (h, w, 3), with its tracks. `time` is as in `VideoWriter.write`."""
-        self._colours.keep(track.object for track in tracks)
-        self._writer.write(draw(image, tracks, self._colours), time)
-
-    def close(self) -> None:
-        """Finish the file and give it its final name."""
-        self._writer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

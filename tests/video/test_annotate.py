@@ -12,9 +12,10 @@ import pytest
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import State, Track
-from catstream.video.annotate import AnnotatedVideo, draw, thumbnail
+from catstream.video.annotate import draw, drawn_size, thumbnail
 from catstream.video.palette import Colours, rgb
 from catstream.video.source import open_source
+from catstream.video.writer import VideoWriter
 
 BOX = Box(40, 30, 60, 40)
 
@@ -28,7 +29,8 @@ def track(state: State = "present", box: Box | None = BOX, frame: int = 7) -> Tr
 def test_drawing_does_not_change_the_frame(state, size):
     image = np.full((size[1], size[0], 3), 128, np.uint8)
     drawn = draw(image, [track(state, None if state == "absent" else BOX)], Colours())
-    assert drawn.shape[1:] == image.shape[1:]
+    assert (drawn.shape[1::-1], drawn.shape[2]) == (drawn_size(size), 3)
+    assert drawn.shape[1] == size[0]
     assert (image == 128).all()
     assert (drawn[25:35, 35:45] != 128).any() == (state != "absent")
     assert (drawn[size[1] :] != 128).any()
@@ -75,24 +77,23 @@ def test_many_objects_with_long_names_can_be_drawn_in_any_picture(size, box):
 def test_the_video_has_each_frame_written_at_any_size(tmp_path, size):
     path = tmp_path / "deep" / "out.mp4"
     image = np.full((size[1], size[0], 3), 128, np.uint8)
-    with AnnotatedVideo(path, 29.97, size) as video:
-        for frame in range(9):
-            video.write(image, [track(frame=frame)])
+    with VideoWriter(path, 29.97, size) as video:
+        for _ in range(9):
+            video.write(image)
         assert not path.exists()
     with open_source(path) as source:
         assert source.rate == pytest.approx(29.97)
         width, height = source.size
-        shape = draw(image, [track()], Colours()).shape
-        assert (height - shape[0], width - shape[1]) == (shape[0] % 2, shape[1] % 2)
+        assert (width, height) == tuple(side + side % 2 for side in size)
         assert sum(1 for _ in source) == 9
     assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
 
 
 def test_frames_keep_the_time_stamps_of_the_source(tmp_path):
     times = [2.0, 2.04, 2.5, 2.52, 9.0]
-    with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)) as video:
-        for frame, time in enumerate(times):
-            video.write(np.zeros((64, 64, 3), np.uint8), [track(frame=frame)], time)
+    with VideoWriter(tmp_path / "out.mp4", 25, (64, 64)) as video:
+        for time in times:
+            video.write(np.zeros((64, 64, 3), np.uint8), time)
     with open_source(tmp_path / "out.mp4") as source:
         assert [frame.time + 2 for frame in source] == pytest.approx(times, abs=0.001)
 
@@ -119,9 +120,9 @@ def with_sound(tmp_path):
 @pytest.mark.parametrize("first", [0, 25])
 def test_the_sound_of_the_source_keeps_its_time(tmp_path, with_sound, first):
     source = open_source(with_sound, part=slice(first, None))
-    with source, AnnotatedVideo(tmp_path / "out.mp4", source.rate, source.size, sound=source.sound) as video:
+    with source, VideoWriter(tmp_path / "out.mp4", source.rate, source.size, sound=source.sound) as video:
         for frame in source:
-            video.write(frame.image, [track(frame=frame.number)], frame.time)
+            video.write(frame.image, frame.time)
     with av.open(str(tmp_path / "out.mp4")) as container:
         heard = [(frame.time, np.abs(frame.to_ndarray()).max() > 0.5) for frame in container.decode(audio=0)]
     assert min(time for time, loud in heard if loud) == pytest.approx(2 - first / 25, abs=0.15)
@@ -129,15 +130,15 @@ def test_the_sound_of_the_source_keeps_its_time(tmp_path, with_sound, first):
 
 
 def test_a_video_without_frames_leaves_no_file(tmp_path):
-    with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)):
+    with VideoWriter(tmp_path / "out.mp4", 25, (64, 64)):
         pass
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_interrupted_run_keeps_its_video(tmp_path):
     def run():
-        with AnnotatedVideo(tmp_path / "out.mp4", 25, (64, 64)) as video:
-            video.write(np.zeros((64, 64, 3), np.uint8), [track()])
+        with VideoWriter(tmp_path / "out.mp4", 25, (64, 64)) as video:
+            video.write(np.zeros((64, 64, 3), np.uint8))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -151,12 +152,12 @@ def test_a_full_disk_is_one_line_of_error_and_no_video_is_left(tmp_path, rng, fu
     image = rng.integers(0, 256, (240, 320, 3), np.uint8)  # noise, which no codec makes small
 
     def run():
-        with AnnotatedVideo(tmp_path / "out.mp4", 25, (320, 240)) as video:
-            for frame in range(50):  # the encoder keeps some back
-                video.write(image, [track(frame=frame)])
+        with VideoWriter(tmp_path / "out.mp4", 25, (320, 240)) as video:
+            for _ in range(50):  # the encoder keeps some back
+                video.write(image)
             full(tmp_path / "out.mp4.part")
-            for frame in range(frames):
-                video.write(image, [track(frame=frame)])
+            for _ in range(frames):
+                video.write(image)
 
     with pytest.raises(VideoError, match=r"cannot write the video .* any more: No space left on device$"):
         run()
@@ -166,7 +167,7 @@ def test_a_full_disk_is_one_line_of_error_and_no_video_is_left(tmp_path, rng, fu
 def test_a_path_that_cannot_be_written_is_an_error_at_once(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(VideoError, match="cannot write the video"):
-        AnnotatedVideo(tmp_path / "file" / "out.mp4", 25, (64, 64))
+        VideoWriter(tmp_path / "file" / "out.mp4", 25, (64, 64))
 
 
 def test_a_thumbnail_shows_both_boxes():
