@@ -204,7 +204,7 @@ def decode_json(data: bytes, kind: type[Message]) -> Message:
     """
     try:
         message = msgspec.json.decode(data, type=kind)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ProtocolError(
             f"expected {kind.__name__.lower()} in JSON, got {len(data)} bytes: {error}", "json"
         ) from None

@@ -321,6 +321,12 @@ def test_a_message_that_this_version_cannot_read_is_an_error_of_one_line(tmp_pat
         Recording(path)
 
 
+def test_text_that_is_not_utf_8_is_an_error_of_one_line(tmp_path):
+    path = with_message(tmp_path, End, b'{"seq": 1, "reason": "\x95"}')
+    with pytest.raises(RecordingError, match=r"holds a message at byte .* cannot read: expected end in JSON"):
+        Recording(path)
+
+
 def test_a_file_that_is_not_a_recording_is_rejected(tmp_path):
     (tmp_path / "video.mp4").write_bytes(b"something else entirely")
     with pytest.raises(RecordingError, match="is no recording"):

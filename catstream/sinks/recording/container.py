@@ -181,7 +181,7 @@ def entry_at(file: BinaryIO, place: int) -> Entry | None:
         return None
     try:
         *records, message = breakup_chunk(Chunk("", data, end, start, check, size))
-    except (McapError, ValueError, struct.error):
+    except (McapError, OverflowError, ValueError, struct.error):  # of another program, or forged
         return None
     if not isinstance(message, Message) or any(isinstance(record, Message) for record in records):
         return None

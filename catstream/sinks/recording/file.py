@@ -156,7 +156,7 @@ class RecordingWriter:
 
     def _lock(self) -> None:
         """Keep other processes from recording to this series as long as this object is open."""
-        if not lock(self._stack.enter_context(self.path.open("rb")).fileno()):
+        if not lock(self._stack.enter_context(_open(self.path)).fileno()):
             raise RecordingError(f"another process records to {self.path}: give another name")
 
     def __enter__(self) -> Self:
