@@ -18,8 +18,7 @@ from table import Table, command, publish
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.summaries.images import describe
-from catstream.applications.summaries.selection import RowSelection
-from catstream.applications.summaries.subset import choose
+from catstream.applications.summaries.selection import RowSelection, choose
 
 COLUMNS = (
     "collection",
@@ -86,7 +85,7 @@ def selected(rows: np.ndarray, k: int) -> list[int]:
     selection = RowSelection[int](k)
     for number, row in enumerate(rows):
         selection.add(row, number)
-    return [row.key for row in selection.selected().rows]
+    return selection.selected().keys
 
 
 def nearest_to_means(rows: np.ndarray, k: int) -> list[int]:

@@ -140,9 +140,8 @@ def _progress(doing: str, things: str, console: Console) -> Progress:
 def _of_images(path: Path, count: int, console: Console) -> Sheet:
     from catstream.applications.summaries.collection import Collection, Origin
     from catstream.applications.summaries.images import describe
-    from catstream.applications.summaries.pictures import WIDTH
     from catstream.applications.summaries.selection import RowSelection
-    from catstream.applications.summaries.sheet import sheet_of_images
+    from catstream.applications.summaries.sheet import WIDTH, sheet_of_images
     from catstream.numerics.threads import one_thread
     from catstream.video.preview import jpeg
 
@@ -153,7 +152,7 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
             selection.add(describe(image), (origin, jpeg(image, WIDTH)))
             progress.update(
                 task,
-                total=len(collection.files),
+                total=len(collection.names),
                 completed=collection.opened,
                 description=f"{selection.count} images read",
             )
@@ -184,15 +183,14 @@ def _tracked(job: Job, folder: Path, console: Console) -> Recording:
 
 
 def _of_recording(recording: Recording, count: int, name: str | None, source: str | None, console: Console) -> Sheet:
-    from catstream.applications.summaries.pictures import pictures_of, source_of
-    from catstream.applications.summaries.sheet import sheet_of_frames
+    from catstream.applications.summaries.sheet import pictures_of, sheet_of_frames
     from catstream.applications.summaries.taught import most_taught, taught_frames
     from catstream.messages.kinds import Features
     from catstream.numerics.threads import one_thread
     from catstream.sinks.recording.learning import require_features
 
     require_features(recording, incomplete=True)
-    settings, source = recording.settings, source or source_of(recording)
+    settings, source = recording.settings, source or _source_of(recording)
     with _progress("comparing", "frames", console) as progress, one_thread():
         (task,) = progress.task_ids
         progress.update(task, total=recording.counts[Features])
@@ -207,6 +205,14 @@ def _of_recording(recording: Recording, count: int, name: str | None, source: st
     except VideoError as error:
         console.print(f"the sheet has no pictures: {error}", style="yellow")
     return sheet_of_frames(Path(source or recording.path).stem, frames, len(measured), source, pictures)
+
+
+def _source_of(recording: Recording) -> str:
+    """Return the source that the detector reported; empty if the recording does not name it."""
+    from catstream.messages.kinds import Health
+
+    reports = (message for _, message in recording.messages() if isinstance(message, Health))
+    return next((report.source for report in reports if report.source), "")
 
 
 def _object_of(objects: list[str], name: str | None) -> str:

@@ -68,10 +68,18 @@ def test_every_frame_of_a_video_is_an_image_and_a_file_that_is_no_video_is_named
 
 @pytest.mark.parametrize(
     ("name", "problem"),
-    [("", "there are no images or videos in"), ("gone", "there is no folder or video"), ("notes.txt", "is neither an")],
+    [
+        ("", "hold neither images nor videos"),
+        ("gone", "there is no file or folder"),
+        ("notes.txt", "give a folder of images, or a video file"),
+        ("torn.jpg", "torn.jpg: not an image that can be read: give a folder"),
+    ],
 )
 def test_a_path_without_images_is_an_error_of_one_line(name, problem, tmp_path):
-    (tmp_path / "notes.txt").write_text("no image")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for file in ("notes.txt", "torn.jpg"):
+        (tmp_path / file).write_text("no image")
     with pytest.raises(VideoError, match=problem) as error:
-        Collection(tmp_path / name)
+        list(Collection(tmp_path / name if name else folder))
     assert "\n" not in str(error.value)

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from catstream.applications.summaries.selection import RowSelection, Selection
-from catstream.applications.summaries.subset import choose, exchange
+from catstream.applications.summaries.selection import RowSelection, Selection, choose, exchange
 from catstream.errors import SettingsError
 
 ROUNDING = 1e-5  # of float32
@@ -34,16 +33,12 @@ def selected(rows: np.ndarray, k: int, size: int | None = None) -> Selection[int
     return selection.selected()
 
 
-def numbers_of(selection: Selection[int]) -> list[int]:
-    return [row.key for row in selection.rows]
-
-
 @pytest.mark.parametrize("k", [1, 4, 10])
 def test_the_energy_kept_lies_within_the_certificate(rows, k):
     selection = selected(rows, k, size=20)  # reduced five times
-    truth = kept(rows, numbers_of(selection))
+    truth = kept(rows, selection.keys)
     assert selection.kept - ROUNDING <= truth <= selection.kept_at_most + ROUNDING
-    assert_allclose(sum(row.energy for row in selection.rows), selection.kept)
+    assert_allclose(sum(selection.energies), selection.kept)
 
 
 @pytest.mark.parametrize("k", [2, 6, 12])
@@ -51,7 +46,7 @@ def test_one_pass_keeps_nearly_as_much_as_the_greedy_choice_from_all_rows_and_mo
     gram = rows.astype(np.float64) @ rows.T.astype(np.float64)
     greedy = kept(rows, choose(gram, gram, k)[0])
     random = np.mean([kept(rows, rng.choice(len(rows), k, replace=False).tolist()) for _ in range(10)])
-    ours = kept(rows, numbers_of(selected(rows, k, size=24)))
+    ours = kept(rows, selected(rows, k, size=24).keys)
     assert ours > random
     assert ours > greedy - 0.1 * (greedy - random)
 
@@ -75,7 +70,7 @@ def test_a_row_of_each_group_is_selected(rng):
     directions = np.linalg.qr(rng.normal(size=(40, 5)))[0].T
     groups = rng.integers(0, 5, 300)
     rows = directions[groups] + 0.01 * rng.normal(size=(300, 40))
-    assert sorted(groups[numbers_of(selected(rows, 5, size=16))]) == [0, 1, 2, 3, 4]
+    assert sorted(groups[selected(rows, 5, size=16).keys]) == [0, 1, 2, 3, 4]
 
 
 def test_energies_fall_and_the_stream_may_continue(rows):
@@ -85,20 +80,20 @@ def test_energies_fall_and_the_stream_may_continue(rows):
         if number in (40, 77):
             early = selection.selected()
             assert early.count == number + 1
-            assert max(numbers_of(early)) <= number
-    energies = [row.energy for row in selection.selected().rows]
+            assert max(early.keys) <= number
+    energies = selection.selected().energies
     assert energies == sorted(energies, reverse=True)
     assert selection.selected() == selection.selected()
 
 
 def test_equal_rows_complete_the_number_with_no_energy():
     selection = selected(np.ones((40, 6)), 3, size=4)
-    assert len(set(numbers_of(selection))) == 3
-    assert_allclose([row.energy for row in selection.rows], [1, 0, 0], atol=ROUNDING)
+    assert len(set(selection.keys)) == 3
+    assert_allclose(selection.energies, [1, 0, 0], atol=ROUNDING)
 
 
 def test_rows_without_energy_can_be_selected():
-    assert len(selected(np.zeros((9, 6)), 2, size=4).rows) == 2
+    assert len(selected(np.zeros((9, 6)), 2, size=4).keys) == 2
 
 
 @given(seeds, st.integers(1, 6))

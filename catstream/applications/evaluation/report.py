@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from html import escape
@@ -14,7 +13,7 @@ from catstream.applications.evaluation.failures import FailureStrip, failure_str
 from catstream.applications.evaluation.metrics import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.applications.evaluation.summary import MEASURES, Row, by_attribute, describe_flips, mean_of, rows_of
-from catstream.applications.html.page import table, write_page
+from catstream.applications.html.page import figure, table, write_page
 from catstream.applications.html.plots import SHARES, Axis, plot
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
@@ -142,11 +141,8 @@ def _share(value: float | None) -> str:
 
 
 def _strip_html(strip: FailureStrip) -> str:
-    run, pictures = strip.run, []
-    for row, jpeg in strip.pictures:
-        number = f"frame {run.start.frame + row}"
-        source = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
-        pictures.append(f'<figure><img alt="{number}" src="{source}"><figcaption>{number}</figcaption></figure>')
+    run = strip.run
+    pictures = [figure(jpeg, f"frame {run.start.frame + row}") for row, jpeg in strip.pictures]
     return (
         f"<p><b>{escape(run.name)}</b>, {run.tracker}: wrong for {strip.length} frames from frame "
         f"{run.start.frame + strip.first} on; success {run.score().success:.3f}</p>\n"

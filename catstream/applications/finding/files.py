@@ -32,7 +32,7 @@ class File:
     @property
     def signature(self) -> list[int]:
         """Number of files, their total size, and the newest time of modification: it differs if the file changed."""
-        states = [path.stat() for path in self._images() or [self.path]]
+        states = [path.stat() for path in self.paths()]
         return [len(states), sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)]
 
     def frames(
@@ -60,7 +60,7 @@ class File:
                 with closing(read_ahead(source)) as frames:
                     yield from ((frame, "") for frame in frames)
             return
-        images = self._images()
+        images = self.paths()
         opened(settings.image_rate, len(images))
         for number, path in enumerate(images[start:], start):
             image = read_image(path)
@@ -69,9 +69,8 @@ class File:
             else:
                 yield Frame(number, number / settings.image_rate, image), path.name if self.kind == "images" else ""
 
-    def _images(self) -> list[Path]:
-        if self.kind == "video":
-            return []
+    def paths(self) -> list[Path]:
+        """The video, or the images in order."""
         return image_files(self.path) if self.kind == "images" else [self.path]
 
 
@@ -88,7 +87,7 @@ def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
     found: dict[File, None] = {}
     for path in paths:
         if is_live(str(path)):
-            raise VideoError(f"{path} is a live source, and only files are searched: record it to a video first")
+            raise VideoError(f"{path} is a live source: record it to a video first, and give the video")
         found |= dict.fromkeys(_files(Path(path)))
     return list(found)
 

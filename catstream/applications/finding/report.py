@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -10,7 +9,7 @@ from pathlib import Path
 
 from catstream.applications.finding.log import FileResult
 from catstream.applications.finding.sightings import Interval
-from catstream.applications.html.page import table, write_page
+from catstream.applications.html.page import figure, table, write_page
 from catstream.applications.html.timeline import Bar, clock, legend, timeline
 from catstream.video.palette import Colours
 
@@ -86,13 +85,8 @@ def _sheet(name: str, results: list[FileResult], names: dict[str, str]) -> list[
 
 def _figure(interval: Interval, names: dict[str, str]) -> str:
     best = interval.best
-    file, place = names[best.file], best.image or clock(best.time)
-    source = f"data:image/jpeg;base64,{base64.b64encode(interval.picture).decode('ascii')}"
-    return (
-        f'<figure><img alt="{escape(best.object)} in {escape(file)}" src="{source}"><figcaption>'
-        f'<b title="{escape(best.file)}">{escape(file)}</b>{escape(place)}, score {best.score:.2f}</figcaption>'
-        "</figure>"
-    )
+    caption = f"{best.image or clock(best.time)}, score {best.score:.2f}"
+    return figure(interval.picture, names[best.file], caption, best.file)
 
 
 def _timeline(result: FileResult, objects: Sequence[str], names: dict[str, str], colours: dict[str, str]) -> str:

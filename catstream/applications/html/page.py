@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 from catstream.errors import VideoError
 from catstream.messages.storage import write_atomically
 
-__all__ = ["table", "write_page"]
+__all__ = ["figure", "table", "write_page"]
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8881; }
@@ -62,6 +63,19 @@ def table(heads: Iterable[str], rows: Iterable[Iterable[object]], *, texts: int 
     return "\n".join(
         ['<div class="wide"><table>', f"<tr>{line('th', map(escape, heads))}</tr>", *marked, "</table></div>"]
     )
+
+
+def figure(jpeg: bytes | None, title: str, caption: str = "", tooltip: str = "") -> str:
+    """Return a picture with a title and a caption below it; without a JPEG file, the title stands below a blank one.
+
+    tooltip : shown if the pointer is over the title, by default the title itself
+    """
+    title, caption, tooltip = escape(title), escape(caption), escape(tooltip or title)
+    shown = '<div class="missing">no picture</div>'
+    if jpeg is not None:
+        data = base64.b64encode(jpeg).decode("ascii")
+        shown = f'<img src="data:image/jpeg;base64,{data}" alt="{title}">'
+    return f'<figure>{shown}<figcaption><b title="{tooltip}">{title}</b>{caption}</figcaption></figure>'
 
 
 def write_page(path: Path, title: str, body: Iterable[str]) -> Path:

@@ -1,4 +1,4 @@
-"""A collection of images: the files of a folder and its subfolders, and every frame of its videos."""
+"""A collection of images: the images of a folder and its subfolders, and every frame of its videos."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from catstream.applications.finding.files import find_files
 from catstream.errors import VideoError
-from catstream.video.source import IMAGES, VIDEOS, is_live, natural_order, open_source, read_image
+from catstream.video.source import IMAGES, open_source, read_image
 
 __all__ = ["Collection", "Origin"]
 
@@ -33,62 +34,40 @@ class Collection:
 
     Attributes
     ----------
-    files, names : files of the collection, and their paths relative to the folder
+    names : paths of the images and videos, relative to the folder
     opened : number of files that were opened
     skipped : descriptions of the images and videos that could not be read, in order
 
     Raises
     ------
     VideoError
-        If there are no images.
+        If there are no images; while iterating, if the only file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
-        self.files = _files(path)
+        self._paths = [each for file in find_files([path]) for each in file.paths()]
+        self.names = [str(each.relative_to(path if path.is_dir() else path.parent)) for each in self._paths]
         self.opened = 0
         self.skipped: list[str] = []
-        folder = path if path.is_dir() else path.parent
-        self.names = [str(file.relative_to(folder)) for file in self.files]
 
     def __iter__(self) -> Iterator[tuple[Origin, np.ndarray]]:
-        for file, name in zip(self.files, self.names, strict=True):
+        for path, name in zip(self._paths, self.names, strict=True):
             self.opened += 1
-            if file.suffix.lower() in VIDEOS:
-                yield from self._frames(file, name)
-            elif (image := read_image(file)) is not None:
-                yield Origin(name), image
-            else:
-                self.skipped.append(f"{name}: not an image that can be read")
+            try:
+                if path.suffix.lower() not in IMAGES:
+                    yield from self._frames(path, name)
+                elif (image := read_image(path)) is not None:
+                    yield Origin(name), image
+                else:
+                    raise VideoError("not an image that can be read")
+            except VideoError as error:
+                if len(self.names) == 1:
+                    raise VideoError(f"{name}: {error}: give a folder of images, or a video file") from None
+                self.skipped.append(f"{name}: {error}")
 
-    def _frames(self, file: Path, name: str) -> Iterator[tuple[Origin, np.ndarray]]:
-        try:
-            with open_source(file, skip_damaged=True) as source:
-                for frame in source:
-                    yield Origin(name, frame.number, frame.time), frame.image
-                if damaged := source.counters.get("damaged"):
-                    self.skipped.append(f"{name}: {damaged:.0f} damaged frames")
-        except VideoError as error:
-            self.skipped.append(f"{name}: {error}")
-
-
-def _files(path: Path) -> list[Path]:
-    kinds = IMAGES | VIDEOS
-    if is_live(str(path)):
-        raise VideoError(f"{str(path)!r} is a live source: record it to a file first, and summarise the file")
-    if not path.exists():
-        raise VideoError(f"there is no folder or video {str(path)!r}: give a folder of images, or a video file")
-    if path.is_file():
-        if path.suffix.lower() not in kinds:
-            raise VideoError(f"{str(path)!r} is neither an image nor a video: give a folder of images, or a video file")
-        return [path]
-    found = [
-        file
-        for file in path.rglob("*")
-        if file.suffix.lower() in kinds
-        and file.is_file()
-        and not any(part.startswith(".") for part in file.relative_to(path).parts)
-    ]
-    if not found:
-        shown = ", ".join(sorted(suffix[1:] for suffix in kinds))
-        raise VideoError(f"there are no images or videos in {str(path)!r} ({shown}): give another folder")
-    return sorted(found, key=lambda file: [natural_order(Path(part)) for part in file.relative_to(path).parts])
+    def _frames(self, path: Path, name: str) -> Iterator[tuple[Origin, np.ndarray]]:
+        with open_source(path, skip_damaged=True) as source:
+            for frame in source:
+                yield Origin(name, frame.number, frame.time), frame.image
+            if damaged := source.counters.get("damaged"):
+                self.skipped.append(f"{name}: {damaged:.0f} damaged frames")

@@ -112,8 +112,7 @@ def summarize(images: Iterable[np.ndarray | str | os.PathLike[str]], k: int) -> 
             selection.add(describe(as_bgr(_read(image))), number)
     with one_thread():
         found = selection.selected()
-    indices, energies = [row.key for row in found.rows], [row.energy for row in found.rows]
-    return ImageSummary(indices, energies, found.count, found.kept, found.kept_at_most)
+    return ImageSummary(found.keys, found.energies, found.count, found.kept, found.kept_at_most)
 
 
 def _read(image: np.ndarray | str | os.PathLike[str]) -> object:

@@ -1,4 +1,9 @@
-"""Selects the k rows of a stream that keep most of its energy, in one pass and constant memory."""
+"""Selects the k rows of a stream that keep most of its energy, in one pass and constant memory.
+
+The subset S of candidate rows X is chosen to maximise ||B P||^2, with P the projection on the span of S and a sketch B
+of the stream. Only the products X X' and B X' are used. The greedy choice is that of Farahat et al. (2011); the
+exchange afterwards replaces each chosen row by the candidate that keeps more.
+"""
 
 from __future__ import annotations
 
@@ -8,41 +13,34 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from catstream.applications.summaries.subset import choose, exchange
 from catstream.compression.reduce import energy
 from catstream.compression.tree import FrequentDirections
 from catstream.errors import SettingsError
 from catstream.numerics.arrays import Float32, Float64
 
-__all__ = ["RowSelection", "Selected", "Selection"]
+__all__ = ["RowSelection", "Selection", "choose", "exchange"]
 
 _Key = TypeVar("_Key")
 
 _LEAST_SIZE = 128  # rows of the sketch, if k is small
-
-
-@dataclass(frozen=True, slots=True)
-class Selected(Generic[_Key]):
-    """A selected row.
-
-    key     the object that was given with the row
-    energy  share of ||A||^2 that it adds to those of the rows selected before it
-    """
-
-    key: _Key
-    energy: float
+_DEPENDENT = 1e-6  # share of a row's energy outside a span below which it counts as inside
+_BETTER = 1 + 1e-9  # factor of energy by which an exchange has to be better, so that rounding does not go on for ever
+_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Selection(Generic[_Key]):
     """The selected rows of a stream A, in the order in which they add most energy.
 
+    keys          the objects that were given with them
+    energies      share of ||A||^2 that each adds to those before it
     count         number of rows of the stream
     kept          share ||A P||^2 / ||A||^2, with P the projection on the span of the selected rows: at least this
     kept_at_most  and at most this; the difference is the error of the sketch
     """
 
-    rows: tuple[Selected[_Key], ...]
+    keys: list[_Key]
+    energies: list[float]
     count: int
     kept: float
     kept_at_most: float
@@ -71,7 +69,7 @@ class RowSelection(Generic[_Key]):
     >>> selection = RowSelection(k=2)
     >>> for key, row in zip("abc", ([1, 0, 0], [0, 2, 0], [2, 0.1, 0])):
     ...     selection.add(row, key)
-    >>> [each.key for each in selection.selected().rows]
+    >>> selection.selected().keys
     ['c', 'b']
     """
 
@@ -119,11 +117,10 @@ class RowSelection(Generic[_Key]):
         order, energies = choose(gram[np.ix_(chosen, chosen)], products[:, chosen], len(chosen))
         whole = sum(node.energy for node in self._sketch.nodes) + energy(self._sketch.pending) or 1.0
         shares = [each / whole for each in energies] + [0.0] * (self._k - len(energies))
-        numbers = self._completed([chosen[place] for place in order], self._k)
-        rows = tuple(Selected(self._keys[number], share) for number, share in zip(numbers, shares, strict=True))
+        keys = [self._keys[number] for number in self._completed([chosen[place] for place in order], self._k)]
         kept = min(sum(shares), 1.0)
         error = min(1.0, self._k / (self._size + 1)) * max(self._sketch.dropped_energy, 0.0) / whole
-        return Selection(rows, self.count, kept, min(kept + error, 1.0))
+        return Selection(keys, shares, self.count, kept, min(kept + error, 1.0))
 
     def _insert(self) -> None:
         """Insert the new candidates into the sketch."""
@@ -147,3 +144,67 @@ class RowSelection(Generic[_Key]):
 
     def _keep(self, numbers: list[int]) -> None:
         self._old, self._keys = self._old[numbers], [self._keys[number] for number in numbers]
+
+
+def choose(gram: Float64, products: Float64, k: int) -> tuple[list[int], list[float]]:
+    """Choose at most `k` candidates one after the other, each time the one that adds most energy.
+
+    Costs O(k m (m + l)).
+
+    Parameters
+    ----------
+    gram : float64 (m, m), X X'
+    products : float64 (l, m), B X'
+
+    Returns
+    -------
+    chosen : their numbers, strongest first; fewer than `k` if the others are in the span of these
+    energies : energy of B that each adds to the ones before
+
+    >>> rows = np.array([[0, 2.0], [3, 0], [1, 0]])
+    >>> choose(rows @ rows.T, rows @ rows.T, 3)
+    ([1, 0], [10.0, 4.0])
+    """
+    gram, products, least = gram.copy(), products.copy(), _DEPENDENT * gram.diagonal()
+    chosen: list[int] = []
+    energies: list[float] = []
+    while len(chosen) < k:
+        own = gram.diagonal()
+        gains = np.divide(np.sum(products**2, axis=0), own, out=np.zeros(len(own)), where=own > least)
+        best = int(gains.argmax())
+        if not gains[best] > 0:
+            break
+        chosen.append(best)
+        energies.append(float(gains[best]))
+        inner, outer = gram[:, best] / np.sqrt(own[best]), products[:, best] / np.sqrt(own[best])
+        gram -= np.outer(inner, inner)
+        products -= np.outer(outer, inner)
+    return chosen, energies
+
+
+def exchange(gram: Float64, products: Float64, chosen: list[int]) -> list[int]:
+    """Replace chosen candidates, one at a time, as long as another one keeps more energy; at most a few rounds.
+
+    Costs O(k^2 m (k + l)) each round. The chosen rows have to be linearly independent, as those of `choose` are.
+    """
+    chosen = list(chosen)
+    for _ in range(_ROUNDS):
+        before = list(chosen)
+        for place, number in enumerate(before):
+            gains = _gains(gram, products, chosen[:place] + chosen[place + 1 :])
+            best = int(gains.argmax())
+            if gains[best] > _BETTER * gains[number]:
+                chosen[place] = best
+        if chosen == before:
+            break
+    return chosen
+
+
+def _gains(gram: Float64, products: Float64, chosen: list[int]) -> Float64:
+    """Energy that each candidate adds to the span of chosen ones; 0 for those."""
+    shares = np.linalg.solve(gram[np.ix_(chosen, chosen)], gram[chosen])
+    own = gram.diagonal() - np.sum(gram[chosen] * shares, axis=0)  # outside the span
+    rest = products - products[:, chosen] @ shares
+    outside = own > _DEPENDENT * gram.diagonal()
+    gains: Float64 = np.divide(np.sum(rest**2, axis=0), own, out=np.zeros(len(own)), where=outside)
+    return gains

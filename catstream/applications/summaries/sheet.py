@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from catstream.applications.html.page import write_page
+import numpy as np
+
+from catstream.applications.html.page import figure, write_page
 from catstream.applications.summaries.collection import Collection, Origin
 from catstream.applications.summaries.selection import Selection
 from catstream.applications.summaries.taught import TaughtFrame
 from catstream.errors import VideoError
 from catstream.messages.storage import write_atomically
+from catstream.video.annotate import thumbnail
+from catstream.video.source import is_live, open_source
 
-__all__ = ["Picture", "Sheet", "json_beside", "sheet_of_frames", "sheet_of_images"]
+__all__ = ["WIDTH", "Sheet", "json_beside", "pictures_of", "sheet_of_frames", "sheet_of_images"]
 
+#: Width of a picture in pixels.
+WIDTH = 420
 
-class Picture(NamedTuple):
-    """A picture on the sheet.
-
-    jpeg     JPEG file, None if the picture cannot be shown
-    title    first line below it
-    caption  second line
-    """
-
-    jpeg: bytes | None
-    title: str
-    caption: str
+_TOLERANCE_SECONDS = 1e-3
+_NO_BOX = np.full(4, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +33,13 @@ class Sheet:
     """The content of a contact sheet.
 
     about     paragraphs below the title
-    pictures  in the order in which they are shown
+    pictures  HTML elements in the order in which they are shown
     figures   content of the JSON file
     """
 
     title: str
     about: tuple[str, ...]
-    pictures: list[Picture]
+    pictures: list[str]
     figures: dict[str, Any]
 
     def save(self, path: Path) -> None:
@@ -56,9 +52,7 @@ class Sheet:
         """
         paragraphs = (f'<p class="about">{escape(text)}</p>' for text in self.about)
         heading = f"<h1>{escape(self.title)}</h1>"
-        write_page(
-            path, self.title, [heading, *paragraphs, '<div class="pictures">', *map(_figure, self.pictures), "</div>"]
-        )
+        write_page(path, self.title, [heading, *paragraphs, '<div class="pictures">', *self.pictures, "</div>"])
         try:
             write_atomically(json_beside(path), (json.dumps(self.figures, indent=1) + "\n").encode())
         except OSError as error:
@@ -73,21 +67,27 @@ def json_beside(path: Path) -> Path:
 def sheet_of_images(name: str, collection: Collection, selection: Selection[tuple[Origin, bytes]]) -> Sheet:
     """Return the sheet of the images that were selected from a collection, each with its JPEG, in their order there."""
     places = {each: place for place, each in enumerate(collection.names)}
-    rows = sorted(selection.rows, key=lambda row: (places[row.key[0].file], row.key[0].frame or 0))
+    images = [(*key, energy) for key, energy in zip(selection.keys, selection.energies, strict=True)]
+    images.sort(key=lambda image: (places[image[0].file], image[0].frame or 0))
     skipped = f"; {len(collection.skipped)} could not be read" * bool(collection.skipped)
+    pictures = []
+    for origin, jpeg, energy in images:
+        place = "" if origin.time is None else f"frame {origin.frame}, {origin.time:.2f} s; "
+        pictures.append(figure(jpeg, origin.file, f"{place}adds {100 * energy:.2f} %"))
     return Sheet(
         f"Summary of {name}",
         (
-            f"{len(rows)} of {selection.count} images keep {100 * selection.kept:.1f} % of the energy of all{skipped}.",
+            f"{len(images)} of {selection.count} images keep {100 * selection.kept:.1f} % of the energy of "
+            f"all{skipped}.",
             "An image adds the energy that is not kept by the selected images which add more.",
         ),
-        [Picture(row.key[1], row.key[0].file, _caption(row.key[0], row.energy)) for row in rows],
+        pictures,
         {
             "images": selection.count,
             "kept": selection.kept,
             "kept_at_most": selection.kept_at_most,
             "skipped": collection.skipped,
-            "selected": [asdict(row.key[0]) | {"energy": row.energy} for row in rows],
+            "selected": [asdict(origin) | {"energy": energy} for origin, _, energy in images],
         },
     )
 
@@ -104,7 +104,7 @@ def sheet_of_frames(
             "box is the one that was learned from.",
         ),
         [
-            Picture(
+            figure(
                 pictures.get(each.frame), f"frame {each.frame}", f"{each.time:.2f} s; {100 * each.novelty:.1f} % new"
             )
             for each in frames
@@ -113,15 +113,34 @@ def sheet_of_frames(
     )
 
 
-def _caption(origin: Origin, energy: float) -> str:
-    place = "" if origin.time is None else f"frame {origin.frame}, {origin.time:.2f} s; "
-    return f"{place}adds {100 * energy:.2f} %"
+def pictures_of(frames: list[TaughtFrame], source: str, image_rate: float) -> dict[int, bytes]:
+    """Read frames of a source, with the object's box drawn in.
 
+    The frames are found by their time, because the frames of a run are numbered from its first one.
 
-def _figure(picture: Picture) -> str:
-    title, caption = escape(picture.title), escape(picture.caption)
-    shown = '<div class="missing">no picture</div>'
-    if picture.jpeg is not None:
-        data = base64.b64encode(picture.jpeg).decode("ascii")
-        shown = f'<img src="data:image/jpeg;base64,{data}" alt="{title}">'
-    return f'<figure>{shown}<figcaption><b title="{title}">{title}</b>{caption}</figcaption></figure>'
+    Returns
+    -------
+    JPEG files by the number of the frame
+
+    Raises
+    ------
+    VideoError
+        If the source is live, cannot be read, or has no frame at one of these times.
+    """
+    if is_live(source):
+        raise VideoError(f"{source!r} is a live source, and its frames were not kept")
+    found: dict[int, bytes] = {}
+    waiting = sorted(frames, key=lambda frame: -frame.time)
+    with open_source(source, image_rate=image_rate, skip_damaged=True, resize=True) as images:
+        for image in images:
+            while waiting and waiting[-1].time < image.time - _TOLERANCE_SECONDS:
+                waiting.pop()
+            if waiting and abs(waiting[-1].time - image.time) <= _TOLERANCE_SECONDS:
+                frame = waiting.pop()
+                box = _NO_BOX if frame.box is None else np.array(frame.box, np.float64)
+                found[frame.frame] = thumbnail(image.image, _NO_BOX, box, WIDTH)
+            if not waiting:
+                break
+    if missing := len(frames) - len(found):
+        raise VideoError(f"{missing} of {len(frames)} frames are not in {source!r}: it is not the video of this run")
+    return found
