@@ -15,37 +15,22 @@ import cv2
 import numpy as np
 
 from catstream.box import Box
-from catstream.video.sprite import VISIBLE, Sprite, cut_out_dahlia, load_photograph
+from catstream.video.sprite import SIZE, VISIBLE, Lake, Sprite, cut_out_dahlia, load_photograph, resized
 from catstream.video.writer import VideoWriter
 
 __all__ = ["FRAMES", "NAMES", "RATE", "SIZE", "render", "write"]
 
-#: Number of frames, frames per second, and size (width, height) in pixels.
-FRAMES, RATE, SIZE = 300, 25.0, (640, 480)
+#: Number of frames, and frames per second.
+FRAMES, RATE = 300, 25.0
 
 #: Names of the objects, in the order in which they are painted: a later one is in front.
 NAMES = (
-    "anna",
-    "ben",
-    "carla",
-    "dan",
-    "eva",
-    "finn",
-    "gina",
-    "hugo",
-    "ida",
-    "jan",
-    "kim",
-    "lea",
-    "max",
-    "nora",
-    "oskar",
-    "pia",
+    *("anna", "ben", "carla", "dan", "eva", "finn", "gina", "hugo"),
+    *("ida", "jan", "kim", "lea", "max", "nora", "oskar", "pia"),
 )
 
 _COLUMNS = 4  # objects start in a grid
 _ZOOM = 1.7  # enlargement of the photograph of the lake
-_NOISE = 4.0  # standard deviation of the sensor noise, in grey levels
 _ALIKE = 25.0  # difference of the hue of objects that look alike, in degrees
 _SIDE = 160  # of a sprite, in pixels
 _OUTSIDE = (0.45, 0.65)  # part of the video in which every third object leaves the picture
@@ -71,16 +56,8 @@ def render(
         of it is visible
     """
     scene = _Scene(count, frames, seed)
-    across, down = size[0] / SIZE[0], size[1] / SIZE[1]
     for number in range(frames):
-        image, boxes = scene.render(number)
-        if size != SIZE:
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-            boxes = {
-                name: box and Box(box.x * across, box.y * down, box.w * across, box.h * down)
-                for name, box in boxes.items()
-            }
-        yield image, boxes
+        yield resized(*scene.render(number), size)
 
 
 def write(
@@ -128,20 +105,17 @@ class _Scene:
 
     def __init__(self, count: int, frames: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        lake, flower = load_photograph("china"), load_photograph("flower")
-        self.lake = cv2.resize(lake, None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_CUBIC).clip(0, 255)
-        self.sprites = [_sprite(number, lake, cut_out_dahlia(flower)) for number in range(count)]
+        photograph, dahlia = load_photograph("china"), cut_out_dahlia(load_photograph("flower"))
+        self.sprites = [_sprite(number, photograph, dahlia) for number in range(count)]
         self.paths = [_path(number, count, frames, rng) for number in range(count)]
+        self.lake = Lake(_ZOOM, rng)
         turn = 2 * np.pi * np.arange(frames) / 240
         self.camera = np.stack([150 + 90 * np.sin(turn), 90 + 60 * np.sin(1.3 * turn)], axis=1)
-        self.rng = rng
-        self.noise = rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
 
     def render(self, frame: int) -> tuple[np.ndarray, dict[str, Box | None]]:
         """Return the image of one frame in full size, and the box of each object."""
-        shift = np.array([[1, 0, -self.camera[frame][0]], [0, 1, -self.camera[frame][1]]])
-        image = cv2.warpAffine(self.lake, shift, SIZE, borderMode=cv2.BORDER_REFLECT_101)
-        free = np.ones(SIZE[::-1], np.float32)
+        left, top = self.camera[frame]
+        image, free = self.lake.seen(np.array([[1, 0, -left], [0, 1, -top]])), np.ones(SIZE[::-1], np.float32)
         view = np.array([[1.0, 0, 0], [0, 1, 0]])  # the paths are in the picture, not in the scene
         boxes: dict[str, Box | None] = {}
         for name, sprite, path in reversed(list(zip(NAMES, self.sprites, self.paths, strict=False))):
@@ -149,9 +123,7 @@ class _Scene:
             seen = sprite.paint(image, turn, free)
             free *= 1 - cv2.warpAffine(sprite.mask, turn, SIZE)
             boxes[name] = sprite.box(turn) if seen >= VISIBLE else None
-        y, x = self.rng.integers(SIZE[1]), self.rng.integers(SIZE[0])
-        image = image + self.noise[y : y + SIZE[1], x : x + SIZE[0]]
-        return image.clip(0, 255).astype(np.uint8), dict(reversed(boxes.items()))
+        return self.lake.with_noise(image), dict(reversed(boxes.items()))
 
 
 def _sprite(number: int, lake: np.ndarray, dahlia: Sprite) -> Sprite:

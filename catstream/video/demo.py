@@ -16,17 +16,17 @@ import cv2
 import numpy as np
 
 from catstream.box import Box
-from catstream.video.sprite import VISIBLE, cut_out_dahlia, load_photograph
+from catstream.messages.names import UNNAMED
+from catstream.video.sprite import SIZE, VISIBLE, Lake, cut_out_dahlia, load_photograph, resized
 from catstream.video.writer import VideoWriter
 
 __all__ = ["FRAMES", "RATE", "SIZE", "render", "write"]
 
-#: Number of different frames, frames per second, and full size (width, height) in pixels.
-FRAMES, RATE, SIZE = 600, 30.0, (640, 480)
+#: Number of different frames, and frames per second.
+FRAMES, RATE = 600, 30.0
 
 _ZOOM = 1.5  # enlargement of the photograph of the lake; coordinates below are in the enlarged photograph
 _BEHIND = 280  # the last frame in which the dahlia is behind the pagoda
-_NOISE = 4.0  # standard deviation of the sensor noise, in grey levels
 
 #: Key frames of the dahlia: frame, centre x and y, diameter, angle in degrees.
 _FLIGHT = np.array(
@@ -99,14 +99,10 @@ def render(
         it is visible
     """
     scene = _Scene(seed)
-    width, height = size
-    across, down = width / SIZE[0], height / SIZE[1]
     for number in range(begin, begin + frames):
         image, box = scene.render(FRAMES - 1 - abs(number % (2 * FRAMES - 2) - (FRAMES - 1)))
-        if (width, height) != SIZE:
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-            box = box and Box(box.x * across, box.y * down, box.w * across, box.h * down)
-        yield image, box
+        image, boxes = resized(image, {UNNAMED: box}, size)
+        yield image, boxes[UNNAMED]
 
 
 def write(
@@ -147,32 +143,26 @@ class _Scene:
     """Renders single frames from the two photographs; colours are float32, 0 to 255."""
 
     def __init__(self, seed: int) -> None:
-        lake, flower = load_photograph("china"), load_photograph("flower")
-        self.lake = cv2.resize(lake, None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_CUBIC).clip(0, 255)
-        pagoda = cv2.fillPoly(np.zeros(self.lake.shape[:2], np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
+        self.lake = Lake(_ZOOM, np.random.default_rng(seed))
+        shape = self.lake.picture.shape[:2]
+        pagoda = cv2.fillPoly(np.zeros(shape, np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
         self.pagoda = cv2.GaussianBlur(pagoda, (0, 0), 1.2)
-        self.dahlia = cut_out_dahlia(flower)
+        self.dahlia = cut_out_dahlia(load_photograph("flower"))
         self.decoy = replace(self.dahlia, colours=self.dahlia.colours[..., [2, 0, 1]] * np.float32(0.9))
         self.flight, self.away, self.camera = (_interpolate(keys) for keys in (_FLIGHT, _DECOY, _CAMERA))
-        self.rng = np.random.default_rng(seed)
-        self.noise = self.rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
 
     def render(self, frame: int) -> tuple[np.ndarray, Box | None]:
         """Return the image of one frame in full size, and the box."""
         left, top, light = self.camera[frame]
         sway = 3 * np.sin(frame / np.array([7.3, 5.1]))  # camera shake
         view = np.array([[1, 0, -left - sway[0]], [0, 1, -top - sway[1]]])  # lake -> picture
-        image = cv2.warpAffine(self.lake, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
-        front = cv2.warpAffine(self.pagoda, view, SIZE)
+        image, front = self.lake.seen(view), cv2.warpAffine(self.pagoda, view, SIZE)
 
         self.decoy.paint(image, self.decoy.turned(self.away[frame], view), 1 - front)
         turn = self.dahlia.turned(self.flight[frame], view)
         seen = self.dahlia.paint(image, turn, 1 - front if frame <= _BEHIND else np.ones_like(front))
-
-        y, x = self.rng.integers(SIZE[1]), self.rng.integers(SIZE[0])
-        image = image * np.float32(light) + self.noise[y : y + SIZE[1], x : x + SIZE[0]]
         box = self.dahlia.box(turn) if seen >= VISIBLE else None
-        return image.clip(0, 255).astype(np.uint8), box
+        return self.lake.with_noise(image * np.float32(light)), box
 
 
 def _interpolate(keys: np.ndarray) -> np.ndarray:

@@ -1,7 +1,11 @@
-"""Sprites: textured objects with a soft outline, cut out of the two photographs that scikit-learn ships."""
+"""What the rendered videos share: sprites and the lake, from the two photographs that scikit-learn ships.
+
+A sprite is a textured object with a soft outline that moves over the photograph of the lake.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,12 +15,16 @@ import numpy as np
 
 from catstream.box import Box
 
-__all__ = ["VISIBLE", "Sprite", "cut_out_dahlia", "load_photograph"]
+__all__ = ["SIZE", "VISIBLE", "Lake", "Sprite", "cut_out_dahlia", "load_photograph", "resized"]
+
+#: Full size (width, height) of the rendered images in pixels.
+SIZE = (640, 480)
 
 #: If a smaller share of a sprite is visible, its object counts as absent.
 VISIBLE = 0.1
 
 _DAHLIA = (308, 221)  # centre of the dahlia in its photograph, in pixels
+_NOISE = 4.0  # standard deviation of the sensor noise, in grey levels
 
 
 def load_photograph(name: str) -> np.ndarray:
@@ -87,6 +95,42 @@ class Sprite:
         """Return the top left and bottom right corners of the object in the picture."""
         points = self.outline @ turn[:, :2].T + turn[:, 2]
         return points.min(axis=0), points.max(axis=0)
+
+
+class Lake:
+    """The picture of the lake over which sprites move, and the sensor noise of the camera.
+
+    Parameters
+    ----------
+    zoom : enlargement of the photograph
+    rng : random numbers of the noise
+    """
+
+    def __init__(self, zoom: float, rng: np.random.Generator) -> None:
+        photograph = load_photograph("china")
+        self.picture = cv2.resize(photograph, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC).clip(0, 255)
+        self._rng = rng
+        self._noise = rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
+
+    def seen(self, view: np.ndarray) -> np.ndarray:
+        """Return the part of it that the camera sees, float32 (h, w, 3), 0 to 255; `view` maps it to the image."""
+        return cv2.warpAffine(self.picture, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
+
+    def with_noise(self, image: np.ndarray) -> np.ndarray:
+        """Return an image with noise, uint8."""
+        y, x = self._rng.integers(SIZE[1]), self._rng.integers(SIZE[0])
+        return (image + self._noise[y : y + SIZE[1], x : x + SIZE[0]]).clip(0, 255).astype(np.uint8)
+
+
+def resized(
+    image: np.ndarray, boxes: Mapping[str, Box | None], size: tuple[int, int]
+) -> tuple[np.ndarray, dict[str, Box | None]]:
+    """Return an image of full size and its boxes in another size; if it is not 4:3, they are stretched."""
+    if size == SIZE:
+        return image, dict(boxes)
+    x, y = size[0] / SIZE[0], size[1] / SIZE[1]
+    scaled = {name: box and Box(box.x * x, box.y * y, box.w * x, box.h * y) for name, box in boxes.items()}
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), scaled
 
 
 def cut_out_dahlia(photograph: np.ndarray) -> Sprite:
