@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from accuracy import MEANS, accuracy_command, changed, compared, described, difference, means, spread, videos
-from table import Table, publish
+from table import Table, benchmark
 
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
@@ -76,5 +76,4 @@ if __name__ == "__main__":
     parser.add_argument(
         "--only", nargs="+", metavar="WORD", help="only ingredients with one of these words in the name"
     )
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, parser)

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
+from groups import CHECK
 from sequences import sequences
 from table import command
 
@@ -20,14 +21,13 @@ from catstream.applications.evaluation.peers import PEERS, Peer
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.applications.evaluation.starts import Starts, choose_starts
 from catstream.applications.evaluation.summary import rows_of
-from catstream.errors import SettingsError, VideoError
+from catstream.errors import SettingsError
 from catstream.settings import Settings
 
 __all__ = [
     "accuracy_command",
     "available",
     "changed",
-    "check_names",
     "compared",
     "described",
     "difference",
@@ -56,9 +56,6 @@ def accuracy_command(about: str | None, starts: int = 1, *, kept: bool = True) -
 def many_sequences(parser: argparse.ArgumentParser, *, kept: bool = True) -> argparse.ArgumentParser:
     """Add the options that choose sequences and their frames, and, if runs are kept, their folder."""
     parser.add_argument("--group", choices=("all", "tuning", "check"), default="all", help="only these sequences")
-    parser.add_argument(
-        "--check", type=Path, metavar="FILE", help="names of the check sequences (default: check.txt in the data)"
-    )
     parser.add_argument("--frames", type=int, help="number of frames of each sequence (default: all)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes (default: %(default)s)")
     if kept:
@@ -71,30 +68,12 @@ def videos(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
     found = shortened(options, prefix)
     if options.quick or options.group == "all":
         return found
-    names = check_names(options)
-    return [one for one in found if (one.name in names) == (options.group == "check")]
+    return [one for one in found if (one.name in CHECK) == (options.group == "check")]
 
 
 def shortened(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
     """Return the sequences whose names begin with `prefix`, cut to the first `--frames`."""
     return [replace(found, boxes=found.boxes[: options.frames]) for found in sequences(options, prefix)]
-
-
-def check_names(options: argparse.Namespace) -> set[str]:
-    """Return the names of the check sequences, on which nothing is tuned; with --quick, none.
-
-    Raises
-    ------
-    VideoError
-        If there is no list.
-    """
-    if options.quick:
-        return set()
-    file = options.check or options.data / "check.txt"
-    try:
-        return set(file.read_text(encoding="utf-8").split())
-    except OSError as error:
-        raise VideoError(f"cannot read the check list {str(file)!r} ({error.strerror}): give it with --check") from None
 
 
 def available(names: Iterable[str], models: Path | None = None) -> tuple[list[str], str]:

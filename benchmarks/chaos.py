@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from arena import LINKS, Arena, small_disk
 from sequences import FIRST, named, objects, scratch
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.evaluation.metrics import score
@@ -324,10 +324,12 @@ def quantiles(recovery: dict[str, list[float]]) -> Iterator[tuple[str, int, floa
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument("--cycles", type=int, default=200, help="number of faults (default: %(default)s)")
-    parser.add_argument("--objects", type=int, default=1, help="number of objects (default: %(default)s)")
     parser.add_argument("--run", choices=list(RUNS), help="only this one of the two runs")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the schedule (default: %(default)s)")
-    options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the small disk is unmounted
-    publish(figures(options), options)
+    benchmark(
+        figures,
+        parser,
+        cycles=(200, "number of faults"),
+        objects=(1, "number of objects"),
+        seed=(0, "seed of the schedule"),
+    )

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from accuracy import many_sequences, videos
-from table import Cell, Table, command, publish
+from table import Cell, Table, benchmark, command
 
 from catstream.applications.evaluation.metrics import overlaps
 from catstream.applications.evaluation.onepass import evaluate
@@ -237,8 +237,9 @@ def state(run: EvaluationRun, frames: dict[str, list[Seen]], row: int) -> list[C
 
 
 if __name__ == "__main__":
-    parser = many_sequences(command(__doc__))
-    parser.add_argument("--jitter", type=int, default=7, help="number of first boxes (default: %(default)s)")
-    parser.add_argument("--strips", type=Path, metavar="FILE", help=f"write film strips of the {STRIPS} worst runs")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(
+        figures,
+        many_sequences(command(__doc__)),
+        jitter=(7, "number of first boxes"),
+        strips=(Path, f"write film strips of the {STRIPS} worst runs"),
+    )

@@ -21,7 +21,7 @@ from unittest.mock import patch
 
 import atheris
 import numpy as np
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 COMPILED = [f"catstream.features.{name}" for name in ("cells", "colours", "compiled", "hog")]  # by numba: no bytecode
 
@@ -251,6 +251,8 @@ def trial(name: str, inputs: int, folder: Path) -> None:
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
+    if options.trial:
+        trial(options.trial, options.inputs, options.folder)
     inputs = 1000 if options.quick else options.inputs
     rows = []
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None) as home:
@@ -277,13 +279,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument(
-        "--inputs", type=int, default=1_000_000, help="number of inputs for each decoder (default: %(default)s)"
-    )
     parser.add_argument("--only", nargs="*", metavar="NAME", help="only these decoders")
     parser.add_argument("--trial", metavar="NAME", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.trial:
-        trial(options.trial, options.inputs, options.folder)
-    publish(figures(options), options)
+    benchmark(figures, parser, inputs=(1_000_000, "number of inputs for each decoder"))

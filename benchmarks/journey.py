@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 import psutil
+from table import plots
 
+from catstream.messages.kinds import Track
+from catstream.messages.names import Boxes
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.source import ALL_FRAMES
@@ -31,7 +34,7 @@ class Look(NamedTuple):
 class Journey:
     """The measurements of one run.
 
-    boxes    a row a frame, x, y, w, h in pixels; NaN where absent
+    boxes    of the first object, a row a frame, x, y, w, h in pixels; NaN where absent
     moments  seconds from the start to the track of each frame
     looks    at each process, now and then
     """
@@ -60,44 +63,45 @@ class Journey:
 
 
 def travel(
-    source: str, box: Sequence[float], settings: Settings, watch: int = 250, part: slice = ALL_FRAMES
+    source: str,
+    boxes: Boxes,
+    settings: Settings,
+    watch: int = 250,
+    part: slice = ALL_FRAMES,
+    turn: Callable[[Mapping[str, Track]], None] = lambda _: None,
 ) -> Journey:
-    """Run a pipeline over its source or a part of it; measure the processes every `watch` frames."""
+    """Run a pipeline over its source or a part of it; measure the processes every `watch` frames.
+
+    turn : called with the tracks of each frame
+    """
     journey, begin = Journey(), perf_counter()
-    with Pipeline(source, box, settings, part=part) as pipeline:
-        for track in pipeline:
+    with Pipeline(source, boxes, settings, part=part) as pipeline:
+        for number, tracks in enumerate(pipeline.by_frame()):
             journey.moments.append(perf_counter() - begin)
-            journey.boxes.append(track.box or (np.nan,) * 4)
-            if track.frame % watch == 0:
+            journey.boxes.append(next(iter(tracks.values())).box or (np.nan,) * 4)
+            turn(tracks)
+            if number % watch == 0:
                 for name, pid in pipeline.pids.items():
                     with suppress(psutil.Error):  # the process has just ended
                         process = psutil.Process(pid)
                         seconds = sum(process.cpu_times()[:2])
-                        look = Look(track.frame, process.memory_info().rss / 1e6, seconds)
+                        look = Look(number, process.memory_info().rss / 1e6, seconds)
                         journey.looks.setdefault(name, []).append(look)
     return journey
 
 
 def draw(journeys: dict[str, Journey], file: Path, blocks: int = 80) -> None:
     """Plot against frames: median time per frame in blocks, processor time of each process per frame, and memory."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    figure, (time, work, memory) = pyplot.subplots(3, 1, sharex=True, figsize=(8, 8), layout="constrained")
-    for label, journey in journeys.items():
-        parts = np.array_split(journey.milliseconds, min(blocks, len(journey.milliseconds)))
-        time.plot(np.cumsum([len(part) for part in parts]), [np.median(part) for part in parts], label=label)
-        for name, looks in journey.looks.items():
-            work.plot(*journey.work(name), label=f"{label} {name}".strip())
-            memory.plot([look.frame for look in looks], [look.megabytes for look in looks])
-    time.set(ylabel="ms a frame (median)", ylim=(0, None))
-    work.set(ylabel="processor time, ms a frame", ylim=(0, None))
-    memory.set(ylabel="resident memory, MB", xlabel="frame", ylim=(0, None))
-    if len(journeys) > 1:
-        time.legend()
-    work.legend(fontsize="small")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=120)
-    pyplot.close(figure)
+    with plots(file, (8, 8), rows=3) as (time, work, memory):
+        for label, journey in journeys.items():
+            parts = np.array_split(journey.milliseconds, min(blocks, len(journey.milliseconds)))
+            time.plot(np.cumsum([len(part) for part in parts]), [np.median(part) for part in parts], label=label)
+            for name, looks in journey.looks.items():
+                work.plot(*journey.work(name), label=f"{label} {name}".strip())
+                memory.plot([look.frame for look in looks], [look.megabytes for look in looks])
+        time.set(ylabel="ms a frame (median)", ylim=(0, None))
+        work.set(ylabel="processor time, ms a frame", ylim=(0, None))
+        memory.set(ylabel="resident memory, MB", xlabel="frame", ylim=(0, None))
+        if len(journeys) > 1:
+            time.legend()
+        work.legend(fontsize="small")

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import numpy as np
 from sequences import rendered
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.compression.reduce import reduce
@@ -87,7 +87,4 @@ def motion() -> Iterator[tuple[str, Callable[[], object]]]:
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument("--runs", type=int, default=21, help="number of runs of each step (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, command(__doc__), runs=(21, "number of runs of each step"))

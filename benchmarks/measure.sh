@@ -19,7 +19,6 @@ measure throughput "$python" benchmarks/throughput.py --runs 2
 measure kernels "$python" benchmarks/kernels.py
 measure objects "$python" benchmarks/objects.py
 measure wire "$python" benchmarks/wire.py
-measure endurance "$python" benchmarks/endurance.py --frames 6000
 measure subscribers "$python" benchmarks/subscribers.py --frames 1500 --runs 1
 measure resume "$python" benchmarks/resume.py --moments 8
 measure loadtest "$catstream" loadtest --streams 2 --duration 20

@@ -14,7 +14,7 @@ from statistics import fmean, stdev
 
 import numpy as np
 from learning import chosen, each, features, hits, learning_command, model_of, tracked
-from table import Table, publish
+from table import Table, benchmark
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Box, Window
@@ -94,5 +94,4 @@ def _paired(found: list[tuple[str, Row, float, float]]) -> Iterator[tuple]:
 
 
 if __name__ == "__main__":
-    options = learning_command(__doc__).parse_args()
-    publish(figures(options), options)
+    benchmark(figures, learning_command(__doc__))

@@ -7,17 +7,19 @@ other load of the machine affects all alike: the ratios are more reliable than t
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable, Iterator, Mapping
 from statistics import median
 from time import perf_counter, process_time
 
-import psutil
+import numpy as np
+from journey import travel
 from sequences import scratch
-from table import Cell, Table, command, publish
+from table import Cell, Table, benchmark, command
 
 from catstream.box import Box
 from catstream.multi import MultiTracker
-from catstream.pipeline import Pipeline
+from catstream.settings import Settings
 from catstream.video import crowd
 from catstream.video.source import open_source
 
@@ -33,7 +35,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
             f"Objects: {title.lower()}",
             ("objects", "ms a frame", "frames/s", "each further object, of the first", "processor, ms a frame"),
             list(rows(measure, str(path), starts, counts, runs)),
-            f"640x480 pixels, {frames} frames with decoding, median of {runs} runs; {psutil.cpu_count()} cores",
+            f"640x480 pixels, {frames} frames with decoding, median of {runs} runs; {os.cpu_count()} cores",
         )
 
 
@@ -72,27 +74,10 @@ def in_one_process(source: str, boxes: Mapping[str, Box]) -> tuple[float, float]
 
 def in_three_processes(source: str, boxes: Mapping[str, Box]) -> tuple[float, float]:
     """Seconds, and processor seconds of the three processes, a frame from the first track to the last."""
-    moments, used = [], []
-    with Pipeline(source, boxes) as pipeline:
-        processes: list[psutil.Process] = []
-        for _ in pipeline.by_frame():
-            processes = processes or [psutil.Process(pid) for pid in pipeline.pids.values()]
-            moments.append(perf_counter())
-            if len(moments) == 1 or len(moments) % 20 == 0:
-                used.append((len(moments), processor_seconds(processes)))
-    (first, before), (last, after) = used[0], used[-1]
-    processor = (after - before) / (last - first) if last > first else 0.0
-    return (moments[-1] - moments[0]) / (len(moments) - 1), processor
-
-
-def processor_seconds(processes: list[psutil.Process]) -> float:
-    """Return the processor time of the processes so far."""
-    return sum(sum(process.cpu_times()[:2]) for process in processes if process.is_running())
+    journey = travel(source, boxes, Settings(), watch=20)
+    work = [np.average(spent) for spent in (journey.work(name)[1] for name in journey.looks) if len(spent)]
+    return 1 / journey.rate, sum(work) / 1000
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument("--frames", type=int, default=200, help="length of the video (default: %(default)s)")
-    parser.add_argument("--runs", type=int, default=3, help="number of runs of each (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, command(__doc__), frames=(200, "length of the video"), runs=(3, "number of runs of each"))

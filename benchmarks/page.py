@@ -386,7 +386,7 @@ SECTIONS = (
     Section(
         "Speed",
         _SPEED,
-        (Shown("speed", beside_others), Shown("startup", select()), Shown("endurance", select())),
+        (Shown("speed", beside_others), Shown("startup", select()), Shown("long_videos-50000", select(1))),
     ),
     Section(
         "Load and faults",

@@ -15,7 +15,7 @@ import numpy as np
 from accuracy import MEANS, accuracy_command, compared, described, difference, means, videos
 from groups import TUNED
 from sequences import named
-from table import Cell, Table, publish
+from table import Cell, Table, benchmark
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.evaluation.runs import EvaluationRun
@@ -92,7 +92,4 @@ def frames_per_second(runs: list[EvaluationRun]) -> float:
 
 
 if __name__ == "__main__":
-    parser = accuracy_command(__doc__, starts=3)
-    parser.add_argument("--sequence", default="TLD_10_panda", help="sequence of the costs (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, accuracy_command(__doc__, starts=3), sequence=("TLD_10_panda", "sequence of the costs"))

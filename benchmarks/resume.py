@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 from sequences import objects, scratch
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
@@ -81,12 +81,11 @@ def written(out: Path) -> int:
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument("--moments", type=int, default=20, help="number of kills (default: %(default)s)")
-    parser.add_argument(
-        "--rows", type=int, default=40, help="maximum number of new rows before a kill (default: %(default)s)"
+    benchmark(
+        figures,
+        command(__doc__),
+        moments=(20, "number of kills"),
+        rows=(40, "maximum number of new rows before a kill"),
+        objects=(1, "number of objects"),
+        seed=(0, "seed of the random moments"),
     )
-    parser.add_argument("--objects", type=int, default=1, help="number of objects (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random moments (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)

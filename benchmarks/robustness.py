@@ -16,8 +16,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from accuracy import available, check_names, many_sequences, videos
-from table import Cell, Table, command, publish
+from accuracy import available, many_sequences, videos
+from groups import CHECK
+from table import Cell, Table, benchmark, command
 
 from catstream.applications.evaluation.attributes import attributes_of, read_attributes
 from catstream.applications.evaluation.datasets import Sequence
@@ -36,7 +37,7 @@ Found = Mapping[tuple[str, str], list[Row]]
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    sequences, check, seen = videos(options), check_names(options), read_attributes(options.attributes)
+    sequences, seen = videos(options), read_attributes(options.attributes)
     trackers, missing = available(options.trackers, options.peer_models)
     if missing:
         print(missing.strip(), file=sys.stderr)
@@ -48,10 +49,10 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         for part in own:
             starts = {sequence.name: set(chosen[part](sequence)) for sequence in sequences}
             found[tracker, part] = rows_of(run for run in runs if run.start in starts[run.sequence.name])
-    yield overview(found, described(options), groups_of(sequences, check))
+    yield overview(found, described(options), groups_of(sequences))
     attributes = {"any": [sequence.name for sequence in sequences]}
     attributes |= attributes_of(sequences, seen)
-    yield by_attribute(found, attributes, check)
+    yield by_attribute(found, attributes)
 
 
 def starts_by_part(options: argparse.Namespace) -> dict[str, Starts]:
@@ -91,10 +92,10 @@ def followed(
     )
 
 
-def groups_of(sequences: Iterable[Sequence], check: set[str]) -> dict[str, set[str]]:
+def groups_of(sequences: Iterable[Sequence]) -> dict[str, set[str]]:
     """Return the names of the sequences of each group; only groups with sequences."""
     names = {sequence.name for sequence in sequences}
-    groups = {"all": names, "tuning": names - check, "check": names & check}
+    groups = {"all": names, "tuning": names - CHECK, "check": names & CHECK}
     return {group: members for group, members in groups.items() if members}
 
 
@@ -129,14 +130,14 @@ def flips(rows: list[Row], part: str) -> int | None:
     return sum(bool(row.flips) for row in rows) if part == "jitter" else None
 
 
-def by_attribute(found: Found, attributes: Mapping[str, list[str]], check: set[str]) -> Table:
+def by_attribute(found: Found, attributes: Mapping[str, list[str]]) -> Table:
     """Return the means of the trackers over the sequences with each attribute, from the first part of each tracker."""
     first: dict[str, list[Row]] = {}
     for (tracker, _), measured in found.items():
         first.setdefault(tracker, measured)
     rows: list[list[Cell]] = []
     for attribute, names in attributes.items():
-        cells: list[Cell] = [attribute, len(names), len(check & set(names))]
+        cells: list[Cell] = [attribute, len(names), len(CHECK & set(names))]
         for measured in first.values():
             members = [row for row in measured if row.name in names]
             cells += [*mean_and_error(row.auc for row in members), mean_and_error(row.success for row in members)[0]]
@@ -151,16 +152,12 @@ if __name__ == "__main__":
     parser = many_sequences(command(__doc__))
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="parts for catstream (default: all)")
     parser.add_argument("--peer-parts", nargs="+", choices=PARTS, default=PARTS[:1], help="for others (default: ope)")
-    parser.add_argument("--starts", type=int, default=5, help="number of frames of tre (default: %(default)s)")
-    parser.add_argument("--jitter", type=int, default=7, help="number of boxes of jitter (default: %(default)s)")
     parser.add_argument("--trackers", nargs="+", choices=TRACKERS, default=TRACKERS, help="those that are installed")
     parser.add_argument("--peer-models", type=Path, metavar="FOLDER", help="model files of nano and vit")
-    parser.add_argument(
-        "--attributes",
-        type=Path,
-        metavar="FILE",
-        default=ATTRIBUTES,
-        help="attributes of the sequences (default: %(default)s)",
+    benchmark(
+        figures,
+        parser,
+        starts=(5, "number of frames of tre"),
+        jitter=(7, "number of boxes of jitter"),
+        attributes=(ATTRIBUTES, "attributes of the sequences"),
     )
-    options = parser.parse_args()
-    publish(figures(options), options)

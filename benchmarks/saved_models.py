@@ -12,7 +12,7 @@ from statistics import fmean, stdev
 
 import numpy as np
 from learning import chosen, each, features, hits, learning_command, model_of, tracked, training_frames
-from table import Table, publish
+from table import Table, benchmark
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.settings import Settings
@@ -68,7 +68,4 @@ def _summary(rows: list[tuple]) -> Iterator[tuple]:
 
 
 if __name__ == "__main__":
-    parser = learning_command(__doc__)
-    parser.add_argument("--others", type=int, default=4, help="other sequences for each model (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, learning_command(__doc__), others=(4, "other sequences for each model"))

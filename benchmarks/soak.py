@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 from sequences import named, scratch
-from table import Table, command, publish
+from table import Table, benchmark, command, plots
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Box
@@ -206,35 +206,21 @@ def doubling(measurements: list[Measurement]) -> Iterator[Measurement]:
 
 def draw(measurements: list[Measurement], file: Path) -> None:
     """Plot time per message, and memory with its bound, against the number of messages."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    figure, (time, memory) = pyplot.subplots(2, 1, sharex=True, figsize=(8, 6), layout="constrained")
     counts = [measurement.messages for measurement in measurements]
-    time.plot(counts, [measurement.micros for measurement in measurements])
-    time.set(ylabel="us a message", ylim=(0, None))
-    for label in ("resident", "law", "trees", "disk"):
-        memory.plot(counts, [getattr(measurement, label) for measurement in measurements], label=label)
-    memory.set(ylabel="MB", xlabel="messages of features", xscale="log", ylim=(0, None))
-    memory.legend(fontsize="small")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=120)
-    pyplot.close(figure)
+    with plots(file, (8, 6), rows=2) as (time, memory):
+        time.plot(counts, [measurement.micros for measurement in measurements])
+        time.set(ylabel="us a message", ylim=(0, None))
+        for label in ("resident", "law", "trees", "disk"):
+            memory.plot(counts, [getattr(measurement, label) for measurement in measurements], label=label)
+        memory.set(ylabel="MB", xlabel="messages of features", xscale="log", ylim=(0, None))
+        memory.legend(fontsize="small")
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument(
-        "--messages", type=int, default=1_000_000, help="number of messages in one process (default: %(default)s)"
+    benchmark(
+        figures,
+        command(__doc__),
+        messages=(1_000_000, "number of messages in one process"),
+        through=(50_000, "number of messages through the compressor process"),
+        plot=(Path("out/soak.png"), "plot"),
     )
-    parser.add_argument(
-        "--through",
-        type=int,
-        default=50_000,
-        help="number of messages through the compressor process (default: %(default)s)",
-    )
-    parser.add_argument("--plot", type=Path, default=Path("out/soak.png"), help="(default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)

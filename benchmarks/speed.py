@@ -19,7 +19,7 @@ import numpy as np
 from accuracy import available, shortened
 from journey import Journey, travel
 from sequences import named, rendered, video
-from table import Table, command, publish
+from table import Table, benchmark, command
 from throughput import MODES, steps
 
 from catstream.applications.evaluation.datasets import Sequence
@@ -62,7 +62,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     cases, sizes, modes, coresets, frames = CASES, SIZES, MODES, CORESETS, 300
     if options.quick:  # one run of the pipeline gives a figure for three tables
         cases, sizes, modes, coresets, frames = CASES[:1], ((640, 480),), ("local",), (Settings().coreset.size,), 8
-    sequences = [one for one in shortened(options) if not options.sequences or one.name in options.sequences]
+    sequences = [one for one in shortened(options) if {one.name, "all"} & {*options.sequences}]
     journeys = [sequence_in_pipeline(sequence) for sequence in sequences]
     trackers, missing = available(TRACKERS)
     runs = evaluate(sequences, trackers, Settings())
@@ -204,10 +204,9 @@ def demo_in_pipeline(frames: int, size: tuple[int, int], tiny: bool, settings: S
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument(
-        "--frames", type=int, help="number of frames of each sequence for the comparison (default: all)"
+    benchmark(
+        figures,
+        command(__doc__),
+        frames=(int, "number of frames of each sequence for the comparison (default: all)"),
+        sequences=(["all"], "only these sequences for the comparison"),
     )
-    parser.add_argument("--sequences", nargs="+", metavar="NAME", help="only these sequences for the comparison")
-    options = parser.parse_args()
-    publish(figures(options), options)

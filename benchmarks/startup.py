@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 
 from sequences import named, video
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.box import Box
 from catstream.errors import ServiceError
@@ -81,7 +81,4 @@ def versions(tracks: Path) -> list[int]:
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument("--runs", type=int, default=7, help="number of starts of each kind (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, command(__doc__), runs=(7, "number of starts of each kind"))

@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import argparse
 import threading
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from statistics import median
 from time import perf_counter
+from typing import NamedTuple
 
-import psutil
+from journey import Journey, travel
 from sequences import rendered, video
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 import catstream
 from catstream.applications.loadtest.subscribers import Subscribers
 from catstream.errors import SilenceError
-from catstream.pipeline import Pipeline
+from catstream.messages.kinds import Track
 from catstream.settings import Settings
 from catstream.wire.endpoint import private_folder
 
@@ -29,29 +28,19 @@ SIZE = (320, 240)
 PAUSE_SECONDS = 2.0  # between two late joiners
 
 
-@dataclass(slots=True)
-class Run:
+class Run(NamedTuple):
     """The measurements of one run.
 
-    moments  seconds of each track
-    memory   of each process: resident megabytes, some fifty times
-    work     of each process: seconds of processor time, when last seen
-    joined   seconds until each late joiner had the last model
-    frozen   seconds for which the frozen readers were that
-    received    tracks that each other reader received
+    journey   of the pipeline
+    joined    seconds until each late joiner had the last model
+    frozen    seconds for which the frozen readers were that
+    received  tracks that each other reader received
     """
 
-    moments: list[float] = field(default_factory=list)
-    memory: dict[str, list[float]] = field(default_factory=dict)
-    work: dict[str, float] = field(default_factory=dict)
-    joined: list[float] = field(default_factory=list)
-    frozen: float = 0.0
-    received: list[int] = field(default_factory=list)
-
-    @property
-    def rate(self) -> float:
-        """Frames per second from the first track to the last."""
-        return (len(self.moments) - 1) / (self.moments[-1] - self.moments[0])
+    journey: Journey
+    joined: list[float]
+    frozen: float
+    received: list[int]
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
@@ -60,21 +49,22 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         frames, readers, frozen, runs = 40, 2, 1, 1
     alone, beside = [], []
     for _ in range(runs):  # alternating, so that other load of the machine affects both alike
-        alone.append(travel(frames, 0, 0))
-        beside.append(travel(frames, readers, frozen))
+        alone.append(run_with(frames, 0, 0))
+        beside.append(run_with(frames, readers, frozen))
 
     columns = ("subscribers", "frozen", "for s", "frames", "frames/s", "slowest run", "ratio")
-    base, rows = median(run.rate for run in alone), []
+    base, rows = median(run.journey.rate for run in alone), []
     for all_runs, connected, stopped in ((alone, 0, 0), (beside, readers, frozen)):
-        rate, seconds = median(run.rate for run in all_runs), median(run.frozen for run in all_runs)
-        rows.append((connected, stopped, seconds, frames, rate, min(run.rate for run in all_runs), rate / base))
+        rate, seconds = median(run.journey.rate for run in all_runs), median(run.frozen for run in all_runs)
+        rows.append((connected, stopped, seconds, frames, rate, min(run.journey.rate for run in all_runs), rate / base))
     yield Table("Frames a second", columns, rows, f"median of {runs} runs each, made in turn")
 
     columns = ("subscribers", "process", "MB at a quarter", "MB at the end", "most", "CPU ms a frame")
     rows = [
-        (connected, name, seen[len(seen) // 4], seen[-1], max(seen), 1000 * run.work[name] / frames)
+        (connected, name, seen[len(seen) // 4], seen[-1], max(seen), 1000 * looks[-1].seconds / frames)
         for connected, run in ((0, alone[-1]), (readers, beside[-1]))
-        for name, seen in run.memory.items()
+        for name, looks in run.journey.looks.items()
+        for seen in [[look.megabytes for look in looks]]
     ]
     yield Table("Processes", columns, rows, "of the last runs; the coreset trees grow with the logarithm of the frames")
 
@@ -91,35 +81,26 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     )
 
 
-def travel(frames: int, readers: int, frozen: int) -> Run:
+def run_with(frames: int, readers: int, frozen: int) -> Run:
     """Run a pipeline over the whole video, with subscribers that connect at its start."""
-    sequence, run, ended = rendered(frames, SIZE), Run(), threading.Event()
+    sequence, joined, ended = rendered(frames, SIZE), list[float](), threading.Event()
     with private_folder() as folder, Subscribers(str(folder), readers, frozen=frozen) as group:
-        late = threading.Thread(target=join, args=(str(folder), ended, run.joined))
-        with Pipeline(video(sequence), sequence.boxes[0], Settings(run={"endpoint": str(folder)})) as pipeline:
-            try:
-                for track in pipeline:
-                    run.moments.append(perf_counter())
-                    if readers and track.model_version and late.ident is None:
-                        late.start()
-                    if track.frame % (frames // 50 + 1) == 0:
-                        group.freeze()
-                        for name, pid in pipeline.pids.items():
-                            look(run, name, pid)
-            finally:
-                ended.set()
-                if late.ident is not None:
-                    late.join()
+        late = threading.Thread(target=join, args=(str(folder), ended, joined))
+
+        def turn(tracks: Mapping[str, Track]) -> None:
+            group.freeze()
+            if readers and late.ident is None and any(track.model_version for track in tracks.values()):
+                late.start()
+
+        settings = Settings(run={"endpoint": str(folder)})
+        try:
+            journey = travel(video(sequence), sequence.boxes[0], settings, frames // 50 + 1, turn=turn)
+        finally:
+            ended.set()
+            if late.ident is not None:
+                late.join()
         group.wait()
-        run.frozen, run.received = group.frozen_seconds, group.received()
-    return run
-
-
-def look(run: Run, name: str, pid: int) -> None:
-    with suppress(psutil.NoSuchProcess):  # the process has just ended
-        process = psutil.Process(pid)
-        run.memory.setdefault(name, []).append(process.memory_info().rss / 1e6)
-        run.work[name] = sum(process.cpu_times()[:2])
+        return Run(journey, joined, group.frozen_seconds, group.received())
 
 
 def join(endpoint: str, ended: threading.Event, seconds: list[float]) -> None:
@@ -137,12 +118,11 @@ def join(endpoint: str, ended: threading.Event, seconds: list[float]) -> None:
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument("--frames", type=int, default=4_000, help="frames of each run (default: %(default)s)")
-    parser.add_argument("--readers", type=int, default=200, help="number of subscribers (default: %(default)s)")
-    parser.add_argument("--frozen", type=int, default=20, help="number of those that are frozen (default: %(default)s)")
-    parser.add_argument(
-        "--runs", type=int, default=2, help="number of runs with and without subscribers (default: %(default)s)"
+    benchmark(
+        figures,
+        command(__doc__),
+        frames=(4_000, "frames of each run"),
+        readers=(200, "number of subscribers"),
+        frozen=(20, "number of those that are frozen"),
+        runs=(2, "number of runs with and without subscribers"),
     )
-    options = parser.parse_args()
-    publish(figures(options), options)

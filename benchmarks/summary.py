@@ -14,7 +14,7 @@ from time import perf_counter
 
 import numpy as np
 from sequences import sequences
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.summaries.images import describe
@@ -111,5 +111,4 @@ def cost(rows: np.ndarray, k: int) -> tuple[int, float, float]:
 if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("-k", type=int, nargs="+", default=(5, 20, 50), help="numbers of images (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, parser)

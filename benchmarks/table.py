@@ -9,7 +9,8 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from catstream.errors import CatstreamError
 from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
 
-__all__ = ["Cell", "Table", "command", "publish", "text"]
+__all__ = ["Cell", "Table", "benchmark", "command", "plots", "publish", "text"]
 
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")
@@ -28,7 +29,6 @@ _PLACES = (
     "--data",
     "--output",
     "--strips",
-    "--check",
     "--attributes",
     "--peer-models",
 )  # options with paths of this machine
@@ -61,6 +61,36 @@ def command(about: str | None) -> argparse.ArgumentParser:
     return parser
 
 
+def benchmark(
+    figures: Callable[[argparse.Namespace], Iterable[Table]],
+    parser: argparse.ArgumentParser,
+    settings: Callable[[argparse.Namespace], Settings] = lambda _: Settings(),
+    **more: tuple[Any, str],
+) -> None:
+    """Read the options of a benchmark, and publish its figures.
+
+    Parameters
+    ----------
+    figures : measures, and yields the tables
+    parser : of `command`
+    settings : those that hold for all tables
+    more : further options by name: the default, or the type of an option without one, and what it means; a list has
+        several values
+    """
+    for name, (default, meaning) in more.items():
+        if default is False:
+            parser.add_argument(f"--{name}", action="store_true", help=meaning)
+        elif isinstance(default, type):
+            parser.add_argument(f"--{name}", type=default, metavar=default.__name__.upper(), help=meaning)
+        else:
+            several = isinstance(default, list)
+            kind = type(default[0] if several else default)
+            text = f"{meaning} (default: %(default)s)".strip()
+            parser.add_argument(f"--{name}", type=kind, nargs="+" if several else None, default=default, help=text)
+    options = parser.parse_args()
+    publish(figures(options), options, settings(options))
+
+
 def publish(tables: Iterable[Table], options: argparse.Namespace, settings: Settings | None = None) -> None:
     """Print each table when it is ready, and write all to the file of `--json`; linear algebra runs on one core.
 
@@ -82,6 +112,21 @@ def publish(tables: Iterable[Table], options: argparse.Namespace, settings: Sett
     if options.json is not None:
         figures = {**provenance(settings or Settings(), list(_words())), "tables": shown}
         options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def plots(file: Path, size: tuple[float, float], rows: int = 1, columns: int = 1) -> Iterator[Any]:
+    """Yield the axes of some plots, which are saved to a file afterwards."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="constrained", sharex=rows > 1)
+    yield axes
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=120)
+    pyplot.close(figure)
 
 
 def text(table: Table) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from journey import travel
 from sequences import named, rendered, video
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.evaluation.metrics import score
@@ -83,7 +83,4 @@ def costs(sequence: Sequence, settings: Settings) -> list[float]:
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument("--runs", type=int, default=3, help="number of runs of each video (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, command(__doc__), runs=(3, "number of runs of each video"))

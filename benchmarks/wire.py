@@ -10,7 +10,7 @@ from dataclasses import replace
 from time import perf_counter
 
 from sequences import rendered
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.box import Box
 from catstream.detection.objects import Detectors
@@ -93,9 +93,4 @@ def receive(endpoint: str) -> None:
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument(
-        "--messages", type=int, default=5_000, help="number of messages over each transport (default: %(default)s)"
-    )
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, command(__doc__), messages=(5_000, "number of messages over each transport"))

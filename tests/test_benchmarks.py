@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-ALONE = BENCHMARKS / "kernels.py"
+ALONE, PAGE = BENCHMARKS / "kernels.py", BENCHMARKS / "page.py"
 SLOW = {BENCHMARKS / "fleet" / "faults.py"}  # minutes; tests/fleet/test_fleet.py kills a node, too
-SCRIPTS = sorted({path for path in BENCHMARKS.rglob("*.py") if "publish(figures" in path.read_text()} - {ALONE})
+SCRIPTS = sorted({path for path in BENCHMARKS.rglob("*.py") if "__main__" in path.read_text()} - {ALONE, PAGE})
 CASES = [
     pytest.param(path, id=str(path.relative_to(BENCHMARKS)), marks=[pytest.mark.slow] if path in SLOW else [])
     for path in SCRIPTS

@@ -17,7 +17,7 @@ from typing import Any
 sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from accuracy import MEANS, accuracy_command, compared, difference, means, starts_of, videos
-from table import Table, publish
+from table import Table, benchmark
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.evaluation.starts import Start
@@ -55,7 +55,4 @@ def pieces_of(sequence: Sequence, starts: list[Start], frames: int) -> list[Sequ
 
 
 if __name__ == "__main__":
-    parser = accuracy_command(__doc__, starts=3)
-    parser.add_argument("--size", type=int, default=64, help="n, in frames and rows (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, accuracy_command(__doc__, starts=3), size=(64, "n, in frames and rows"))

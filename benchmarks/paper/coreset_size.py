@@ -16,7 +16,7 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 
 from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
-from table import Table, publish
+from table import Table, benchmark
 
 from catstream.settings import PRESETS, Settings
 
@@ -45,5 +45,4 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 if __name__ == "__main__":
-    options = accuracy_command(__doc__, kept=False).parse_args()
-    publish(figures(options), options)
+    benchmark(figures, accuracy_command(__doc__, kept=False))

@@ -32,7 +32,7 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 
 from groups import CHECK
 from sequences import scratch, sequences
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.finding.files import File
@@ -451,15 +451,12 @@ def _call(
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument(
-        "--own", type=int, default=12, help="frames of the rest of each sequence (default: %(default)s)"
+    benchmark(
+        figures,
+        command(__doc__),
+        own=(12, "frames of the rest of each sequence"),
+        others=(2, "frames of each other sequence"),
+        step=(1, "learn only every N-th sequence"),
+        jobs=(os.cpu_count() or 1, "number of processes"),
+        output=(Path, "folder for the answers; objects that are complete are not repeated"),
     )
-    parser.add_argument("--others", type=int, default=2, help="frames of each other sequence (default: %(default)s)")
-    parser.add_argument("--step", type=int, default=1, help="learn only every N-th sequence (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes (default: %(default)s)")
-    parser.add_argument(
-        "--output", type=Path, help="folder for the answers; objects that are complete are not repeated"
-    )
-    options = parser.parse_args()
-    publish(figures(options), options)

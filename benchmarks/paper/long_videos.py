@@ -20,7 +20,7 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 
 from journey import Journey, draw, travel
 from sequences import named, scratch
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.evaluation.metrics import score
@@ -121,12 +121,13 @@ def growth(journey: Journey) -> tuple[float, ...]:
 
 if __name__ == "__main__":
     parser = command(__doc__)
-    parser.add_argument(
-        "--frames", type=int, default=100_000, help="frames of the longest video (default: %(default)s)"
-    )
-    parser.add_argument("--videos", nargs="+", default=["TLD_06_car", "TLD_10_panda"], help="(default: %(default)s)")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 500], help="n (default: %(default)s)")
     parser.add_argument("--preset", choices=PRESETS, help="preset for the settings except n (default: none)")
-    parser.add_argument("--plot", type=Path, default=Path("out/long_videos.png"), help="(default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options, base_of(options))
+    benchmark(
+        figures,
+        parser,
+        base_of,
+        frames=(100_000, "frames of the longest video"),
+        videos=(["TLD_06_car", "TLD_10_panda"], "names of sequences"),
+        sizes=([64, 500], "n"),
+        plot=(Path("out/long_videos.png"), "plot"),
+    )

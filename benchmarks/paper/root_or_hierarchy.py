@@ -15,7 +15,7 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 
 from accuracy import MEANS, accuracy_command, described, means, spread, videos
 from assembled import Recipe, follow_all
-from table import Table, publish
+from table import Table, benchmark
 
 from catstream.compression import sampling
 from catstream.compression.tree import CoresetTree
@@ -48,7 +48,4 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 
 if __name__ == "__main__":
-    parser = accuracy_command(__doc__, starts=3, kept=False)
-    parser.add_argument("--ours", action="store_true", help="only with our settings")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(figures, accuracy_command(__doc__, starts=3, kept=False), ours=(False, "only with our settings"))

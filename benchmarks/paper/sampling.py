@@ -20,7 +20,7 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 
 from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
-from table import Table, publish
+from table import Table, benchmark
 
 from catstream.compression.tree import CoresetTree
 from catstream.messages.kinds import Summary
@@ -112,8 +112,10 @@ def base_of(options: argparse.Namespace) -> Settings:
 
 
 if __name__ == "__main__":
-    parser = accuracy_command(__doc__, kept=False)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256], help="n (default: %(default)s)")
-    parser.add_argument("--ours", action="store_true", help="with our settings in place of the paper's")
-    options = parser.parse_args()
-    publish(figures(options), options, base_of(options))
+    benchmark(
+        figures,
+        accuracy_command(__doc__, kept=False),
+        base_of,
+        sizes=([64, 256], "n"),
+        ours=(False, "with our settings in place of the paper's"),
+    )

@@ -18,7 +18,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from sequences import named
-from table import Table, command, publish
+from table import Table, benchmark, command, plots
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Window
@@ -81,33 +81,26 @@ def seconds(work: Callable[..., object], *arguments: object) -> float:
 
 def draw(training: list[tuple[float, ...]], building: list[tuple[float, ...]], file: Path) -> None:
     """Draw the two plots of the figure side by side."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    points, everything, *coresets = zip(*training, strict=True)
-    left.semilogy(points, everything, label="all points")
-    for n, times in zip(SIZES[1:3], coresets, strict=True):
-        left.semilogy(points, times, label=f"coreset, n = {n}")
-    points, *times = zip(*building, strict=True)
-    for n, each in zip(SIZES, times, strict=True):
-        right.plot(points, each, label=f"n = {n}")
-    left.set(xlabel="points", ylabel="one training, ms")
-    right.set(xlabel="points", ylabel="building the tree, us a point", ylim=(0, None))
-    for axes in (left, right):
-        axes.set_xscale("log", base=2)
-        axes.xaxis.set_major_formatter("{x:.0f}")
-        axes.legend()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=120)
-    pyplot.close(figure)
+    with plots(file, (10, 4), columns=2) as (left, right):
+        points, everything, *coresets = zip(*training, strict=True)
+        left.semilogy(points, everything, label="all points")
+        for n, times in zip(SIZES[1:3], coresets, strict=True):
+            left.semilogy(points, times, label=f"coreset, n = {n}")
+        points, *times = zip(*building, strict=True)
+        for n, each in zip(SIZES, times, strict=True):
+            right.plot(points, each, label=f"n = {n}")
+        left.set(xlabel="points", ylabel="one training, ms")
+        right.set(xlabel="points", ylabel="building the tree, us a point", ylim=(0, None))
+        for axes in (left, right):
+            axes.set_xscale("log", base=2)
+            axes.xaxis.set_major_formatter("{x:.0f}")
+            axes.legend()
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument("--points", type=int, default=8192, help="maximum number of points (default: %(default)s)")
-    parser.add_argument("--plot", type=Path, default=Path("out/time_complexity.png"), help="(default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(
+        figures,
+        command(__doc__),
+        points=(8192, "maximum number of points"),
+        plot=(Path("out/time_complexity.png"), "plot"),
+    )

@@ -17,7 +17,7 @@ from statistics import fmean
 sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
 from accuracy import accuracy_command, compared, videos
-from table import Table, publish
+from table import Table, benchmark
 
 from catstream.applications.evaluation.metrics import score
 from catstream.applications.evaluation.runs import EvaluationRun
@@ -67,5 +67,4 @@ def by_part(tracker: str, runs: list[EvaluationRun], settings: Settings) -> Iter
 
 
 if __name__ == "__main__":
-    options = accuracy_command(__doc__).parse_args()
-    publish(figures(options), options)
+    benchmark(figures, accuracy_command(__doc__))
