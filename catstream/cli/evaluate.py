@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from catstream.cli import INTERRUPTED, interruptible
+from catstream.cli.figures import check_json, write_json
 from catstream.errors import CatstreamError
 from catstream.services.options import with_settings
 from catstream.settings import Settings
@@ -116,8 +116,7 @@ def evaluate(
         raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
-    if json_file is not None:
-        _validate_json(json_file)
+    check_json(json_file)
     seen = {} if attributes is None else read_attributes(attributes)
 
     errors: list[CatstreamError] = []
@@ -146,8 +145,7 @@ def evaluate(
         console.print(line, soft_wrap=True)
     if json_file is not None or output is not None:
         shared = attributes_of({run.sequence.name: run.sequence for run in runs}.values(), seen)
-        if json_file is not None:
-            _write_json(json_file, to_json(rows, settings, shared))
+        write_json(json_file, to_json(rows, settings, shared))
         if output is not None:
             console.print(f"report: {write_report(output / 'report.html', runs, settings, shared)}", soft_wrap=True)
     if errors:
@@ -170,19 +168,6 @@ def _progress(console: Console) -> Iterator[tuple[Callable[[int], None], Callabl
             progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}")
 
         yield begin, done
-
-
-def _validate_json(file: Path) -> None:
-    if file.is_dir() or not file.absolute().parent.is_dir():
-        problem = "it is a folder" if file.is_dir() else "its folder does not exist, make it first"
-        raise CatstreamError(f"cannot write {str(file)!r}: {problem}")
-
-
-def _write_json(file: Path, figures: dict[str, object]) -> None:
-    try:
-        file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise CatstreamError(f"cannot write {str(file)!r}: {error.strerror}") from None
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import signal
 import sys
@@ -15,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from catstream.cli import INTERRUPTED
+from catstream.cli.figures import check_json, write_json
 from catstream.errors import CatstreamError
 from catstream.services.options import with_settings
 
@@ -117,7 +117,9 @@ def loadtest(
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     parameters = Plan(**plan)
-    _check_writable(json_file, output)
+    check_json(json_file)
+    if output is not None:
+        _make(output)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console(width=None if sys.stdout.isatty() else 140)
     columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[figures]}")
@@ -138,8 +140,7 @@ def loadtest(
         load_test = run_load_test(parameters, asked, find=find_limit, report=report, done=done)
     if load_test.results:
         _print(console, load_test.result, asked)
-        if json_file is not None:
-            json_file.write_text(json.dumps(to_json(load_test), indent=1) + "\n", encoding="utf-8")
+        write_json(json_file, to_json(load_test))
         if output is not None:
             load_test.result.track.write(output / "track.hgrm")
             load_test.result.model.write(output / "model.hgrm")
@@ -159,15 +160,12 @@ def loadtest(
         sys.exit(_FAILED)
 
 
-def _check_writable(json_file: Path | None, output: Path | None) -> None:
-    """Check before the run that the results can be written."""
-    if output is not None:
-        try:
-            output.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise CatstreamError(f"cannot write to {str(output)!r} ({error.strerror}): give another folder") from None
-    if json_file is not None and not json_file.absolute().parent.is_dir():
-        raise CatstreamError(f"cannot write {str(json_file)!r}: its folder does not exist, make it first")
+def _make(output: Path) -> None:
+    """Make the folder of the results before the run."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CatstreamError(f"cannot write to {str(output)!r} ({error.strerror}): give another folder") from None
 
 
 def _print(console: Console, result: Result, limits: list[Limit]) -> None:

@@ -70,16 +70,16 @@ def test_the_ground_truth_of_otb_david_begins_at_its_300th_image(tmp_path):
     check(folder(tmp_path / "mine" / "david", "groundtruth_rect.txt", "img", lines(TRUTH)), "david")
 
 
-def test_tld_with_corners(tmp_path):
-    check(folder(tmp_path / "walk", "gt.txt", ".", lines(corners(TRUTH))))
-
-
-def test_vot_with_polygons(tmp_path):
-    check(folder(tmp_path / "walk", "groundtruth.txt", ".", lines(polygons(TRUTH)), file="%08d.jpg"))
-
-
-def test_vot_with_a_folder_of_colours_and_rectangles(tmp_path):
-    check(folder(tmp_path / "walk", "groundtruth.txt", "color", lines(TRUTH)))
+@pytest.mark.parametrize(
+    ("name", "images", "rows", "file"),
+    [
+        pytest.param("gt.txt", ".", corners(TRUTH), "%05d.png", id="TLD, corners"),
+        pytest.param("groundtruth.txt", ".", polygons(TRUTH), "%08d.jpg", id="VOT, polygons"),
+        pytest.param("groundtruth.txt", "color", TRUTH, "%05d.png", id="VOT, rectangles, and a folder of colours"),
+    ],
+)
+def test_the_layouts_of_tld_and_vot(tmp_path, name, images, rows, file):
+    check(folder(tmp_path / "walk", name, images, lines(rows), file=file))
 
 
 def test_a_rotated_polygon_is_read_as_its_bounding_box(tmp_path):

@@ -17,7 +17,7 @@ from catstream.applications.evaluation.onepass import evaluate, follow
 from catstream.applications.evaluation.runs import EvaluationRun, load, save
 from catstream.applications.evaluation.starts import FIRST, Start, jittered, spatial, temporal
 from catstream.applications.evaluation.summary import MEASURES, describe_flips, flips_of, mean_of, rows_of, to_json
-from catstream.errors import CatstreamError, SettingsError, VideoError
+from catstream.errors import CatstreamError, SettingsError
 from catstream.settings import Settings
 
 SETTINGS = Settings()
@@ -120,6 +120,19 @@ def test_runs_from_changed_first_boxes_are_stored_beside_the_others(tmp_path, se
     assert {path.name for path in (tmp_path / "mil" / "longterm").iterdir()} == {name for _, name in counted}
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        pytest.param(lambda sequence: sequence.boxes[:-1], id="fewer boxes"),
+        pytest.param(lambda sequence: sequence.boxes + 3, id="another first box"),
+    ],
+)
+def test_runs_with_another_ground_truth_are_repeated(tmp_path, sequence, counted, changed):
+    for boxes in (sequence.boxes, changed(sequence)):
+        evaluate([replace(sequence, boxes=boxes)], ["catstream"], SETTINGS, output=tmp_path)
+    assert len(counted) == 2
+
+
 def test_an_incomplete_run_is_repeated(tmp_path, sequence, run, counted):
     save(tmp_path, run)
     folder = tmp_path / "catstream" / "longterm" / "walk"
@@ -129,32 +142,17 @@ def test_an_incomplete_run_is_repeated(tmp_path, sequence, run, counted):
     assert not folder.with_name("walk.part").exists()
 
 
-def test_runs_with_another_ground_truth_are_repeated(tmp_path, sequence, run, counted):
-    save(tmp_path, run)
-    shorter = Sequence(sequence.name, sequence.path, sequence.boxes[:-1])
-    evaluate([shorter], ["catstream"], SETTINGS, output=tmp_path)
-    assert len(counted) == 1
-
-
-def test_a_run_from_another_box_is_repeated(tmp_path, sequence, counted):
+@pytest.mark.parametrize(
+    ("version", "settings", "named"),
+    [("3.0", SETTINGS, r"versions \(opencv\)"), (runs.OPENCV, Settings(coreset={"size": 32}), r"coreset\.size")],
+)
+def test_runs_of_another_version_or_with_other_settings_are_not_mixed_in(
+    tmp_path, monkeypatch, sequence, counted, version, settings, named
+):
     evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
-    corrected = Sequence(sequence.name, sequence.path, sequence.boxes + 3)
-    evaluate([corrected], ["catstream"], SETTINGS, output=tmp_path)
-    assert len(counted) == 2
-
-
-def test_runs_of_another_version_are_not_mixed_in(tmp_path, monkeypatch, sequence, counted):
-    evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
-    monkeypatch.setattr(runs, "OPENCV", "3.0")
-    with pytest.raises(SettingsError, match=r"versions \(opencv\)"):
-        evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
-    assert len(counted) == 1
-
-
-def test_runs_made_with_other_settings_are_not_mixed_in(tmp_path, sequence, counted):
-    evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
-    with pytest.raises(SettingsError, match=r"coreset\.size"):
-        evaluate([sequence], ["catstream"], Settings(coreset={"size": 32}), output=tmp_path)
+    monkeypatch.setattr(runs, "OPENCV", version)
+    with pytest.raises(SettingsError, match=named):
+        evaluate([sequence], ["catstream"], settings, output=tmp_path)
     assert len(counted) == 1
 
 
@@ -186,17 +184,21 @@ def test_begin_and_done_report_the_progress(sequence):
 # --- refusing ----------------------------------------------------------------------------------------
 
 
-def test_unknown_trackers_and_equal_names_are_errors_before_the_first_run(sequence, counted):
-    with pytest.raises(SettingsError, match="no tracker 'kfc'"):
-        evaluate([sequence], ["catstream", "kfc"], SETTINGS)
-    with pytest.raises(VideoError, match="two sequences are named 'walk'"):
-        evaluate([sequence, sequence], ["catstream"], SETTINGS)
+@pytest.mark.parametrize(
+    ("count", "trackers", "message"),
+    [
+        (1, ["catstream", "kfc"], "no tracker 'kfc'"),
+        (2, ["catstream"], "two sequences are named 'walk'"),
+        (1, [], "no tracker is given"),
+    ],
+)
+def test_unknown_trackers_and_equal_names_are_errors_before_the_first_run(sequence, counted, count, trackers, message):
+    with pytest.raises(CatstreamError, match=message):
+        evaluate([sequence] * count, trackers, SETTINGS)
     assert not counted
 
 
-def test_no_tracker_is_an_error_and_a_tracker_named_twice_runs_once(sequence, counted):
-    with pytest.raises(SettingsError, match="no tracker is given"):
-        evaluate([sequence], [], SETTINGS)
+def test_a_tracker_named_twice_runs_once(sequence, counted):
     assert len(evaluate([sequence], ["mil", "mil"], SETTINGS)) == len(counted) == 1
 
 

@@ -115,17 +115,18 @@ def test_the_command_counts_the_sequences_that_flip(tmp_path, walk):
     assert sentence in (tmp_path / "report.html").read_text()
 
 
-@pytest.mark.parametrize("options", [("--shifts", "--jitter", "2"), ("--starts", "2", "--shifts")])
-def test_the_runs_of_a_sequence_are_chosen_by_one_option(walk, options):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--shifts", "--jitter", "2"), "--starts, --shifts and --jitter each choose the runs of a sequence: give one"),
+        (("--starts", "2", "--shifts"), "--starts, --shifts and --jitter each choose the runs of a sequence: give one"),
+        (("--attributes", "attributes.json"), "give --output or --json"),
+    ],
+)
+def test_options_that_contradict_one_another_are_an_error(walk, options, message):
     result = CliRunner().invoke(evaluate, [str(walk), *options])
     assert result.exit_code == 2
-    assert "--starts, --shifts and --jitter each choose the runs of a sequence: give one of them" in result.output
-
-
-def test_attributes_without_a_file_to_write_them_to_are_an_error(walk, tmp_path):
-    result = CliRunner().invoke(evaluate, [str(walk), "--attributes", str(tmp_path / "attributes.json")])
-    assert result.exit_code == 2
-    assert "give --output or --json" in result.output
+    assert message in " ".join(result.output.split())
 
 
 def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk):
