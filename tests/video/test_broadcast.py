@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -66,6 +67,16 @@ def test_a_slow_receiver_gets_every_frame(broadcast):
         while schedule.following(time.monotonic()) < 60:
             data += answer.read1()
     assert data.count(b"\xff\xd8\xff") >= 40
+
+
+def test_a_receiver_that_disconnects_ends_its_connection_only(broadcast, until, capfd):
+    broadcast.play(Schedule(time.monotonic(), 100.0, frames=1000))
+    before = threading.active_count()
+    for _ in range(2):
+        with open_source(broadcast.urls[0]) as source:
+            assert next(iter(source)).image.shape == (48, 64, 3)
+    until(lambda: threading.active_count() <= before)
+    assert capfd.readouterr().err == ""
 
 
 def test_an_unknown_stream_is_an_http_404(broadcast):
