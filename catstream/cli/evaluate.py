@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -183,24 +182,16 @@ def _reporting_interrupt(output: Path | None) -> Iterator[None]:
 
 def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
     """Return a table of the sequences and the means."""
+    from catstream.applications.evaluation.summary import MEASURES, cells
+
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("sequence")
     table.add_column("tracker")
-    for heading in ("frames", "AUC", "success", "precision", "norm.", "F", "frames/s"):
+    for heading in ("frames", *MEASURES.values()):
         table.add_column(heading, justify="right")
     for row in rows:
-        table.add_row(row.name, row.tracker, str(row.frames), *_cells(asdict(row)))
+        table.add_row(row.name, row.tracker, str(row.frames), *cells(row))
     table.add_section()
     for tracker, mean in means.items():
-        table.add_row("mean", tracker, "", *_cells(mean), style="bold")
+        table.add_row("mean", tracker, "", *cells(mean), style="bold")
     return table
-
-
-def _cells(row: dict[str, float | None]) -> list[str]:
-    def share(measure: str) -> str:
-        value, spread = row[measure], row.get(f"{measure}_spread")
-        if value is None:
-            return "-"
-        return f"{value:.3f}" if row.get("runs", 1) == 1 or spread is None else f"{value:.3f} ±{spread:.3f}"
-
-    return [*map(share, ("auc", "success", "precision", "normalised_precision", "f_score")), f"{row['fps']:.0f}"]

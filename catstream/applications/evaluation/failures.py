@@ -64,9 +64,6 @@ def _bad(run: EvaluationRun) -> Bool:
 
 def _longest(bad: Bool) -> tuple[int, int]:
     """Return the first index and the length of the longest run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(int), [0]])))
-    begins, ends = edges[::2], edges[1::2]
-    if not len(begins):
-        return 0, 1
-    best = int((ends - begins).argmax())
-    return int(begins[best]), int(ends[best] - begins[best])
+    runs = np.ma.clump_masked(np.ma.masked_where(bad, bad))
+    longest = max(runs, key=lambda run: run.stop - run.start, default=slice(0, 1))
+    return longest.start, longest.stop - longest.start

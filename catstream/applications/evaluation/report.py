@@ -12,7 +12,15 @@ import numpy as np
 from catstream.applications.evaluation.failures import FailureStrip, failure_strip, worst_runs
 from catstream.applications.evaluation.metrics import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.summary import MEASURES, Row, by_attribute, describe_flips, mean_of, rows_of
+from catstream.applications.evaluation.summary import (
+    MEASURES,
+    Row,
+    by_attribute,
+    cells,
+    describe_flips,
+    mean_of,
+    rows_of,
+)
 from catstream.applications.html.page import figure, table, write_page
 from catstream.applications.html.plots import SHARES, Axis, plot
 from catstream.numerics.arrays import Float64
@@ -20,8 +28,6 @@ from catstream.settings import Settings
 
 __all__ = ["write_report", "write_strips"]
 
-#: Headings of `MEASURES`.
-_HEADS = ("AUC", "success", "precision", "norm. precision", "F", "frames/s")
 _STRIPS = 8  # film strips for the first tracker
 _OTHER_STRIPS = 2  # and for each other tracker
 _LEGEND = '<p class="about">White: ground truth. Orange: tracker.</p>'
@@ -104,40 +110,27 @@ def _plots(runs: list[EvaluationRun]) -> str:
 
 
 def _table(rows: list[Row]) -> str:
-    heads = ("sequence", "tracker", "frames", *_HEADS)
-    lines = []
-    for row in rows:
-        auc, success = _share(row.auc), _share(row.success)
-        if row.runs > 1:
-            auc += f" <small>±{row.auc_spread:.3f}</small>"
-            success += f" <small>±{row.success_spread:.3f}</small>"
-        rest = (row.precision, row.normalised_precision, row.f_score)
-        lines.append([escape(row.name), row.tracker, row.frames, auc, success, *map(_share, rest), f"{row.fps:.0f}"])
+    lines = [[escape(row.name), row.tracker, row.frames, *_shaded(cells(row))] for row in rows]
     means = mean_of(rows)
-    lines += [["mean", tracker, "", *_means(mean)] for tracker, mean in means.items()]
-    return table(heads, lines, texts=2, means=len(means))
+    lines += [["mean", tracker, "", *_shaded(cells(mean))] for tracker, mean in means.items()]
+    return table(("sequence", "tracker", "frames", *MEASURES.values()), lines, texts=2, means=len(means))
 
 
 def _attribute_table(rows: list[Row], attributes: Mapping[str, Sequence[str]]) -> str:
     lines = [
-        [escape(attribute), tracker, len(attributes[attribute]), *_means(mean)]
+        [escape(attribute), tracker, len(attributes[attribute]), *_shaded(cells(mean))]
         for attribute, means in by_attribute(rows, attributes).items()
         for tracker, mean in means.items()
     ]
-    return table(("attribute", "tracker", "sequences", *_HEADS), lines, texts=2, means=0)
+    return table(("attribute", "tracker", "sequences", *MEASURES.values()), lines, texts=2, means=0)
 
 
-def _means(mean: Mapping[str, float | None]) -> list[str]:
-    return [*(_share(mean[name]) for name in MEASURES if name != "fps"), f"{mean['fps']:.0f}"]
-
-
-def _share(value: float | None) -> str:
-    """Format a measure; its background is darker for a higher value."""
-    if value is None:
-        return "<small>-</small>"
-    return (
-        f'<span style="background: rgb(47 158 68 / {40 * value * value:.0f}%); padding: .1rem .3rem">{value:.3f}</span>'
-    )
+def _shaded(texts: list[str]) -> list[str]:
+    """Give the measures from 0 to 1 a background that is darker for a higher value."""
+    shades = [0 if text == "-" else 40 * float(text.partition(" ")[0]) ** 2 for text in texts[:-1]]
+    style = "background: rgb(47 158 68 / {:.0f}%); padding: .1rem .3rem"
+    shown = [f'<span style="{style.format(each)}">{text}</span>' for each, text in zip(shades, texts, strict=False)]
+    return [*shown, texts[-1]]
 
 
 def _strip_html(strip: FailureStrip) -> str:

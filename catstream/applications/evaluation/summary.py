@@ -11,10 +11,28 @@ from catstream.applications.evaluation.provenance import provenance
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
-__all__ = ["FLIP", "MEASURES", "Row", "by_attribute", "describe_flips", "flips_of", "mean_of", "rows_of", "to_json"]
+__all__ = [
+    "FLIP",
+    "MEASURES",
+    "Row",
+    "by_attribute",
+    "cells",
+    "describe_flips",
+    "flips_of",
+    "mean_of",
+    "rows_of",
+    "to_json",
+]
 
-#: The measures of a row that are averaged.
-MEASURES = ("auc", "success", "precision", "normalised_precision", "f_score", "fps")
+#: The measures of a row that are averaged, with their headings.
+MEASURES = {
+    "auc": "AUC",
+    "success": "success",
+    "precision": "precision",
+    "normalised_precision": "norm.",
+    "f_score": "F",
+    "fps": "frames/s",
+}
 
 #: Difference of the smallest and the largest success over several first boxes, above which a sequence flips.
 FLIP = 0.25
@@ -64,6 +82,19 @@ def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
         tracker: {measure: _mean(getattr(row, measure) for row in group) for measure in MEASURES}
         for tracker, group in groups.items()
     }
+
+
+def cells(measured: Row | Mapping[str, float | None]) -> list[str]:
+    """Return the measures of a row or a mean as text, in the order of `MEASURES`; with the spread of several runs."""
+    values = dataclasses.asdict(measured) if isinstance(measured, Row) else measured
+
+    def text(measure: str) -> str:
+        value, spread = values[measure], values.get(f"{measure}_spread")
+        if value is None:
+            return "-"
+        return f"{value:.3f}" if spread is None or values.get("runs") == 1 else f"{value:.3f} ±{spread:.3f}"
+
+    return [text(measure) if measure != "fps" else f"{values['fps']:.0f}" for measure in MEASURES]
 
 
 def by_attribute(
