@@ -13,7 +13,7 @@ from statistics import fmean
 import numpy as np
 from groups import CHECK
 from sequences import sequences
-from table import command
+from table import command, mean_and_error
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.evaluation.onepass import evaluate
@@ -136,8 +136,8 @@ def difference(runs: list[EvaluationRun], others: list[EvaluationRun]) -> tuple[
     Runs over one sequence are alike: they count as one.
     """
     pairs = zip(rows_of(runs), rows_of(others), strict=True)
-    apart = np.array([row.auc - other.auc for row, other in pairs])
-    return float(apart.mean()), float(apart.std(ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else 0.0
+    mean, error = mean_and_error(row.auc - other.auc for row, other in pairs)
+    return mean or 0.0, error or 0.0
 
 
 def changed(runs: list[EvaluationRun], others: list[EvaluationRun]) -> int:

@@ -10,11 +10,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from itertools import islice
-from statistics import fmean, stdev
+from statistics import fmean
 
 import numpy as np
 from learning import chosen, each, features, hits, learning_command, model_of, tracked
-from table import Table, benchmark
+from table import Table, benchmark, mean_and_error
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Box, Window
@@ -86,11 +86,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 def _paired(found: list[tuple[str, Row, float, float]]) -> Iterator[tuple]:
     for other in ("first third", "second third", "one tree"):
-        cells: list[float] = []
-        for k in (0, 1):
-            differences = [row["merged"][k] - row[other][k] for _, row, *_ in found]
-            cells += [fmean(differences), stdev(differences) / len(found) ** 0.5 if len(found) > 1 else 0.0]
-        yield f"merged - {other}", *cells
+        pairs = (mean_and_error(row["merged"][k] - row[other][k] for _, row, *_ in found) for k in (0, 1))
+        yield f"merged - {other}", *(cell or 0.0 for pair in pairs for cell in pair)
 
 
 if __name__ == "__main__":

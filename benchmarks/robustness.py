@@ -15,10 +15,9 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-import numpy as np
 from accuracy import available, many_sequences, videos
 from groups import CHECK
-from table import Cell, Table, benchmark, command
+from table import Cell, Table, benchmark, command, mean_and_error
 
 from catstream.applications.evaluation.attributes import attributes_of, read_attributes
 from catstream.applications.evaluation.datasets import Sequence
@@ -116,13 +115,6 @@ def summarised(rows: list[Row]) -> Iterator[float | None]:
     """Return the mean and the standard error of AUC, success and F-score."""
     for measure in ("auc", "success", "f_score"):
         yield from mean_and_error([getattr(row, measure) for row in rows])
-
-
-def mean_and_error(values: Iterable[float | None]) -> tuple[float | None, float | None]:
-    """Return the mean of the values that are not None, and its standard error, if there are enough."""
-    known = np.array([value for value in values if value is not None])
-    mean = float(known.mean()) if len(known) else None
-    return mean, float(known.std(ddof=1) / np.sqrt(len(known))) if len(known) > 1 else None
 
 
 def flips(rows: list[Row], part: str) -> int | None:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from statistics import fmean, stdev
+from statistics import fmean
 
 import numpy as np
 from learning import chosen, each, features, hits, learning_command, model_of, tracked, training_frames
-from table import Table, benchmark
+from table import Table, benchmark, mean_and_error
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.settings import Settings
@@ -57,14 +57,11 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
 def _summary(rows: list[tuple]) -> Iterator[tuple]:
     """The mean over the models, and its standard error; the size is the mean factor away from the true one."""
-    columns = [[row[1] for row in rows], [row[2] for row in rows], [row[4] for row in rows]]
+    (found, wrong, strangers), errors = zip(*(mean_and_error(row[k] for row in rows) for k in (1, 2, 4)), strict=True)
     sizes = [abs(np.log(row[3])) for row in rows if row[3] is not None]
-    size = float(np.exp(fmean(sizes))) if sizes else None
-    found, wrong, strangers = map(fmean, columns)
-    yield "mean", found, wrong, size, strangers
+    yield "mean", found, wrong, float(np.exp(fmean(sizes))) if sizes else None, strangers
     if len(rows) > 1:
-        found, wrong, strangers = (stdev(column) / len(rows) ** 0.5 for column in columns)
-        yield "± standard error", found, wrong, None, strangers
+        yield "± standard error", errors[0], errors[1], None, errors[2]
 
 
 if __name__ == "__main__":

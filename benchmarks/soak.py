@@ -19,22 +19,19 @@ from typing import NamedTuple
 
 import numpy as np
 import psutil
+from learning import features as learned
 from sequences import named, scratch
 from table import Table, benchmark, command, plots
 
 from catstream.applications.evaluation.datasets import Sequence
-from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.compression.tree import CoresetTree
-from catstream.detection.objects import Detectors
 from catstream.errors import ServiceError
-from catstream.features.pyramid import Pyramid
 from catstream.messages.heads import APPEARANCE, GROUPS
 from catstream.messages.kinds import End, Features, ObjectFeatures, TrainingRows
 from catstream.messages.names import UNNAMED
 from catstream.services.start import service_command
 from catstream.settings import Settings
-from catstream.training.trainer import Trainer
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES
 from catstream.wire.endpoint import Endpoint, private_folder
@@ -72,7 +69,7 @@ class Stream:
     """Makes an endless sequence of features messages from the rows of a video."""
 
     def __init__(self, sequence: Sequence, frames: int, settings: Settings) -> None:
-        features = list(cut(sequence, frames, settings))
+        features = learned(sequence, 0, frames, settings)
         seen = _all(features, APPEARANCE)
         self._object, self._background = seen.rows[seen.labels == 1], seen.rows[seen.labels == 0]
         self._others = {group: _all(features, group) for group in GROUPS if group != APPEARANCE}
@@ -110,18 +107,6 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield Table("In one process", COLUMNS, list(doubling(here)), note)
     note = "the compressor's process, with its checkpoints, over a Unix socket: from the sender's side, all stored"
     yield Table("Through the process", ("messages", "us a message", "resident MB", "handles", "disk MB"), there, note)
-
-
-def cut(sequence: Sequence, frames: int, settings: Settings) -> Iterator[ObjectFeatures]:
-    """Return the features of the object in the first frames of a sequence."""
-    detectors, forest, trainer = Detectors(settings), Forest(settings), Trainer(settings)
-    for number, image in zip(range(frames), sequence.frames(), strict=False):
-        frame = Pyramid.of(image)
-        given = {} if number else {UNNAMED: detectors.begin(UNNAMED, frame, Box(*sequence.boxes[0]))}
-        _, features = detectors.step(frame, given=given)
-        yield features.objects[UNNAMED]
-        for sample in forest.take(features):
-            detectors.adopt(trainer.train(sample))
 
 
 def alone(stream: Stream, messages: int, settings: Settings) -> list[Measurement]:

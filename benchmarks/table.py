@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean, stdev
 from typing import Any
 
 from catstream.applications.evaluation.provenance import provenance
@@ -20,7 +21,7 @@ from catstream.errors import CatstreamError
 from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
 
-__all__ = ["Cell", "Table", "benchmark", "command", "plots", "publish", "text"]
+__all__ = ["Cell", "Table", "benchmark", "command", "mean_and_error", "plots", "publish", "text"]
 
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")
@@ -112,6 +113,12 @@ def publish(tables: Iterable[Table], options: argparse.Namespace, settings: Sett
     if options.json is not None:
         figures = {**provenance(settings or Settings(), list(_words())), "tables": shown}
         options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+def mean_and_error(values: Iterable[float | None]) -> tuple[float | None, float | None]:
+    """Return the mean of the values that are not None, and its standard error, if there are enough."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None, stdev(known) / len(known) ** 0.5 if len(known) > 1 else None
 
 
 @contextmanager

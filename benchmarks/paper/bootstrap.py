@@ -8,14 +8,11 @@ several places of each sequence. The paper prints no figures of its bootstrap al
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
-
+import shared  # noqa: F401
 from accuracy import MEANS, accuracy_command, compared, difference, means, starts_of, videos
 from table import Table, benchmark
 

@@ -8,12 +8,9 @@ tables 2 and 5 have the columns of Panda and Volkswagen the other way round; thi
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
-
+import shared  # noqa: F401
 from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark

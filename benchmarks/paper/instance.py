@@ -27,9 +27,7 @@ from unittest.mock import patch
 
 import cv2
 import numpy as np
-
-sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
-
+import shared  # noqa: F401
 from groups import CHECK
 from sequences import scratch, sequences
 from table import Table, benchmark, command

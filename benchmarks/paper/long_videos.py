@@ -9,15 +9,12 @@ the object jumps.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
-
-sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
-
+import shared  # noqa: F401
 from journey import Journey, draw, travel
 from sequences import named, scratch
 from table import Table, benchmark, command

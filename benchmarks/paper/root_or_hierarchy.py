@@ -7,12 +7,9 @@ whole frame searched), once with our settings.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
-
+import shared  # noqa: F401
 from accuracy import MEANS, accuracy_command, described, means, spread, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark

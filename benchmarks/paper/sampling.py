@@ -9,15 +9,11 @@ we do it.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-
-sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
-
+import shared  # noqa: F401
 from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark

@@ -8,15 +8,12 @@ constant on average, at several n. Its figure prints no numbers.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-
-sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
-
+import shared  # noqa: F401
 from sequences import named
 from table import Table, benchmark, command, plots
 

@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from statistics import fmean
 
-sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
-
+import shared  # noqa: F401
 from accuracy import accuracy_command, compared, videos
 from table import Table, benchmark
 
