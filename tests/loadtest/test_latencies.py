@@ -19,6 +19,15 @@ def test_percentiles_are_those_of_the_sorted_latencies_to_three_digits(rng):
         assert latencies[name] == pytest.approx(exact, rel=2e-3), name
 
 
+def test_the_distribution_rises_from_the_shortest_to_the_longest_latency(rng):
+    seconds = rng.lognormal(-4, 1, 2_000)
+    shares, values = Latencies(seconds).distribution()
+    assert (shares[0], shares[-1]) == (0, 1)
+    assert (np.diff(shares) >= 0).all()
+    assert (values[0], values[-1]) == pytest.approx((seconds.min(), seconds.max()), rel=2e-3)
+    assert values == pytest.approx(np.quantile(seconds, shares, method="inverted_cdf"), rel=5e-3)
+
+
 def test_a_latency_above_an_hour_is_counted_as_an_hour():
     assert Latencies([0.01, 1e6])["max"] == pytest.approx(3600, rel=1e-2)
 

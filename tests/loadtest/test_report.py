@@ -74,6 +74,10 @@ def test_every_stream_process_and_kill_has_its_row(result, tmp_path):
     assert '<tr class="mean"><td class="text">all</td>' in page
     for plot in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ElementTree.fromstring(plot)
+    for title in ("From frame to track", "From frame to the model trained on it", "Latency to the track over time"):
+        (plot,) = (plot for plot in page.split("<svg")[1:] if f'aria-label="{title}"' in plot)
+        curves = re.findall(r'points="([^"]*)"', plot)
+        assert [len(set(curve.split())) > 1 for curve in curves] == [True, True], title
     processor = next(plot for plot in page.split("<svg")[1:] if 'aria-label="Processor"' in plot)
     assert ">detector<" in processor
 

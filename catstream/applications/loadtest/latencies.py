@@ -48,9 +48,9 @@ class Latencies:
 
     def distribution(self) -> tuple[np.ndarray, np.ndarray]:
         """Return percentiles as shares from 0 to 1, denser towards 1, and the latencies in seconds."""
-        steps = list(self._histogram.get_percentile_iterator(_STEPS))
-        shares = np.array([step.percentile_level_iterated_to for step in steps]) / 100
-        return shares, np.array([step.value_iterated_to for step in steps]) / 1e6
+        steps = self._histogram.get_percentile_iterator(_STEPS)  # yields one object, which it changes
+        found = np.array([(step.percentile_level_iterated_to, step.value_iterated_to) for step in steps], float)
+        return found[:, 0] / 100, found[:, 1] / 1e6
 
     def write(self, path: Path) -> None:
         """Write the percentile distribution in milliseconds, in the .hgrm format of HdrHistogram's plotter.

@@ -37,6 +37,7 @@ class Table(NamedTuple):
 
     note   explanation of the columns
     means  number of rows at the end that summarise the others
+    texts  number of columns of words, the first ones
     """
 
     title: str
@@ -44,6 +45,7 @@ class Table(NamedTuple):
     rows: list[tuple[str, ...]]
     note: str = ""
     means: int = 0
+    texts: int = 1
 
 
 def tables(result: Result) -> Iterator[Table]:
@@ -227,7 +229,7 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
 def _html(shown: Table) -> str:
     rows = [[escape(cell) for cell in row] for row in shown.rows]
     note = f'<p class="about">{shown.note}</p>' if shown.note else ""
-    return f"<h2>{shown.title}</h2>{table(shown.heads, rows, means=shown.means)}{note}"
+    return f"<h2>{shown.title}</h2>{table(shown.heads, rows, texts=shown.texts, means=shown.means)}{note}"
 
 
 def _verdict(result: Result) -> str:
@@ -252,13 +254,14 @@ def _steps(load_test: LoadTest) -> Table:
     rows = [
         (
             f"{step.plan.rate:g} frames/s",
+            "; ".join(violations(load_test.limits, step)) or "met",
             f"{step.followed:.1f}",
             *(milliseconds(step.track[name]) for name in PERCENTILES),
-            "; ".join(violations(load_test.limits, step)) or "met",
         )
         for step in load_test.results
     ]
-    return Table(title, ("due", "tracked", *(f"{name} ms" for name in PERCENTILES), "limits"), rows, "In this order.")
+    heads = ("due", "limits", "tracked", *(f"{name} ms" for name in PERCENTILES))
+    return Table(title, heads, rows, "The runs, in this order.", texts=2)
 
 
 def _plots(result: Result) -> Iterator[str]:
