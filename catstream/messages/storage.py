@@ -177,6 +177,7 @@ def is_locked(handle: int) -> bool:
 
 
 def _flock(handle: int, kind: int) -> bool:
+    """Lock an open file or folder without waiting; returns False if another process has locked it."""
     try:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -6,8 +6,7 @@
     models     as samples
     tracks     every message, one for each object and frame, to any number of subscribers; a slow one misses some, and
                sees by `seq` how many
-    results    the tracks again, one message a frame, acknowledged, for the process that started the pipeline, its
-               owner; the files that it writes are `catstream.run.job.Results`
+    results    the tracks again, one message a frame, acknowledged, for the process that started the pipeline, its owner
     health     the newest of each process
     previews   small pictures of the newest frame; none is made while nobody subscribes
     control    commands and their answers; a command without an answer is sent again, and carried out once

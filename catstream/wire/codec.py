@@ -29,25 +29,9 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 from catstream.messages.checks import check_message
-from catstream.messages.kinds import (
-    Answer,
-    Command,
-    End,
-    Features,
-    Health,
-    Listing,
-    Model,
-    Position,
-    Preview,
-    Question,
-    Run,
-    Sample,
-    SavedModel,
-    Stored,
-    Track,
-    Tracks,
-)
+from catstream.messages.kinds import Position, Stored
 from catstream.messages.schema import LONGEST_LIST, LONGEST_TEXT
+from catstream.wire.channels import CHANNELS, REGISTRY
 
 __all__ = [
     "KINDS",
@@ -68,27 +52,11 @@ VERSION = 4
 
 _LONGEST_TOPIC = 512  # bytes
 
-#: Kinds of message, by their name on the wire.
+#: Kinds of message, by their name on the wire: those of the channels, and the replies on acknowledged channels.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind
-    for kind in (
-        Answer,
-        Command,
-        End,
-        Features,
-        Health,
-        Listing,
-        Model,
-        Position,
-        Preview,
-        Question,
-        Run,
-        Sample,
-        SavedModel,
-        Stored,
-        Track,
-        Tracks,
-    )
+    for kinds in (*(channel.messages for channel in (*CHANNELS.values(), REGISTRY)), (Position, Stored))
+    for kind in kinds
 }
 
 

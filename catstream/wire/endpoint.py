@@ -42,10 +42,8 @@ _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
-_NOTE = "endpoint"  # file in the private folder of a running pipeline that holds its endpoint
-_SOURCE = "source"  # file beside it that names the source of the pipeline
-_FLEET_NOTE = "fleet-endpoint"  # file in the private folder of the controller of a fleet that holds its endpoint
-_FLEET_NAME = "fleet-name"  # file beside it that names the fleet
+_NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
+_FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
 _EARLY = f"{_PREFIX}early-"  # begins the names of the notes of subscribers that wait for a pipeline
 
 
@@ -250,43 +248,35 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
         os.close(handle)
 
 
-@contextlib.contextmanager
-def _noted(endpoint: Endpoint, folder: Path, source: str, fleet: str) -> Iterator[None]:
-    """Keep a file with an endpoint, locked until the process ends, and beside it one with the source or the fleet."""
-    about = folder / (_FLEET_NAME if fleet else _SOURCE)
-    text = "\n".join([str(endpoint), *([str(endpoint.keys.folder)] if endpoint.keys is not None else [])])
-    try:
-        about.write_text(fleet or source)
-        with Note(folder / (_FLEET_NOTE if fleet else _NOTE), text):
-            yield
-    finally:
-        about.unlink(missing_ok=True)
+def _noted(endpoint: Endpoint, folder: Path, source: str, fleet: str) -> Note:
+    """Note an endpoint with its source or its fleet, until the note is closed or the process ends."""
+    keys = str(endpoint.keys.folder) if endpoint.keys is not None else ""
+    return Note(folder / (_FLEET_NOTE if fleet else _NOTE), "\n".join([str(endpoint), keys, fleet or source]))
 
 
 def running() -> list[Endpoint]:
     """Endpoints of this user's running pipelines, in no order."""
-    return [replace(endpoint, source=source) for endpoint, source in _endpoints(_NOTE, _SOURCE)]
+    return [replace(endpoint, source=source) for endpoint, source in _endpoints(_NOTE)]
 
 
 def fleets() -> dict[str, Endpoint]:
     """Endpoints of the controllers of this user's running fleets on this machine, by the names of the fleets."""
-    return {name: endpoint for endpoint, name in _endpoints(_FLEET_NOTE, _FLEET_NAME)}
+    return {name: endpoint for endpoint, name in _endpoints(_FLEET_NOTE)}
 
 
-def _endpoints(note: str, about: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, str]]:
-    """The endpoint in each note whose process is running, and the text of the file beside it.
+def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, str]]:
+    """The endpoint in each note whose process is running, and the source or name in it.
 
     An endpoint whose keys cannot be read is skipped, because it must not hide the others; if `strict`, it is an error.
     """
-    for path, text in _notes(_homes(), f"{_PREFIX}*/{note}"):
+    for _, text in _notes(_homes(), f"{_PREFIX}*/{note}"):
         if text is not None:
+            place, keys, about = text.split("\n", 2)
             try:
-                endpoint = Endpoint.parse(*text.split("\n"))
+                yield Endpoint.parse(place, keys), about
             except ServiceError:
                 if strict:
                     raise
-                continue
-            yield endpoint, _read(path.with_name(about))
 
 
 def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
@@ -314,20 +304,13 @@ def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
             raise ServiceError(f"{len(found)} pipelines follow {source!r}: say which (--endpoint){_listed(found)}")
         return found[0]
     if not endpoints:
-        list(_endpoints(_NOTE, _SOURCE, strict=True))  # one whose keys cannot be read is running: say so
+        list(_endpoints(_NOTE, strict=True))  # one whose keys cannot be read is running: say so
         raise ServiceError("no pipeline of yours is running: start one (catstream track), or give its --endpoint")
     if len(endpoints) > 1:
         raise ServiceError(
             f"{len(endpoints)} pipelines are running: say which (--endpoint or --source){_listed(endpoints)}"
         )
     return endpoints[0]
-
-
-def _read(path: Path) -> str:
-    """The text of a file, empty if there is none."""
-    with contextlib.suppress(OSError):
-        return path.read_text()
-    return ""
 
 
 def _listed(endpoints: list[Endpoint]) -> str:

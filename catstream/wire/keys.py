@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,7 @@ from typing import get_args
 import zmq
 
 from catstream.errors import ServiceError
-from catstream.messages.storage import write_atomically
+from catstream.messages.storage import create_atomically, write_atomically
 from catstream.wire.channels import Role
 
 __all__ = ["ROLES", "Client", "Keys", "allow", "allowed", "clients", "create", "public_key", "revoke", "synchronise"]
@@ -266,15 +265,7 @@ def _write(path: Path, **facts: bytes) -> None:
     """Write a new file atomically; only its owner can read it at any time."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle, part = tempfile.mkstemp(dir=path.parent, prefix=".")  # mode 0600; no client's name begins with a dot
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(_text(**facts))
-                file.flush()
-                os.fsync(handle)
-            os.link(part, path)  # unlike a rename, this never replaces a file
-        finally:
-            Path(part).unlink()
+        create_atomically(path, _text(**facts))  # beside a file whose name begins with a dot, as no client's does
     except FileExistsError:
         raise ServiceError(f"{path} exists already and is not written over: give another folder") from None
     except OSError as error:

@@ -171,7 +171,7 @@ def test_a_killed_pipeline_is_not_found():
     killed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     place = Path(killed.stdout.strip())
     try:
-        assert (place / "endpoint").read_text() == str(place)
+        assert (place / "endpoint").read_text() == f"{place}\n\n"
         assert Endpoint.parse(str(place)) not in running()
     finally:
         shutil.rmtree(place)
