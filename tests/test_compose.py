@@ -169,7 +169,7 @@ def test_ports_for_subscribers_are_published_on_this_host_alone_if_there_are_key
     wanted = {
         int(compose.address(channel, sender).rpartition(":")[2])
         for channel in CHANNELS.values()
-        if channel.role in ("watch", "steer")
+        if channel.role in ("watch", "control")
         for sender in channel.senders
     }
     assert set(published(WITH_KEYS["network"])) == {("127.0.0.1", port) for port in wanted}

@@ -65,13 +65,13 @@ def allow_(folder: Path, name: str, role: Role, output: Path | None, public: str
     \b
     ROLE
       watch     subscribe to tracks, models, samples and health
-      steer     watch, and send commands to a running pipeline
+      control   watch, and send commands to a running pipeline
       pipeline  everything: another machine that runs processes of this pipeline
 
     \b
     EXAMPLES
       catstream keys allow keys phone --output phone-keys
-      catstream keys allow keys desk --role steer --public 'Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID'
+      catstream keys allow keys desk --role control --public 'Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID'
     """
     if (output is None) == (public is None):
         raise click.UsageError("give --output, a folder for the new keys of the client, or --public, the key it has")

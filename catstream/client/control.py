@@ -52,7 +52,7 @@ class Control:
         From each command, if no answer arrives in time; the command may still be executed later. If no pipeline runs at
         the endpoint, a folder, that is said after a second.
     ServiceError
-        From each command, if these keys do not have the role "steer".
+        From each command, if these keys do not have the role "control".
     """
 
     def __init__(
@@ -223,7 +223,7 @@ def control(endpoint: str = "", *, timeout: float = ANSWER_SECONDS, keys: str = 
     timeout : float
         Seconds to wait for the answer to a command.
     keys : str
-        Folder of the keys of this client, if the pipeline requires keys; their role must be "steer".
+        Folder of the keys of this client, if the pipeline requires keys; their role must be "control".
     source : str
         Source that the pipeline tracks, for example "walk.mp4", instead of its endpoint.
 

@@ -63,7 +63,7 @@ __all__ = [
 ]
 
 #: The permissions of a client: each role includes those before it.
-Role = Literal["watch", "steer", "pipeline"]
+Role = Literal["watch", "control", "pipeline"]
 
 #: The port of the first channel, by default.
 PORT = 5700
@@ -130,7 +130,7 @@ PREVIEWS: Channel[Preview] = Channel(
     "previews", (Preview,), ("detector",), None, "newest", port=8, megabytes=1, role="watch", high_water_mark=8
 )
 CONTROL: Channel[Command | Answer] = Channel(
-    "control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=64, role="steer"
+    "control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=64, role="control"
 )
 TRAINING: Channel[Run | Features | End] = Channel(
     "training",

@@ -142,7 +142,7 @@ def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(
     stream = folder / "stream"
     create(stream)
     own = clients(stream)["pipeline"]
-    allow(stream, "old", "steer", output=folder / "old")
+    allow(stream, "old", "control", output=folder / "old")
     synchronise(stream, allowed(fleet_keys))
     assert clients(stream) == {
         "pipeline": own,
@@ -150,9 +150,9 @@ def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(
         "anna": clients(fleet_keys)["anna"],
     }
     revoke(fleet_keys, "anna")
-    allow(fleet_keys, "anna", "steer", output=folder / "new")
+    allow(fleet_keys, "anna", "control", output=folder / "new")
     synchronise(stream, allowed(fleet_keys))
-    assert clients(stream)["anna"] == Client("steer", Keys.load(folder / "new").public.decode())
+    assert clients(stream)["anna"] == Client("control", Keys.load(folder / "new").public.decode())
     assert (stream / "clients" / "anna").stat().st_mode & 0o777 == 0o600
 
 

@@ -36,7 +36,7 @@ from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejects
 
 WINDOW = 4
-CLIENTS = {"watcher": "watch", "helm": "steer", "host": "pipeline"}  # name and role of some
+CLIENTS = {"watcher": "watch", "helm": "control", "host": "pipeline"}  # name and role of some
 WATCHED = [name for name, channel in CHANNELS.items() if channel.role == "watch"]
 
 #: Of each channel, who has no place there.
@@ -155,14 +155,14 @@ def test_keys_are_not_written_over(keys):
     with pytest.raises(ServiceError, match="not written over"):
         allow(keys, "other", "watch", output=keys.parent / "watcher")
     with pytest.raises(ServiceError, match="a client helm already"):
-        allow(keys, "helm", "steer", output=keys.parent / "other")
+        allow(keys, "helm", "control", output=keys.parent / "other")
     assert before == {path: path.read_bytes() for path in keys.parent.glob("**/*") if path.is_file()}
 
 
 def test_a_client_with_keys_of_its_own_is_allowed_by_the_public_one(keys):
     public, _ = zmq.curve_keypair()
-    allow(keys, "desk", "steer", public=public.decode())
-    assert Keys.load(keys).client(public.decode()) == ("desk", "steer")
+    allow(keys, "desk", "control", public=public.decode())
+    assert Keys.load(keys).client(public.decode()) == ("desk", "control")
     with pytest.raises(ServiceError, match="that of desk"):
         allow(keys, "again", "watch", public=public.decode())
 
@@ -205,7 +205,7 @@ def test_a_client_that_may_watch_receives_messages(name, place, listener, until)
     assert heard
 
 
-def test_a_client_that_may_steer_receives_answers(place, until):
+def test_a_client_that_may_send_commands_receives_answers(place, until):
     with Responder(CONTROL, place()) as detector, Requester(CONTROL, place("helm")) as helm:
         answers = []
 
