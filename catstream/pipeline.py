@@ -23,7 +23,7 @@ from catstream.errors import RecordingError, ServiceError, SettingsError
 from catstream.messages.kinds import Health, Position, Track
 from catstream.messages.names import Boxes, check_boxes
 from catstream.run.job import Job, Models, Results, files_by_name
-from catstream.run.learned import Learned, check_sizes
+from catstream.run.learned import check_files
 from catstream.run.state import begun, position, saved
 from catstream.services.run_reader import RunReader
 from catstream.services.start_server import start_server
@@ -153,9 +153,7 @@ class Pipeline:
         check_boxes(job.boxes, *self.size)
         path = job.source if self.live else str(Path(job.source).absolute())
         self._job = replace(job, source=path, size=self.size, settings=job.settings.for_length(self.frames))
-        for file in job.models.values():
-            Learned.load(file).check_fits(self._job.settings)
-        check_sizes({name: file.stat().st_size for name, file in job.models.items()})
+        check_files(job.models, self._job.settings)
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
         self._save_models = job.results.models if save_model is None else files_by_name(save_model)

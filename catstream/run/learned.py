@@ -34,7 +34,7 @@ from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
-__all__ = ["Learned", "begun", "check_sizes", "merge"]
+__all__ = ["Learned", "begun", "check_files", "check_sizes", "merge"]
 
 _KIND = "learned 3"  # and the version of what the file holds
 
@@ -205,6 +205,21 @@ class Learned:
             tree, width = self.trees[name], len(self.model.weights) + kind.more_columns
             if tree.size != self.settings.coreset.size or tree.width not in (0, width):
                 raise ValueError(f"its tree {name!r} has {tree.size} rows of length {tree.width}")
+
+
+def check_files(files: Mapping[str, Path], settings: Settings) -> None:
+    """Raise an error unless objects can begin with the saved models in these files, by name, in the first frame.
+
+    Raises
+    ------
+    ServiceError, ProtocolError
+        If one of them cannot be read.
+    SettingsError
+        If one of them was learned with other settings, or they are too large.
+    """
+    for file in files.values():
+        Learned.load(file).check_fits(settings)
+    check_sizes({name: file.stat().st_size for name, file in files.items()})
 
 
 def check_sizes(sizes: Mapping[str, int]) -> None:
