@@ -270,8 +270,8 @@ def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, s
     An endpoint whose keys cannot be read is skipped, because it must not hide the others; if `strict`, it is an error.
     """
     for _, text in _notes(_homes(), f"{_PREFIX}*/{note}"):
-        if text is not None:
-            place, keys, about = text.split("\n", 2)
+        if text:
+            place, keys, about = [*text.split("\n", 2), "", ""][:3]  # another version may write less
             try:
                 yield Endpoint.parse(place, keys), about
             except ServiceError:

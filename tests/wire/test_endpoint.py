@@ -14,7 +14,7 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import Endpoint, find, meeting_place, private_folder, running
+from catstream.wire.endpoint import Endpoint, Note, find, meeting_place, private_folder, running
 from catstream.wire.keys import Keys, create
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
@@ -199,6 +199,17 @@ def test_without_a_place_there_must_be_just_one_pipeline(folder, monkeypatch):
         assert find() == first
         with meeting_place("", two), pytest.raises(ServiceError, match="2 pipelines are running: say which"):
             find()
+
+
+@pytest.mark.parametrize("text", ["", "run", "run\n", "http://run\n\n"])
+def test_a_note_of_another_version_does_not_hide_the_pipelines_of_this_one(text):
+    with (
+        private_folder() as one,
+        meeting_place("", one, source="good.mp4") as good,
+        private_folder() as two,
+        Note(two / "endpoint", text),
+    ):
+        assert {str(good): "good.mp4"}.items() <= {str(endpoint): endpoint.source for endpoint in running()}.items()
 
 
 def test_a_pipeline_whose_keys_cannot_be_read_does_not_hide_the_others(tmp_path):
