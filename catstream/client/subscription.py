@@ -134,7 +134,7 @@ class Subscription(Generic[Message]):
         self.endpoint, self.keys, self.timeout = str(endpoint), keys, timeout
         self.end: End | None = None
         self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
-        self._close_time = float("inf")  # when to stop waiting
+        self._close_time = float("inf")  # until which messages may still arrive after the end
         self._rejected = 0  # by the connections before this one
         self._connection: _Connection | None = None
         self._stream = follow(endpoint, keys)

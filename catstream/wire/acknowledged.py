@@ -18,6 +18,7 @@ from catstream.messages.kinds import End, Position, Stored
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.go_back_n import HELLO, Deliver, ReceiveWindow, Reject, Reply, SendWindow
+from catstream.wire.monitor import Event
 from catstream.wire.socket import ChannelSocket
 from catstream.wire.timing import LINGER_SECONDS, PATIENCE_SECONDS
 
@@ -208,7 +209,7 @@ class Receiver(ChannelSocket[Message]):
     def close(self) -> None:
         """Close, after the sender if it has sent its end: a connection that breaks may cost it the last reply."""
         if self._window.ended and self._window.connected:
-            self._read_events(LINGER_SECONDS, until=lambda event: event.disconnected)
+            self._read_events(LINGER_SECONDS, until=Event.DISCONNECTED)
         super().close()
 
     def _disconnected(self) -> None:

@@ -72,7 +72,7 @@ class SendWindow:
     ----------
     sent : newest seq that was pushed
     acknowledged : newest seq that the receiver will not ask for again while it lives
-    stored : newest seq that survives the receiver's death; less than `acknowledged` while its disk fails
+    stored : newest seq that survives the receiver's death; below `acknowledged` while its disk cannot be written
     taken : newest seq that the receiver has processed
     versions : version of the newest sample of each object that the receiver has made, by name
     """
@@ -135,7 +135,7 @@ class SendWindow:
         if reply.seq > max(self.sent, self._sent_before):
             raise ProtocolError(
                 f"the receiver of {self._channel} has stored message {reply.seq}, only {self.sent} were sent: "
-                "it holds another stream, restart it or start this process with --resume"
+                "it holds another stream: restart it, or start this process with --resume"
             )
         if isinstance(reply, Position):
             self._go_back(reply)

@@ -104,7 +104,7 @@ class ChannelSocket(Generic[Message]):
             self._socket.close()
             # libzmq stops listening some time later, and would remove the socket file of the next one with its own.
             # Unbinding first would be faster, but drops queued messages.
-            self._read_events(2 * timing.LINGER_SECONDS, until=lambda event: event.stopped)
+            self._read_events(2 * timing.LINGER_SECONDS, until=Event.STOPPED)
             self._listens = False
         elif not self._socket.closed:
             self._socket.disable_monitor()
@@ -199,7 +199,7 @@ class ChannelSocket(Generic[Message]):
         self.rejected += 1
         reject(self.channel.name, reason, text)
 
-    def _read_events(self, seconds: float = 0.0, until: Callable[[Event], bool] = lambda _: False) -> None:
+    def _read_events(self, seconds: float = 0.0, until: Event | None = None) -> None:
         """Handle what was reported about connections; wait so long for each event, until a certain one.
 
         Raises
@@ -210,13 +210,13 @@ class ChannelSocket(Generic[Message]):
         if self._monitor is None:
             return
         for event in self._monitor.events(_milliseconds(seconds)):
-            if event.disconnected:
+            if event is Event.DISCONNECTED:
                 self._disconnected()
             elif self._listens:
                 self._failed_to_connect(event)
             else:
                 self._raise_if_denied(event)
-            if until(event):
+            if event is until:
                 break
 
     def _disconnected(self) -> None:
@@ -226,18 +226,18 @@ class ChannelSocket(Generic[Message]):
 
     def _failed_to_connect(self, event: Event) -> None:
         """A peer failed the handshake; a key that was denied is counted by the ZAP handler already."""
-        if not event.stopped and not event.denied:
+        if event in (Event.OTHER_MECHANISM, Event.FAILED):
             missing = "does not speak ZeroMQ" if self._endpoint.keys is None else "lacks the pipeline's keys"
             reject(self.channel.name, "handshake", f"a peer was rejected: it {missing}")
 
     def _raise_if_denied(self, event: Event) -> None:
-        if event.denied:
+        if event is Event.DENIED:
             raise ServiceError(
                 f"{self._endpoint} rejects this key: it was revoked, was never allowed, or lacks the role "
                 f"{self.channel.role}, which {self.channel.name} requires; the pipeline's log says which: "
                 "ask its administrator (catstream keys allow)"
             )
-        if event.other_mechanism and self._endpoint.keys is None:
+        if event is Event.OTHER_MECHANISM and self._endpoint.keys is None:
             raise ServiceError(
                 f"the pipeline at {self._endpoint} requires authentication: pass a folder of keys that it allows "
                 "(--keys DIR, see catstream keys)"

@@ -39,7 +39,7 @@ class ZapHandler:
         self._thread: threading.Thread | None = None
 
     def register(self, channel: Channel[object], keys: Keys) -> bytes:
-        """Answer for one more socket; returns its domain."""
+        """Register a socket that listens; returns its domain."""
         with self._lock:
             domain = f"{channel.name} {next(self._numbers)}".encode()
             self._sockets[domain] = channel, keys
