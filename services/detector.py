@@ -1,60 +1,72 @@
 """The process that tracks the objects in each frame with their newest models, and sends tracks and features.
 
-`main` shows the order of events, and `DetectorLoop` connects them to sockets. The decisions are pure functions in
-`resume`, `pacing`, `delivery` and `commands`.
+`main` shows the order of events. `DetectorLoop` tells its core what happens, and carries out what the core orders: all
+decisions are in `catstream.services.core`.
 """
 
 from __future__ import annotations
 
 import logging
-import math
+import tempfile
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from typing import TypeVar
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import cv2
 
 from catstream.detection import objects
 from catstream.detection.detector import Detector, Result
 from catstream.detection.objects import Detectors
-from catstream.errors import ProtocolError, VideoError
+from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.features.pyramid import Pyramid
 from catstream.messages import storage
-from catstream.messages.kinds import End, Features, Model, Position, Tracks
+from catstream.messages.kinds import Command, End, Features, Model, Position, Tracks
 from catstream.numerics import ridge
 from catstream.run.learned import Learned
 from catstream.run.state import SEARCHED
-from catstream.services.commands import CommandHandler
-from catstream.services.control import CommandChannel
-from catstream.services.delivery import Step, next_step
+from catstream.services import actions, core
+from catstream.services.actions import Action
+from catstream.services.core import Event, History
+from catstream.services.core_state import Known, Phase, Progress, Request, Rules, Saved, State
 from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.loop import RECORDER, Process
 from catstream.services.model_files import ModelFiles
-from catstream.services.outputs import DataSender, Outputs
-from catstream.services.pacing import Awaited, awaited
-from catstream.services.resume import agree, start
+from catstream.services.outputs import Outputs
 from catstream.video import source
 from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password
 from catstream.video.source import open_source
-from catstream.wire.acknowledged import Sender
-from catstream.wire.channels import MODELS
+from catstream.wire.channels import CONTROL, MODELS
+from catstream.wire.commands import Responder
 from catstream.wire.newest import Subscriber
-from catstream.wire.timing import EARLY_SECONDS
 
 __all__ = ["main", "opening_seconds", "prepare"]
 
-Message = TypeVar("Message", Features | End, Tracks | End)
-
 _FILE = "desired_state.json"  # in the folder of the state
-_COMPRESSOR_SECONDS = 10.0  # time for the compressor to store the end, once the process was asked to end
-_OWNER_SECONDS = 0.5  # the same for the owner of the run, which may no longer receive
-_OPEN_SECONDS = 60.0  # limit for opening the source, and for the first frame
+_EVENTS_FILE = "detector_events.ndjson"  # the same, after a crash
+_OPEN_SECONDS = 60.0  # limit for opening the source, for the first frame, and for an object that begins
 _SKIP_SECONDS = 0.1  # limit for decoding a skipped frame
 _TURN_SECONDS = 0.02  # from one turn of a waiting loop to the next
+_MODEL_SECONDS = 60.0  # limit for reading saved models, and for writing them to a slow disk
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
+
+#: The channel whose acknowledgements are waited for in a phase.
+_CHANNELS = {
+    Phase.SUBSCRIBERS: "features",
+    Phase.RESULTS: "results",
+    Phase.OWNER: "results",
+    Phase.FEATURES: "features",
+    Phase.TAKEN: "features",
+    Phase.END_FEATURES: "features",
+    Phase.END_STORED: "features",
+    Phase.END_RESULTS: "results",
+    Phase.END_OWNER: "results",
+}
 
 _log = logging.getLogger(__name__)
 
@@ -73,19 +85,13 @@ def main(process: Process) -> None:
     reason, failed = "the source has ended", False
     with ExitStack() as stack:
         loop = DetectorLoop(process, stack)
-        loop.wait_for_subscribers()
-        if process.job.resume:
-            loop.resume()
+        loop.wait()  # for subscribers, and for the position of an earlier detector
         frames = loop.open(stack)
         try:
             for frame in frames:
-                result = loop.track(frame)
-                if result is not None:
-                    loop.send(frame, *result)
-                    loop.wait_for_model()
-                if loop.end_reason:
+                loop.take(frame)
+                if loop.state.end_reason:
                     break
-            reason = loop.end_reason or reason
         except VideoError as error:
             reason, failed = str(error), True
         loop.end(reason, failed)
@@ -95,114 +101,106 @@ def main(process: Process) -> None:
 
 
 class DetectorLoop:
-    """The detectors, and the sockets that they are connected to.
-
-    Every method that waits does so in turns: see `turn`.
-    """
+    """The detectors, and the sockets that they are connected to."""
 
     def __init__(self, process: Process, stack: ExitStack) -> None:
-        state = process.job.state
-        file = state / _FILE if state is not None else None
-        objects.prepare(process.settings)
-        self.detectors = Detectors(process.settings)
-        self._process, self._model_files = process, ModelFiles(state / SEARCHED if state is not None else None)
-        self._commands = CommandHandler(self.detectors, _desired(process, self._model_files), self._model_files)
-        self._control = stack.enter_context(CommandChannel(process.endpoint, self._commands, file, process.allow))
+        settings, job = process.settings, process.job
+        objects.prepare(settings)
+        self._process, self._began = process, time.monotonic()
+        self._models_of_job = ModelFiles(job.state / SEARCHED if job.state is not None else None)
+        desired = _desired(process, self._models_of_job)
+        rules = Rules(
+            window=settings.run.unstored_frames,
+            lag_frames=0 if settings.run.lockstep else settings.run.lag_frames,
+            lockstep=settings.run.lockstep,
+            objects_most=settings.run.objects_most,
+            context=settings.search.context,
+            owned=job.owned,
+            recorded=job.record is not None,
+            resumes=job.resume,
+        )
+        self._core = History(State.at_start(rules, desired, self._models_of_job.sizes))
+        stack.push(self._write_events)
+        self._detectors = Detectors(settings)
+        self._control: Responder[Command, Any] = stack.enter_context(
+            Responder(CONTROL, process.endpoint, longest=CONTROL.limit)
+        )
         self._outputs = stack.enter_context(Outputs(process))
         self._models = stack.enter_context(Subscriber(MODELS, process.endpoint))
         self._source: Source | None = None
-        self._skipped = 0  # frames that were skipped while the run was paused or waited for a box
+        self._kept: DesiredState | None = None  # in the file
+        self._frame: Frame | None = None  # the present one
+        self._given: dict[str, Result] = {}  # of the objects that are not searched in it
+        self._begun: dict[str, Learned] = {}  # the saved models that begin in it
         self._tracks = Tracks(0, 0, {})  # the last ones
-        self._sent_before = math.inf if process.job.resume else 0  # the last message of an earlier detector
+        self._features = Features(0, 0, 0.0, {})
+        self._positions: dict[str, Position] = {}  # the answers of the receivers, by channel
+        self._arrived: dict[str, Model] = {}  # before the positions agree
+        self._do: dict[type[Action], Callable[[Any], Event | None]] = {
+            actions.Continue: self._continue,
+            actions.Resume: self._resume,
+            actions.SetBox: self._set_box,
+            actions.Forget: self._forget,
+            actions.Begin: self._begin,
+            actions.Seek: self._seek,
+            actions.Miss: self._miss,
+            actions.Step: self._step,
+            actions.Send: self._send,
+            actions.GiveUp: self._give_up,
+            actions.Show: self._show,
+            actions.Conclude: self._conclude,
+            actions.Finish: self._finish,
+        }
+        self._conclude(actions.Conclude((), tuple(desired.models_since(0))))
+        self._tell_subscribed()
 
     @property
-    def end_reason(self) -> str:
-        """Reason for which no more frames are tracked; empty while frames are tracked."""
-        return "it was stopped" if self._process.stop_requested else self._commands.end_reason
+    def state(self) -> State:
+        """The state of the core."""
+        return self._core.state
 
-    @property
-    def _repeats(self) -> bool:
-        """Whether an earlier detector has sent the next message already: commands and pauses apply after those."""
-        return self.detectors.seq < self._sent_before
+    def tell(self, event: Event) -> None:
+        """Tell the core what has happened, and carry out its actions; their results are further events."""
+        events = deque([event])
+        while events:
+            for action in self._core.handle(events.popleft()):
+                if (result := self._do[type(action)](action)) is not None:
+                    events.append(result)
 
-    @property
-    def _holds(self) -> bool:
-        """Whether no frames are tracked, because the run is paused or waits for a box."""
-        return self._commands.desired.holds and not self._repeats
-
-    def turn(self, sender: DataSender | None = None) -> None:
-        """One turn of a waiting loop: process acknowledgements and commands, and publish the health.
-
-        If a sender is given, wait a short time for its acknowledgements.
-        """
-        self._outputs.poll(sender)
-        self._serve()
-
-    def _serve(self) -> None:
-        """Serve late joiners, carry out the commands that have arrived, and publish the health."""
-        self._outputs.serve_late_joiners()
-        commanded = self._control.carry_out(repeats=self._repeats)
-        self._process.beat(self._counters, self._object_counters, now=commanded)
-
-    def wait_for_subscribers(self) -> None:
-        """Wait for the recorder without a time-out, and for early subscribers for a few seconds."""
-        deadline = time.monotonic() + EARLY_SECONDS
-        while (missing := self._outputs.awaited) and (RECORDER in missing or time.monotonic() < deadline):
-            self._outputs.poll(self._outputs.features)
-            self._serve_or_exit()
-
-    def resume(self) -> None:
-        """Continue after the last message that all receivers have stored."""
-        models: dict[str, Model] = {}
-        commands = self._commands
-        positions = [self._position(sender) for sender in self._outputs.senders]
-        while not agree(positions, models, commands.desired):
-            if (model := self._models.receive(_TURN_SECONDS)) is not None:
-                models[model.object] = model
-            positions = [self._position(sender) for sender in self._outputs.senders]
-        begin = start(positions, models, commands.desired, Detector(self._process.settings).state_at)
-        self.detectors.seq, commands.desired = begin.seq, begin.desired
-        for name, (state, model) in begin.objects.items():
-            self.detectors.add(name).resume(state, model)
-        for name, each in begin.desired.objects_at(begin.seq).items():
-            self._seek_again(name, each, models)
-        for sender, position in zip(self._outputs.senders, positions, strict=True):
-            sender.resume(begin.seq, position)
-        self._sent_before = max(position.seq for position in positions)
-
-    def _seek_again(self, name: str, each: DesiredObject, models: dict[str, Model]) -> None:
-        """Continue to search for an object by its saved model, unless it was found before the restart."""
-        known = self.detectors.detectors.get(name)
-        if known is not None and (known.state is None or known.state.first_window is not None):
-            return
-        if (learned := self._learned(each)) is None:
-            return
-        if known is not None:
-            known.likeness = learned.likeness()
-        else:  # its state is not known: it counts as not found
-            model = models.get(name, learned.model)
-            self.detectors.add(name).seek(model, learned.box, learned.likeness(), each.begins - 1)
-
-    def _learned(self, each: DesiredObject) -> Learned | None:
-        """The saved model that an object begins with, None if it has none."""
-        return self._model_files.get(each.model) if each.model else None
-
-    def _position(self, sender: DataSender) -> Position:
-        """The position that a receiver reports; there is no time-out."""
-        while (position := sender.ask_position()) is None:  # without `poll`, which would consume the answer
-            self._serve_or_exit()
-        return position
-
-    def _serve_or_exit(self) -> None:
-        """One turn before the first frame: no message was sent yet, so the process may exit at once."""
-        self._serve()
-        if self._process.stop_requested:
+    def wait(self) -> None:
+        """Wait in turns until the next frame can be taken, or the stream has ended."""
+        while self.state.phase not in (Phase.FRAME, Phase.ENDED):
+            self.turn()
+        if self._frame is None and self.state.phase is Phase.ENDED:  # nothing was sent yet
             raise SystemExit(0)
+
+    def turn(self) -> None:
+        """Wait a short time for what the core waits for; then serve everybody else, and publish the health."""
+        phase = self.state.phase
+        if phase is Phase.POSITIONS:
+            self._ask_positions()
+        else:
+            self._outputs.poll(_CHANNELS.get(phase))
+        if phase not in (Phase.SUBSCRIBERS, Phase.POSITIONS):  # before, they belong to no detector yet
+            self._receive_models(_TURN_SECONDS if phase is Phase.MODEL else 0.0)
+        if phase is Phase.HELD:
+            time.sleep(_TURN_SECONDS)
+        self._outputs.serve_late_joiners()
+        commands = self._control.receive_all()
+        for command in commands:
+            self.tell(core.Commanded(self._request(command)))
+        if self._process.stop_requested and (self.state.stopping < 0 or phase is not Phase.FRAME):
+            self.tell(core.Stopping(self._process.seconds_since_stop))
+        if phase is Phase.SUBSCRIBERS:
+            self._tell_subscribed()
+        if (progressed := self._progressed()) is not None:
+            self.tell(progressed)
+        self._process.beat(self._counters, self._object_counters, now=bool(commands))
 
     def open(self, stack: ExitStack) -> Iterator[Frame]:
         """Open the source at the frame before the next one, which always exists."""
         job, settings = self._process.job, self._process.settings
-        first = max(self.detectors.seq - 1, 0)
+        first = max(self.state.seq - 1, 0)
         once, each = opening_seconds(job.part, first)
         self._process.allow(once)
         self._process.allow_each(each)
@@ -223,163 +221,221 @@ class DetectorLoop:
     def _idle(self) -> bool:
         """One turn while a live source provides no frame; returns whether to stop waiting."""
         self.turn()
-        if self._source is not None and self._source.counters.get("lost_seconds"):
-            self._control.reject_boxes("the source is lost, so there is no frame for a box: try again once it is back")
-        return bool(self.end_reason)
+        if self.state.boxes and self._source is not None and self._source.counters.get("lost_seconds"):
+            self.tell(core.SourceLost())
+        return bool(self.state.end_reason)
 
-    def track(self, frame: Frame) -> tuple[Tracks, Features] | None:
-        """The tracks and the features of a frame; None if it is skipped."""
-        if frame.number < self.detectors.seq:
-            return None
+    def take(self, frame: Frame) -> None:
+        """Track the objects in a frame, and wait until the next one can be taken."""
         self.turn()
-        pyramid = Pyramid.of(frame.image)
-        given = self._given(pyramid, frame) or self._hold(pyramid, frame)
-        if not given and self.end_reason:
-            return None
-        if not given and self._holds:
-            self._skipped += 1
-            return None
-        return self._step(pyramid, frame, given)
-
-    def _hold(self, pyramid: Pyramid, frame: Frame) -> dict[str, Result]:
-        """Keep a frame while the run is paused or has no box; frames of a live source are not kept.
-
-        Returns
-        -------
-        the results of the objects whose boxes commands have set for it
-        """
-        if self._holds:
-            kept = {name: each for name, each in self._tracks.tracks.items() if name in self._commands.desired.objects}
-            self._outputs.show(self.detectors.seq, frame.image, kept)  # the other objects, while a box is drawn
-        live = self._source is not None and self._source.live
-        while self._holds and not self.end_reason and not live:
-            time.sleep(_TURN_SECONDS)
-            self.turn()
-            if given := self._given(pyramid, frame):
-                return given
-        return {}
-
-    def _given(self, pyramid: Pyramid, frame: Frame) -> dict[str, Result]:
-        """The results of the objects whose boxes commands have set for a frame, by name."""
-        if self._commands.has_box:
-            self._process.allow(_OPEN_SECONDS)
-        return self._control.begin(pyramid, frame.time)
-
-    def _step(self, pyramid: Pyramid, frame: Frame, given: dict[str, Result]) -> tuple[Tracks, Features]:
-        """The tracks and the features of a frame, which may be repeated after a restart."""
-        detectors, seq = self.detectors, self.detectors.seq + 1
-        for model in self._models.receive_all():
-            detectors.adopt(model)
-        objects = self._commands.desired.objects_at(seq)
-        for name in detectors.detectors.keys() - objects.keys():
-            detectors.forget(name)
-        begun: dict[str, Learned] = {}
-        for name, each in objects.items():  # in the order in which they began, in which the samples are numbered
-            if name in given:
-                continue
-            if seq == each.begins:
-                self._process.allow(_OPEN_SECONDS)
-            if seq == each.begins and (learned := self._learned(each)) is not None:
-                detectors.seek(name, learned.model, learned.box, learned.likeness())
-                begun[name] = learned
-            elif seq == each.begins and not each.model:
-                given[name] = detectors.begin(name, pyramid, each.box, frame.time)
-            elif name not in detectors.detectors:  # it was forgotten later: see `catstream.services.resume`
-                given[name] = Detector(self._process.settings, name).miss(seq, frame.time)
-        tracks, features = detectors.step(pyramid, frame.time, given)
-        models = {name: replace(features.objects[name], model=learned.to_bytes()) for name, learned in begun.items()}
-        return tracks, replace(features, objects=features.objects | models)
-
-    def send(self, frame: Frame, tracks: Tracks, features: Features) -> None:
-        """Send the tracks and the features of a frame; wait while a window is full."""
-        tracks = replace(tracks, tracks={name: replace(each, pts=frame.pts) for name, each in tracks.tracks.items()})
-        self._tracks = tracks
-        self._outputs.publish_tracks(tracks)
-        if (results := self._outputs.results) is not None:
-            self._deliver(results, tracks)
-            # In lockstep the owner is never behind: after a crash, all continue after the same message.
-            while (
-                self._process.settings.run.lockstep and results.taken < tracks.seq and not self._process.stop_requested
-            ):
-                self.turn(results)
-        self._outputs.publish_features(features)
-        self._deliver(self._outputs.features, features)
-        self._outputs.show(tracks.frame, frame.image, tracks.tracks)
-
-    def wait_for_model(self) -> None:
-        """Wait until the models are recent enough: see `catstream.services.pacing`."""
-        settings, features = self._process.settings, self._outputs.features
-        due = features.sent - (0 if settings.run.lockstep else settings.run.lag_frames)
-        live = self._source is not None and self._source.live
-        while not live and not self.end_reason:
-            match awaited(due, features.taken, features.count_samples(due), self.detectors.newest_versions(due)):
-                case Awaited.NOTHING:
-                    return
-                case Awaited.TAKEN:
-                    self.turn(features)
-                case Awaited.MODEL:  # `turn` retransmits features to a restarted compressor
-                    if (model := self._models.receive(_TURN_SECONDS)) is not None:
-                        self.detectors.adopt(model)
-                    self.turn()
+        self._frame, self._pyramid = frame, Pyramid.of(frame.image)
+        self.tell(core.Frame(frame.number, self._source is not None and self._source.live))
+        self.wait()
 
     def end(self, reason: str, failed: bool) -> None:
         """Send the end of the stream, and wait until it is stored; with a time-out if the process was asked to end."""
-        self._control.end(reason)
-        features, results, seq = self._outputs.features, self._outputs.results, self.detectors.seq
-        self._deliver(features, End(seq + 1, reason, failed), _COMPRESSOR_SECONDS, stored=True)
-        totals = {"sent": float(seq), "stored": float(min(features.stored, seq))} | self._source_counters()
-        totals.pop("lost_seconds", None)  # this one is of the moment
-        end = End(seq + 1, reason, failed, totals)
+        self._failed = failed
+        self.tell(core.Ended(reason, failed))
+        while self.state.phase is not Phase.ENDED:
+            self.turn()
+
+    # What the core is told
+
+    def _tell_subscribed(self) -> None:
+        missing, seconds = self._outputs.awaited, time.monotonic() - self._began
+        if self.state.phase is Phase.SUBSCRIBERS:
+            self.tell(core.Subscribed(RECORDER not in missing, not missing - {RECORDER}, seconds))
+
+    def _request(self, command: Command) -> Request:
+        """A command without the saved model, which is kept here."""
+        if (data := command.model) is None:
+            return Request(command)
+        self._process.allow(_MODEL_SECONDS)
+        command = replace(command, model=b"")
+        try:
+            learned = Learned.from_bytes(data, "the file")
+            learned.check_fits(self._process.settings)
+        except CatstreamError as error:
+            return Request(command, error=str(error))
+        name = self._models_of_job.add(learned)
+        return Request(command, Saved(name, learned.box, learned.model.version, self._models_of_job.sizes[name]))
+
+    def _ask_positions(self) -> None:
+        """Ask the receivers for their positions, and receive the models that belong to them."""
+        senders = self._outputs.senders
+        for name in senders.keys() - self._positions.keys():
+            if (position := senders[name].ask_position()) is not None:
+                self._positions[name] = position
+        if self._positions.keys() < senders.keys():
+            return
+        self.tell(core.Positions(tuple(_place(self._positions[name]) for name in senders)))
+        if self.state.phase is Phase.POSITIONS:  # they do not agree yet
+            self._positions.clear()
+            self._receive_models(_TURN_SECONDS)
+
+    def _receive_models(self, seconds: float) -> None:
+        """Receive models, waiting at most this long for the first; the detectors adopt those of their objects."""
+        first = self._models.receive(seconds)
+        for model in (*([first] if first is not None else []), *self._models.receive_all()):
+            if self.state.phase is Phase.POSITIONS:
+                self._arrived[model.object] = model
+                self.tell(core.ModelArrived(model.object, model.version))
+            elif model.object in self.state.known:
+                self._detectors.adopt(model)
+                known = _known(self._detectors.detectors[model.object])
+                self.tell(core.ModelArrived(model.object, model.version, known))
+
+    def _progressed(self) -> Event | None:
+        """The progress of the receivers, if it is another one than before."""
+        senders, due = self._outputs.senders, self.state.due
+        features, results = self._outputs.features, senders.get("results", self._outputs.features)
+        progress = Progress(
+            features.acknowledged, features.taken, results.acknowledged, results.taken, due, features.count_samples(due)
+        )
+        return core.Progressed(progress) if progress != self.state.progress else None
+
+    # What the core orders
+
+    def _continue(self, order: actions.Continue) -> None:
+        position = self._positions[[*self._outputs.senders][order.receiver]]
+        found, detector = position.objects[order.name], self._detectors.add(order.name)
+        state = found.detector
+        if state is None and found.box is not None:
+            state = detector.state_at(found.box, order.first, order.began)
+        if state is not None:
+            detector.resume(state, self._arrived[order.name])
+        if order.model and (learned := self._models_of_job.get(order.model)) is not None:
+            detector.likeness = learned.likeness()
+
+    def _resume(self, order: actions.Resume) -> Event:
+        self._detectors.seq = order.seq
+        for name, sender in self._outputs.senders.items():
+            sender.resume(order.seq, self._positions[name])
+        self._arrived.clear()
+        return core.Resumed(self._known())
+
+    def _set_box(self, order: actions.SetBox) -> Event:
+        self._process.allow(_OPEN_SECONDS)
+        detectors, time_ = self._detectors, self._present.time
+        act = detectors.correct if order.keep else detectors.begin
+        try:
+            self._given[order.name] = act(order.name, self._pyramid, order.box, time_)
+        except (BoxError, ObjectError) as error:
+            return core.Begun(error=str(error))
+        return core.Begun(_known(detectors.detectors[order.name]))
+
+    def _forget(self, order: actions.Forget) -> None:
+        self._detectors.forget(order.name)
+
+    def _begin(self, order: actions.Begin) -> None:
+        self._process.allow(_OPEN_SECONDS)
+        self._given[order.name] = self._detectors.begin(order.name, self._pyramid, order.box, self._present.time)
+
+    def _seek(self, order: actions.Seek) -> None:
+        self._process.allow(_OPEN_SECONDS)
+        learned, name = self._models_of_job.get(order.model), order.name
+        if learned is None:  # its file cannot be read
+            if name in self._detectors.detectors:
+                self._detectors.forget(name)
+            if not order.again:
+                self._miss(actions.Miss(name))
+        elif order.again:
+            model = self._arrived.get(name, learned.model)
+            self._detectors.add(name).seek(model, learned.box, learned.likeness(), order.began)
+        else:
+            self._detectors.seek(name, learned.model, learned.box, learned.likeness())
+            self._begun[name] = learned
+
+    def _miss(self, order: actions.Miss) -> None:
+        absent = Detector(self._process.settings, order.name)
+        self._given[order.name] = absent.miss(self.state.seq + 1, self._present.time)
+
+    def _step(self, _: actions.Step) -> Event:
+        tracks, features = self._detectors.step(self._pyramid, self._present.time, self._given)
+        models = {
+            name: replace(features.objects[name], model=learned.to_bytes()) for name, learned in self._begun.items()
+        }
+        pts = self._present.pts
+        self._tracks = replace(tracks, tracks={name: replace(each, pts=pts) for name, each in tracks.tracks.items()})
+        self._features = replace(features, objects=features.objects | models)
+        self._given, self._begun = {}, {}
+        self._outputs.publish(self._tracks, self._features)
+        return core.Stepped(self._known())
+
+    def _send(self, order: actions.Send) -> Event | None:
+        results, features = self._outputs.results, self._outputs.features
+        if order.channel == "features":
+            features.send(End(order.seq, self.state.ending, self._failed) if order.end else self._features)
+            return self._progressed()
         if results is not None:
-            self._deliver(results, end, _OWNER_SECONDS, stored=True)
-        self._control.clear_stop()
-        self._outputs.publish_tracks(end)
-        self._outputs.publish_features(end)
+            results.send(self._end if order.end else self._tracks)
+        return None
+
+    def _give_up(self, order: actions.GiveUp) -> None:
+        _log.warning("message %d of %s was not sent: its receiver did not answer in time", order.seq, order.channel)
+
+    def _show(self, order: actions.Show) -> None:
+        wanted = self.state.desired.objects if order.held else self._tracks.tracks
+        shown = {name: each for name, each in self._tracks.tracks.items() if name in wanted}
+        self._outputs.show(self._present.number, self._present.image, shown)
+
+    def _conclude(self, order: actions.Conclude) -> None:
+        """Store the desired state if it has changed, then send the answers; those say so if it could not be stored."""
+        state, desired, lost = self._process.job.state, self.state.desired, ""
+        if state is not None and desired != self._kept:
+            try:
+                self._models_of_job.store()  # before the state that names them
+                desired.save(state / _FILE)
+                self._kept = desired
+                self._models_of_job.keep_only(set(order.models))
+            except OSError as error:
+                _log.warning("the desired state cannot be written to %s (%s)", state / _FILE, error.strerror)
+                lost = f"; a resumed run will not know it, as {state / _FILE} cannot be written ({error.strerror})"
+        for answer in order.answers:
+            self._control.answer(replace(answer, reason=answer.reason + lost) if answer.done else answer)
+
+    def _finish(self, _: actions.Finish) -> None:
+        self._outputs.publish(self._end, self._end)
         self._process.beat(self._counters, self._object_counters, now=True)
 
-    def _deliver(
-        self, sender: Sender[Message], message: Message, patience: float = 0.0, *, stored: bool = False
-    ) -> None:
-        """Send a message on an acknowledged channel; wait for room in its window, or until it is `stored`."""
-        sent = sender.send(message)
-        while True:
-            step = next_step(
-                sent=sent,
-                stored=not stored or sender.acknowledged >= message.seq,
-                seconds_since_stop=self._process.seconds_since_stop,
-                patience_seconds=patience,
-            )
-            match step:
-                case Step.DONE:
-                    return
-                case Step.GIVE_UP:
-                    if not sent:
-                        lost = "message %d of %s was not sent: its receiver did not answer in time"
-                        _log.warning(lost, message.seq, sender.channel.name)
-                    return
-                case Step.WAIT:
-                    self.turn(sender)
-                case Step.SEND:
-                    self.turn(sender)
-                    sent = sender.send(message)
+    @property
+    def _present(self) -> Frame:
+        """The present frame."""
+        if self._frame is None:
+            raise ValueError("there is no frame yet")
+        return self._frame
+
+    @cached_property
+    def _end(self) -> End:
+        """The end of the stream, with what a run must not forget."""
+        stored, seq = self._outputs.features.stored, self.state.seq
+        totals = {"sent": float(seq), "stored": float(min(stored, seq))} | self._source_counters()
+        totals.pop("lost_seconds", None)  # this one is of the moment
+        return End(seq + 1, self.state.ending, self._failed, totals)
+
+    def _known(self) -> dict[str, Known]:
+        """The detectors by name, as the core sees them."""
+        return {name: _known(each) for name, each in self._detectors.detectors.items()}
 
     def _counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
-        features = self._outputs.features
+        features, desired = self._outputs.features, self.state.desired
         own = {
             "sent": features.sent,
             "taken": features.taken,
             "stored": features.stored,
             "model_version": max((each.model_version for each in self._tracks.tracks.values()), default=0),
-            "objects": len(self._commands.desired.objects),
+            "objects": len(desired.objects),
+            "paused": float(desired.paused),
+            "waiting": float(not desired.objects),
         }
-        return own | self._commands.counters | self._source_counters()
+        return own | self._source_counters()
 
     def _source_counters(self) -> dict[str, float]:
         """The counters of the source; frames that were skipped while the run was paused count, too."""
         counters = self._source.counters if self._source is not None else {}
         if "skipped" in counters:
-            counters["skipped"] += self._skipped
+            counters["skipped"] += self.state.skipped
         return counters
 
     def _object_counters(self) -> dict[str, dict[str, float]]:
@@ -387,8 +443,37 @@ class DetectorLoop:
         return {
             name: {"model_version": each.model_version, "score": each.score, "present": float(each.box is not None)}
             for name, each in self._tracks.tracks.items()
-            if name in self._commands.desired.objects
+            if name in self.state.desired.objects
         }
+
+    def _write_events(self, kind: type[BaseException] | None, *_: object) -> None:
+        """After a crash, write the last events to the folder of the state: see `History.write`."""
+        if kind is None or not issubclass(kind, Exception) or issubclass(kind, CatstreamError):
+            return
+        file = (self._process.job.state or Path(tempfile.gettempdir())) / _EVENTS_FILE
+        try:
+            self._core.write(file)
+            _log.error("the last events before this error are in %s", file)
+        except OSError as error:
+            _log.warning("the last events cannot be written to %s (%s)", file, error.strerror)
+
+
+def _known(detector: Detector) -> Known:
+    """A detector as the core sees it."""
+    if (state := detector.state) is None:
+        raise ValueError(f"the detector of {detector.name!r} has no object yet")
+    version, sought = detector.model.version, state.first_window is None
+    return Known(version, detector.newest_version, state.first_frame, sought, state.window)
+
+
+def _place(position: Position) -> core.Place:
+    """A position as the core sees it."""
+    found = {}
+    for name, each in position.objects.items():
+        state = each.detector
+        sought = state is not None and state.first_window is None
+        found[name] = core.PlaceOfObject(each.version, each.box, state is not None, sought)
+    return core.Place(position.seq, found)
 
 
 def opening_seconds(part: slice, first: int) -> tuple[float, float]:

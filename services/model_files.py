@@ -21,18 +21,22 @@ class ModelFiles:
     Parameters
     ----------
     folder : folder of the files; None if they are kept in memory only
+
+    Attributes
+    ----------
+    sizes : bytes of each saved model that was added, by its name
     """
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
         self._models: dict[str, Learned] = {}
-        self._sizes: dict[str, int] = {}
+        self.sizes: dict[str, int] = {}
 
     def add(self, learned: Learned) -> str:
         """Keep a saved model in memory; return its name."""
         data = learned.to_bytes()
         name = blake2b(data, digest_size=16).hexdigest()
-        self._models[name], self._sizes[name] = learned, len(data)
+        self._models[name], self.sizes[name] = learned, len(data)
         return name
 
     def get(self, name: str) -> Learned | None:
@@ -43,10 +47,6 @@ class ModelFiles:
             except CatstreamError as error:
                 _log.warning("the object of a saved model is not searched for any more: %s", error)
         return self._models.get(name)
-
-    def size(self, name: str) -> int:
-        """Bytes of a saved model in memory, 0 of any other."""
-        return self._sizes.get(name, 0)
 
     def store(self) -> None:
         """Write the saved models in memory that have no file yet.
@@ -64,7 +64,7 @@ class ModelFiles:
     def keep_only(self, names: set[str]) -> None:
         """Remove all saved models but those of these names, from memory and from the folder."""
         self._models = {name: learned for name, learned in self._models.items() if name in names}
-        self._sizes = {name: size for name, size in self._sizes.items() if name in names}
+        self.sizes = {name: size for name, size in self.sizes.items() if name in names}
         for file in self._folder.glob("*.safetensors") if self._folder is not None else ():
             if file.stem not in names:
                 file.unlink(missing_ok=True)

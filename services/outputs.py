@@ -30,7 +30,7 @@ class Outputs:
     ----------
     features : sender of the features to the compressor
     results : sender of the tracks to the owner of the run; None if it has no owner
-    senders : both senders, `features` first; without `results` if it is None
+    senders : both senders by the names of their channels, `features` first; without `results` if it is None
     """
 
     def __init__(self, process: Process) -> None:
@@ -43,7 +43,9 @@ class Outputs:
             self._training = stack.enter_context(Publisher(TRAINING, endpoint, first_message=process.run))
             self._previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
-        self.senders: list[DataSender] = [self.features, *([self.results] if self.results is not None else [])]
+        self.senders: dict[str, DataSender] = {"features": self.features}
+        if self.results is not None:
+            self.senders["results"] = self.results
         if process.job.record is not None:
             self._tracks.awaited.add(RECORDER)
 
@@ -52,10 +54,10 @@ class Outputs:
         """Names of the subscribers that should be connected before the first frame, and are not yet."""
         return self._tracks.awaited | self._training.awaited
 
-    def poll(self, awaited: DataSender | None = None) -> None:
-        """Process acknowledgements; wait a short time for one to the sender `awaited`."""
-        for sender in self.senders:
-            sender.poll(_TURN_SECONDS if sender is awaited else 0)
+    def poll(self, awaited: str | None = None) -> None:
+        """Process acknowledgements; wait a short time for one on the channel `awaited`."""
+        for name, sender in self.senders.items():
+            sender.poll(_TURN_SECONDS if name == awaited else 0)
 
     def serve_late_joiners(self) -> None:
         """Send the first message or the newest preview to new subscribers."""
@@ -63,13 +65,10 @@ class Outputs:
         self._training.serve_late_joiners()
         self._previews.turn()
 
-    def publish_tracks(self, tracks: Tracks | End) -> None:
-        """Send the tracks of a frame, one message an object, or the end to all subscribers."""
+    def publish(self, tracks: Tracks | End, features: Features | End) -> None:
+        """Send the tracks of a frame, one message an object, and its features to all subscribers; or the end."""
         for each in tracks.tracks.values() if isinstance(tracks, Tracks) else (tracks,):
             self._tracks.send(each)
-
-    def publish_features(self, features: Features | End) -> None:
-        """Send features, or the end, to all subscribers."""
         self._training.send(features)
 
     def show(self, frame: int, image: np.ndarray, tracks: Mapping[str, Track]) -> None:

@@ -74,7 +74,10 @@ IMPORTERS = {
     ],
     "mcap": ["catstream/sinks/recording/container.py"],
     "msgpack": ["catstream/wire/codec.py"],
-    "msgspec": ["catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"],
+    "msgspec": [
+        *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
+        *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
+    ],
     "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/provenance.py"],
     "psutil": ["catstream/applications/loadtest/usage.py"],
     "hdrh": ["catstream/applications/loadtest/latencies.py"],
@@ -102,7 +105,10 @@ SLOW = {
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
 
 #: State machines with the same rule: bytes, events and the time are arguments.
-PURE = ["catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/fleet/desired.py"]
+PURE = [
+    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/fleet/desired.py"),
+    *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
+]
 
 FILES = sorted([*ROOT.glob("catstream/**/*.py"), *ROOT.glob("services/**/*.py")])
 

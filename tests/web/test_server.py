@@ -18,21 +18,19 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.detection.objects import Detectors
+from catstream.box import Box
 from catstream.errors import ServiceError
-from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Health
-from catstream.services.commands import CommandHandler
-from catstream.services.control import CommandChannel
-from catstream.services.desired import DesiredState
-from catstream.services.model_files import ModelFiles
-from catstream.settings import Settings
+from catstream.services.core import Commanded, Frame, History
+from catstream.services.core_state import Phase, Request, Rules, State
+from catstream.services.desired import DesiredObject, DesiredState
 from catstream.web import app
 from catstream.web.app import pipeline_site
 from catstream.web.dashboard import Dashboard
 from catstream.web.guard import Guard, TokenBucket
 from catstream.web.server import Server
-from catstream.wire.channels import HEALTH, PREVIEWS, TRACKS
+from catstream.wire.channels import CONTROL, HEALTH, PREVIEWS, TRACKS
+from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
@@ -288,19 +286,20 @@ def test_malformed_json_is_rejected_like_any_invalid_command(page, body):
     assert "expected" in answer.json()["reason"]
 
 
-def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered(page, pipeline, folder, until, rng):
-    handler = CommandHandler(Detectors(Settings(run={"objects_most": 2})), DesiredState(), ModelFiles(None))
-    frame = Pyramid.of(rng.integers(0, 255, (120, 160, 3), np.uint8))
-    with (
-        CommandChannel(Endpoint.parse(str(folder)), handler, None, lambda _: None) as channel,
-        ThreadPoolExecutor(1) as pool,
-    ):
+def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered(page, pipeline, folder, until):
+    rules = Rules(window=8, lag_frames=8, lockstep=False, objects_most=2, context=1.0)
+    boxes = {name: DesiredObject(Box(40, 30, 48, 48), begins=1) for name in ("anna", "ben")}
+    core = History(State(rules, Phase.FRAME, desired=DesiredState(boxes)))
+    with Responder(CONTROL, Endpoint.parse(str(folder))) as channel, ThreadPoolExecutor(1) as pool:
 
         def answer(verb, name, **more):
             asked = pool.submit(page.post, "/control", json={"verb": verb, "object": name, **more})
             while not asked.done():
-                channel.carry_out()
-                channel.begin(frame, 0.0)
+                for command in channel.receive_all():
+                    frame = [Frame(0, live=False)] if command.verb == "set-box" else []
+                    for event in (Commanded(Request(command)), *frame):
+                        for each in [each for action in core.handle(event)[:1] for each in action.answers]:
+                            channel.answer(each)
             return asked.result().status_code, asked.result().json()["reason"]
 
         def attached():
@@ -308,14 +307,13 @@ def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered
             return "\ncatstream_up 1.0\n" in page.get("/metrics").text
 
         until(attached)
-        for name in ("anna", "ben"):
-            assert answer("set-box", name, box=[40, 30, 48, 48])[0] == 200
+        assert answer("pause", "")[0] == 200
         status, reason = answer("set-box", "carl", box=[40, 30, 48, 48])
         assert (status, "3 objects are more than 2" in reason) == (409, True)
         status, reason = answer("forget", "carl")
         assert (status, "there is no object 'carl'" in reason) == (409, True)
         assert answer("forget", "ben")[0] == 200
-        assert list(handler.desired.objects) == ["anna"]
+        assert list(core.state.desired.objects) == ["anna"]
 
 
 def test_commands_above_the_rate_limit_are_rejected(page):
