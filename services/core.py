@@ -288,14 +288,18 @@ def _features(state: State) -> Moved | None:
 def _sent(state: State, phase: Phase, message: actions.Send) -> Moved | None:
     """Send a message if there is room in the window; give it up if the process is to end; otherwise wait.
 
-    There is no other time-out, as a receiver that died is restarted.
+    There is no other time-out, as a receiver that died is restarted. Nothing follows a message that was given up: no
+    receiver takes a message before the one before it.
     """
-    progress = state.progress
-    acknowledged = progress.acknowledged if message.channel == "features" else progress.owner_acknowledged
+    progress, channel = state.progress, message.channel
+    acknowledged = progress.acknowledged if channel == "features" else progress.owner_acknowledged
+    if channel in state.given_up:
+        return replace(state, phase=phase), []
     if message.seq - acknowledged <= state.rules.window:
         return replace(state, phase=phase), [message]
-    if state.stopping >= (_PATIENCE_SECONDS[message.channel] if message.end else 0.0):
-        return replace(state, phase=phase), [actions.GiveUp(message.channel, message.seq)]
+    if state.stopping >= (_PATIENCE_SECONDS[channel] if message.end else 0.0):
+        state = replace(state, phase=phase, given_up=(*state.given_up, channel))
+        return state, [actions.GiveUp(channel, message.seq)]
     return None
 
 
@@ -401,7 +405,8 @@ def _end_features(state: State) -> Moved | None:
 
 
 def _end_stored(state: State) -> Moved | None:
-    if state.progress.acknowledged <= state.seq and state.stopping < _PATIENCE_SECONDS["features"]:
+    waits = "features" not in state.given_up and state.progress.acknowledged <= state.seq
+    if waits and state.stopping < _PATIENCE_SECONDS["features"]:
         return None
     return replace(state, phase=Phase.END_RESULTS), []
 
@@ -414,7 +419,8 @@ def _end_results(state: State) -> Moved | None:
 
 def _end_owner(state: State) -> Moved | None:
     """Clear the command `stop` at the end of the run, so that a resumed detector does not stop at once."""
-    waits = state.rules.owned and state.progress.owner_acknowledged <= state.seq
+    awaited = state.rules.owned and "results" not in state.given_up
+    waits = awaited and state.progress.owner_acknowledged <= state.seq
     if waits and state.stopping < _PATIENCE_SECONDS["results"]:
         return None
     state = replace(state, phase=Phase.ENDED, desired=with_fields(state.desired, stopped=False))

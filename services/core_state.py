@@ -131,6 +131,7 @@ class State(msgspec.Struct, frozen=True):
     sizes     bytes of the saved models that objects begin with, by their names
     progress  of the receivers
     arrived   version of the newest model of each object, before the positions agree
+    given_up  the channels on which a message was given up
     ending    reason for which no more frames are tracked; empty while frames are tracked
     stopping  seconds since a signal asked the process to end; negative if none has
     """
@@ -151,6 +152,7 @@ class State(msgspec.Struct, frozen=True):
     sizes: dict[str, int] = {}
     progress: Progress = Progress()
     arrived: dict[str, int] = {}
+    given_up: tuple[str, ...] = ()
     ending: str = ""
     stopping: float = -1.0
 

@@ -18,12 +18,12 @@ from catstream.services.core import History, handle
 from catstream.services.core_state import STOPPED, Known, Phase, Progress, Request, Rules, Saved, State
 from catstream.services.desired import DesiredObject, DesiredState, PastObject
 
-BOX, OUTSIDE = Box(40, 30, 20, 20), Box(400, 30, 20, 20)
+BOX, FIRST, OUTSIDE = Box(40, 30, 20, 20), Box(10, 30, 20, 20), Box(400, 30, 20, 20)
 PLACE = Window(40, 30, 20, 20)
 SAVED = Saved("digest", BOX, version=5, size=1000)
 NAMES = ["", "anna", "ben", "carl"]
 RULES = Rules(window=3, lag_frames=2, lockstep=False, objects_most=2, context=1.0)
-ANNA = DesiredState({"anna": DesiredObject(BOX, 1)})
+ANNA = DesiredState({"anna": DesiredObject(FIRST, 1)})
 
 
 class Receiver:
@@ -244,20 +244,17 @@ class Anything(RuleBasedStateMachine):
                 self.objects.pop(name, None)
                 self.objects[name] = each
 
-    @rule(channel=channels, acknowledges=st.booleans())
-    def receive(self, channel, acknowledges):
-        receiver = self.world.receivers[channel]
+    @rule(channel=channels, acknowledges=st.booleans(), learns=st.none() | names)
+    def receive(self, channel, acknowledges, learns):
+        receiver, before = self.world.receivers[channel], self.world.receivers["features"].taken
         if receiver.on_the_way:
             receiver.receive()
         if acknowledges:
             receiver.acknowledged = receiver.taken
+        taken = self.world.receivers["features"].taken
+        if taken > before and learns in self.world.messages.get(taken, ()):
+            self.world.learn(learns)
         self.world.progress()
-
-    @rule(name=names)
-    def learn(self, name):
-        at = self.world.receivers["features"].taken
-        if name in self.world.messages.get(at, ()):
-            self.world.learn(name)
 
     @rule(name=names)
     def model(self, name):
@@ -278,13 +275,13 @@ class Anything(RuleBasedStateMachine):
     @precondition(lambda self: not self.repeats)
     @rule(name=names, damaged=st.booleans())
     def search(self, name, damaged):
-        meant = self.meant(name)
+        meant, seq = self.meant(name), self.world.state.seq
         answer = self.world.command("search", name, **({"error": "it is damaged"} if damaged else {"saved": SAVED}))
         room = meant is not None and len(self.objects.keys() | {meant}) <= RULES.objects_most
         assert answer.done == (room and not damaged and not self.stopped and not self.ended)
         if answer.done:
             self.objects.pop(meant, None)
-            self.objects[meant] = DesiredObject(BOX, self.world.state.seq + 1, SAVED.name)
+            self.objects[meant] = DesiredObject(BOX, seq + 1, SAVED.name)
 
     @precondition(lambda self: not self.repeats)
     @rule(name=names)
@@ -522,7 +519,7 @@ def test_commands_for_objects_wait_until_all_frames_of_an_earlier_detector_are_r
     assert next(answer.reason for answer in world.answers.values()) == (
         "anna is no longer tracked after frame 1: no object is left, so the run waits for a box"
     )
-    assert world.state.desired.past == (PastObject("anna", DesiredObject(BOX, 1), 2),)
+    assert world.state.desired.past == (PastObject("anna", DesiredObject(FIRST, 1), 2),)
 
 
 def test_a_repeated_frame_reports_an_object_as_absent_that_was_forgotten_later_and_of_which_nothing_is_known():
