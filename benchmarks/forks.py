@@ -27,10 +27,11 @@ from catstream.applications.evaluation.summary import FLIP
 from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.detection.detector import Detector
-from catstream.detection.search import Detection, non_maximum_suppression
+from catstream.detection.search import Detection
 from catstream.errors import CatstreamError
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
+from catstream.features.score_map import non_maximum_suppression
 from catstream.messages.heads import APPEARANCE
 from catstream.messages.kinds import Features, Level
 from catstream.messages.names import UNNAMED

@@ -53,7 +53,7 @@ IMPORTERS = {
     ],
     "filterpy": ["catstream/numerics/kalman.py"],
     "numba": ["catstream/features/compiler.py"],
-    "llvmlite": ["catstream/features/compiled.py", "catstream/features/compiler.py"],
+    "llvmlite": [f"catstream/features/{name}.py" for name in ("compiled", "compiler", "machine")],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
     "safetensors": ["catstream/messages/storage.py"],
     "fsspec": ["catstream/fleet/objects.py"],

@@ -37,9 +37,9 @@ from catstream.applications.finding.files import File
 from catstream.applications.finding.scan import Scan, Seen
 from catstream.applications.finding.search import Search
 from catstream.box import Box
-from catstream.detection.search import non_maximum_suppression
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
+from catstream.features.score_map import non_maximum_suppression
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.services.start import SPAWN

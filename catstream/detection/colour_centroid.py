@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from catstream.box import Window
-from catstream.detection.search import ScoreMap
 from catstream.features.layout import SIDE, WINDOW
+from catstream.features.score_map import ScoreMap
 
 __all__ = ["recentred"]
 

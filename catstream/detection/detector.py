@@ -10,12 +10,13 @@ import numpy as np
 from catstream.box import Box, Window
 from catstream.detection import motion, teacher
 from catstream.detection.likeness import Likeness
-from catstream.detection.search import Detection, ScoreMap
+from catstream.detection.search import Detection
 from catstream.detection.step import looked, replaced, settled, taught, track_of
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
+from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, Track
 from catstream.messages.storage import Arrays, Metadata
 from catstream.settings import Settings

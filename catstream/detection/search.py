@@ -15,24 +15,22 @@ import numpy as np
 from catstream.box import Window
 from catstream.detection import belief, extent
 from catstream.detection.likeness import Likeness
-from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
+from catstream.features.score_map import ScoreMap, vertex
 from catstream.messages.heads import ASPECT, EXTENT, SIZE
 from catstream.messages.kinds import DetectorState, Model
 from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 
 __all__ = [
+    "SAME_OVERLAP",
     "Detection",
-    "ScoreMap",
     "due",
     "find",
     "fitted",
     "local",
-    "non_maximum_suppression",
     "searched",
     "seek",
-    "vertex",
     "whole",
 ]
 
@@ -43,7 +41,7 @@ _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an obje
 _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
 _LIKELY_STEPS = 8  # larger or smaller than the size at which an object was first found, that are tried
 _LEAD_OVER_ALIKE = 0.25  # difference of score to another window whose likeness to the object is at least half as high
-_SAME_OVERLAP = 0.3  # above which two windows in successive frames show the same object
+SAME_OVERLAP = 0.3  #: above which two windows in successive frames show the same object
 
 #: A region of a frame that is searched, and the factor of the window's size in it.
 _Part = tuple[float, Region]
@@ -63,84 +61,6 @@ class Detection:
     window: Window
     around: ScoreMap | None = None
     redetected: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScoreMap:
-    """Features of a part of a frame at one scale, and the score of each window in them.
-
-    cells    of rows x columns
-    scores   float32 (rows - 7, columns - 7), each of the window whose first cell is there
-    origin   corner of the first cell in the frame, (x, y) in pixels
-    step     width and height of a cell, in pixels of the frame
-    """
-
-    cells: Cells
-    scores: np.ndarray
-    origin: tuple[float, float]
-    step: tuple[float, float]
-
-    @classmethod
-    def around(cls, frame: Pyramid, window: Window, side: int, model: Model | None) -> ScoreMap:
-        """All windows in `side` x `side` cells around a window, of its size; without a model all scores are 0."""
-        patch = frame.around(window, side)
-        cells = Cells.within(patch)
-        if model is None:
-            scores = np.zeros((side - WINDOW + 1,) * 2, np.float32)
-        else:
-            scores = cells.respond(model.weights, model.bias)
-        step, (x, y) = (window.w / WINDOW, window.h / WINDOW), window.centre
-        return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step)
-
-    @classmethod
-    def within(cls, frame: Pyramid, region: Region, window: Window, model: Model) -> ScoreMap:
-        """All windows of a size in a region of a frame."""
-        image, step = frame.part(region).resized(window)
-        cells = Cells.of(image)
-        return cls(cells, cells.respond(model.weights, model.bias), (float(region.left), float(region.top)), step)
-
-    @classmethod
-    def whole(cls, frame: Pyramid, window: Window, model: Model) -> ScoreMap:
-        """All windows of a size in a frame, or in as large a part around the window as can be searched in time."""
-        return cls.within(frame, frame.region_around(window), window, model)
-
-    def window(self, row: float, column: float) -> Window:
-        """The window at (row, column), which may lie between cells."""
-        (x, y), (w, h) = self.origin, self.step
-        return Window(x + column * w, y + row * h, WINDOW * w, WINDOW * h)
-
-    def place(self, window: Window) -> tuple[float, float]:
-        """Row and column, between the cells, of the window with the same centre: the inverse of `window`."""
-        (x, y), (w, h), (left, top) = window.centre, self.step, self.origin
-        return (y - top) / h - WINDOW / 2, (x - left) / w - WINDOW / 2
-
-    def row(self, row: int, column: int) -> np.ndarray:
-        """Feature row of the window at (row, column), float32 (d,)."""
-        return self.cells.row(row, column)
-
-    def highest(self, penalty: np.ndarray | float = 0.0) -> tuple[int, int]:
-        """Row and column of the window with the highest score less a penalty."""
-        row, column = divmod(int((self.scores - penalty).argmax()), self.scores.shape[1])
-        return row, column
-
-    def best(self, penalty: np.ndarray | float = 0.0) -> Detection:
-        """The window with the highest score less a penalty, its place refined between the cells."""
-        row, column = self.highest(penalty)
-        return Detection(float(self.scores[row, column]), self.window(*self.refined(row, column)))
-
-    def refined(self, row: int, column: int) -> tuple[float, float]:
-        """The maximum at (row, column) refined between the cells, by a parabola in each direction."""
-        scores = self.scores
-        return row + vertex(scores[:, column], row), column + vertex(scores[row], column)
-
-    def apart(self, window: Window) -> ScoreMap:
-        """The same, but the score of each window that touches another one is -inf."""
-        (x, y), (w, h) = self.origin, self.step
-        rows, columns = self.scores.shape
-        top, left = y + h * np.arange(rows), x + w * np.arange(columns)
-        beyond = (top >= window.y + window.h) | (top + WINDOW * h <= window.y)
-        beside = (left >= window.x + window.w) | (left + WINDOW * w <= window.x)
-        return replace(self, scores=np.where(beyond[:, None] | beside, self.scores, np.float32(-np.inf)))
 
 
 def searched(
@@ -196,7 +116,7 @@ def seek(
         sighting = _sighting(frame, state.window, _SOUGHT_FACTORS, model)
     best = sighting.found
     seen = best.score >= limits.confident_score and _stands_out(sighting, likeness, limits)
-    again = state.sightings > 0 and best.window.overlap(state.confident_window) > _SAME_OVERLAP
+    again = state.sightings > 0 and best.window.overlap(state.confident_window) > SAME_OVERLAP
     state = replace(
         state,
         sightings=0 if not seen else state.sightings + 1 if again else 1,
@@ -217,7 +137,7 @@ def _at_likely_size(frame: Pyramid, found: Detection, model: Model, likeness: Li
 
     def tried(step: int) -> tuple[float, Detection]:
         scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
-        best = scores.best()
+        best = Detection(*scores.best())
         return min(best.score, 1.0) + likeness(scores.row(*scores.highest())), best
 
     return max((tried(step) for step in range(-_LIKELY_STEPS, _LIKELY_STEPS + 1)), key=lambda each: each[0])[1]
@@ -231,7 +151,7 @@ def local(frame: Pyramid, window: Window, model: Model, settings: SearchSettings
     side = WINDOW + 2 * round((settings.area - 1) * WINDOW / 2)
     scores = ScoreMap.around(frame, window, side, model)
     away = (np.arange(side - WINDOW + 1) - (side - WINDOW) // 2) / WINDOW
-    return replace(scores.best(_DISTANCE_PENALTY * (away[:, None] ** 2 + away**2)), around=scores)
+    return Detection(*scores.best(_DISTANCE_PENALTY * (away[:, None] ** 2 + away**2)), around=scores)
 
 
 def whole(frame: Pyramid, window: Window, model: Model) -> Detection:
@@ -301,7 +221,8 @@ def _turns(width: float, height: float, regions: tuple[Region, ...]) -> list[lis
 
 def _best_of(frame: Pyramid, parts: list[_Part], window: Window, model: Model) -> Detection:
     """The best window of several parts of a frame, each searched at the size of a window times a factor."""
-    found = [ScoreMap.within(frame, region, window.scaled(factor), model).best() for factor, region in parts]
+    maps = [ScoreMap.within(frame, region, window.scaled(factor), model) for factor, region in parts]
+    found = [Detection(*each.best()) for each in maps]
     costs = [extent.cost(math.log(factor)) for factor, _ in parts]
     return found[int(np.argmax([each.score - cost for each, cost in zip(found, costs, strict=True)]))]
 
@@ -330,7 +251,7 @@ def _sighting(frame: Pyramid, window: Window, factors: tuple[float, ...], model:
     costs = [extent.cost(math.log(factor)) for factor in factors]
     worths = [float(each.scores.max()) - cost for each, cost in zip(maps, costs, strict=True)]
     scores = maps[int(np.argmax(worths))]
-    best = scores.best()
+    best = Detection(*scores.best())
     apart = max((each.apart(best.window) for each in maps), key=lambda each: float(each.scores.max()))
     rival = float(apart.scores.max())
     rival_row = apart.row(*apart.highest()) if rival > 0 else None
@@ -372,7 +293,7 @@ def _at_best_size(frame: Pyramid, found: Detection, first: Window, model: Model,
 
     def tried(step: int) -> tuple[float, Detection]:
         scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
-        best = scores.best()
+        best = Detection(*scores.best())
         fit = _fit(scores.row(1, 1), model, SIZE, settings)
         return best.score + fit - extent.cost(step * extent.SIZE_CHANGE, grown, settings.prior), best
 
@@ -429,30 +350,3 @@ def _climb(tried: Callable[[int], tuple[float, Detection]], most: int) -> tuple[
     if not all(step in trials and math.isfinite(trials[step][0]) for step in neighbours):
         return trials[best][1], best, 0.0
     return trials[best][1], best, vertex(np.array([trials[step][0] for step in neighbours]), 1)
-
-
-def non_maximum_suppression(scores: np.ndarray, most: int, apart: int, least: float = -np.inf) -> list[tuple[int, int]]:
-    """The highest windows, each more than `apart` cells from any higher one.
-
-    Returns
-    -------
-    up to `most` pairs (row, column) with a score above `least`, highest first
-    """
-    left = scores.copy()
-    maxima = []
-    for _ in range(most):
-        row, column = divmod(int(left.argmax()), left.shape[1])
-        if not left[row, column] > least:
-            break
-        maxima.append((row, column))
-        left[max(row - apart, 0) : row + apart + 1, max(column - apart, 0) : column + apart + 1] = -np.inf
-    return maxima
-
-
-def vertex(values: np.ndarray, i: int) -> float:
-    """Offset of the vertex of the parabola through three neighbours, -0.5 to 0.5."""
-    if not 0 < i < len(values) - 1:
-        return 0.0
-    before, here, after = float(values[i - 1]), float(values[i]), float(values[i + 1])
-    bend = before - 2 * here + after
-    return min(max((before - after) / (2 * bend), -0.5), 0.5) if bend < 0 else 0.0

@@ -18,11 +18,12 @@ import numpy as np
 from catstream.box import Box, Window
 from catstream.detection import extent
 from catstream.detection.likeness import Likeness
-from catstream.detection.search import ScoreMap, due, non_maximum_suppression
+from catstream.detection.search import due
 from catstream.errors import BoxError
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW, row_length
 from catstream.features.pyramid import Pyramid
+from catstream.features.score_map import ScoreMap, non_maximum_suppression
 from catstream.messages.heads import APPEARANCE, BETWEEN_RIDGE, EXTENT
 from catstream.messages.kinds import Model, TrainingRows
 from catstream.numerics import ridge

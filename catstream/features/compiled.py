@@ -10,37 +10,24 @@ import contextlib
 import ctypes
 import functools
 import hashlib
-import inspect
 import logging
 import os
-import re
 import tempfile
 from collections.abc import Callable, Iterator
 from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.metadata import version
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import TypeVar, cast
 
 import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
 from catstream.features import COMPILING
+from catstream.features.machine import ENTRY, FUNCTIONS, globals_of, processor, target_machine
 
-__all__ = ["ENTRY", "FUNCTIONS", "Parameter", "globals_of", "kernel", "parameters", "target_machine"]
-
-ENTRY = "kernel"  #: name of the function in the machine code
-#: Functions of Python's C-API that the machine code may call.
-FUNCTIONS = (
-    "PyErr_Occurred",
-    "PyErr_SetString",
-    "PyEval_RestoreThread",
-    "PyEval_SaveThread",
-    "PyFloat_AsDouble",
-    "PyLong_AsLongLong",
-    "Py_NewRef",
-)
+__all__ = ["kernel"]
 
 _Function = TypeVar("_Function", bound=Callable[..., None])
 
@@ -92,49 +79,6 @@ class _Method(ctypes.Structure):
     )
 
 
-class Parameter(NamedTuple):
-    """The type of a kernel's parameter.
-
-    dtype       name of the dtype of the number or array
-    dimensions  of the array; 0 for a number
-    contiguous  if the array has to be C-contiguous
-    """
-
-    dtype: str
-    dimensions: int
-    contiguous: bool
-
-
-def parameters(signature: str) -> list[Parameter]:
-    """Parameters of a kernel.
-
-    >>> parameters("void(uint8[:,::1])")
-    [Parameter(dtype='uint8', dimensions=2, contiguous=True)]
-    """
-    found = re.findall(r"(\w+)(?:\[([:,1]+)\])?", signature.removeprefix("void"))
-    return [Parameter(dtype, axes.count(",") + 1 if axes else 0, axes.endswith("::1")) for dtype, axes in found]
-
-
-def globals_of(function: FunctionType) -> dict[str, Any]:
-    """What a function reads from its module, by name."""
-    return dict(inspect.getclosurevars(function).globals)
-
-
-@functools.cache
-def target_machine() -> llvm.TargetMachine:
-    """This processor, for LLVM to make the fastest machine code for it."""
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    cpu, features = _processor()
-    options = {"cpu": cpu, "features": features, "opt": 3, "codemodel": "jitdefault", "jit": True}
-    return llvm.Target.from_triple(llvm.get_process_triple()).create_target_machine(**options)
-
-
-def _processor() -> tuple[str, str]:
-    """Its name, and what it can do."""
-    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-
-
 def _load(name: str, function: FunctionType, signature: str) -> llvm.ResourceTracker:
     """The machine code of a kernel, which is compiled if the cache has none."""
     file = _FOLDER / f"{name}.{_digest(name, function, signature)}.kernel"
@@ -166,7 +110,7 @@ def _linker() -> llvm.LLJIT:
 def _digest(name: str, function: FunctionType, signature: str) -> str:
     """A digest of all that machine code depends on."""
     digest = hashlib.sha256()
-    for part in (_compiler(), repr(_processor()).encode(), name.encode(), signature.encode(), *_described(function)):
+    for part in (_compiler(), repr(processor()).encode(), name.encode(), signature.encode(), *_described(function)):
         digest.update(b"%d:%s" % (len(part), part))
     return digest.hexdigest()[:32]
 
@@ -174,7 +118,7 @@ def _digest(name: str, function: FunctionType, signature: str) -> str:
 @functools.cache
 def _compiler() -> bytes:
     """Versions of the compiler and of Python's binary interface, and the source code here."""
-    sources = [Path(__file__).with_name(name).read_bytes() for name in ("compiled.py", "compiler.py")]
+    sources = [Path(__file__).with_name(name).read_bytes() for name in ("compiled.py", "compiler.py", "machine.py")]
     return repr((EXTENSION_SUFFIXES[0], version("numba"), llvmlite.__version__, sources)).encode()
 
 

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from llvmlite import ir
 
-from catstream.features.compiled import ENTRY, FUNCTIONS, Parameter, globals_of, parameters, target_machine
+from catstream.features.machine import ENTRY, FUNCTIONS, Parameter, globals_of, parameters, target_machine
 
 __all__ = ["machine_code"]
 

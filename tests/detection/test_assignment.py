@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from catstream.box import Box, Window
 from catstream.detection.assignment import assigned
-from catstream.detection.search import Detection, ScoreMap, local
+from catstream.detection.search import Detection, local
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
+from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import DetectorState, Model
 from catstream.settings import SearchSettings
 

@@ -5,10 +5,10 @@ import pytest
 
 from catstream.box import Window
 from catstream.detection.colour_centroid import recentred
-from catstream.detection.search import ScoreMap
 from catstream.features import colours
 from catstream.features.layout import COLOURS, row_length
 from catstream.features.pyramid import Pyramid, planes_of
+from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import Model
 
 RED, GREEN = (40, 40, 200), (60, 160, 60)

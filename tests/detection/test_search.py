@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from catstream.box import Window
 from catstream.detection import extent, search
-from catstream.detection.search import ScoreMap, due, non_maximum_suppression
+from catstream.detection.search import due
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
+from catstream.features.score_map import ScoreMap, non_maximum_suppression
 from catstream.messages.kinds import Model
 from catstream.settings import ExtentSettings
 

@@ -5,10 +5,10 @@ import pytest
 
 from catstream.box import Window
 from catstream.detection import teacher
-from catstream.detection.search import ScoreMap
 from catstream.features.cells import Cells
 from catstream.features.layout import COLOURS, WINDOW, row_length
 from catstream.features.pyramid import Pyramid
+from catstream.features.score_map import ScoreMap
 from catstream.messages.heads import APPEARANCE, EXTENT
 from catstream.messages.kinds import Model
 from catstream.settings import Settings

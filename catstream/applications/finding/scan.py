@@ -16,10 +16,11 @@ import numpy as np
 
 from catstream.box import Box, Window
 from catstream.detection.likeness import Likeness
-from catstream.detection.search import Detection, ScoreMap, fitted, non_maximum_suppression
+from catstream.detection.search import SAME_OVERLAP, Detection, fitted
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
+from catstream.features.score_map import ScoreMap, non_maximum_suppression
 from catstream.messages.kinds import Model
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
@@ -39,7 +40,6 @@ _WIDEST = 1.25  # of a window, as a multiple of the frame: its object fills the 
 _SMALLEST = 24  # side of a window in pixels: a smaller one shows too little of its object
 _MOST_MAXIMA = 8  # windows of one size that are examined, and sightings of one object in a frame
 _FITTED = 0.7  # share of the threshold from which a window is fitted: its score rises by less
-_SAME_OVERLAP = 0.3  # above which two windows show the same object
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +169,6 @@ def _suppressed(found: Iterable[Seen]) -> list[Seen]:
     """The windows that overlap no better one, highest score first."""
     kept: list[Seen] = []
     for each in sorted(found, key=lambda one: -one.score):
-        if len(kept) < _MOST_MAXIMA and all(each.window.overlap(other.window) < _SAME_OVERLAP for other in kept):
+        if len(kept) < _MOST_MAXIMA and all(each.window.overlap(other.window) < SAME_OVERLAP for other in kept):
             kept.append(each)
     return kept

@@ -1,0 +1,68 @@
+"""What the compiler of kernels and their calls have in common: parameters, names and the processor."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import llvmlite.binding as llvm
+
+__all__ = ["ENTRY", "FUNCTIONS", "Parameter", "globals_of", "parameters", "processor", "target_machine"]
+
+ENTRY = "kernel"  #: name of the function in the machine code
+#: Functions of Python's C-API that the machine code may call.
+FUNCTIONS = (
+    "PyErr_Occurred",
+    "PyErr_SetString",
+    "PyEval_RestoreThread",
+    "PyEval_SaveThread",
+    "PyFloat_AsDouble",
+    "PyLong_AsLongLong",
+    "Py_NewRef",
+)
+
+
+class Parameter(NamedTuple):
+    """The type of a kernel's parameter.
+
+    dtype       name of the dtype of the number or array
+    dimensions  of the array; 0 for a number
+    contiguous  if the array has to be C-contiguous
+    """
+
+    dtype: str
+    dimensions: int
+    contiguous: bool
+
+
+def parameters(signature: str) -> list[Parameter]:
+    """Parameters of a kernel.
+
+    >>> parameters("void(uint8[:,::1])")
+    [Parameter(dtype='uint8', dimensions=2, contiguous=True)]
+    """
+    found = re.findall(r"(\w+)(?:\[([:,1]+)\])?", signature.removeprefix("void"))
+    return [Parameter(dtype, axes.count(",") + 1 if axes else 0, axes.endswith("::1")) for dtype, axes in found]
+
+
+def globals_of(function: FunctionType) -> dict[str, Any]:
+    """What a function reads from its module, by name."""
+    return dict(inspect.getclosurevars(function).globals)
+
+
+@functools.cache
+def target_machine() -> llvm.TargetMachine:
+    """This processor, for LLVM to make the fastest machine code for it."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    cpu, features = processor()
+    options = {"cpu": cpu, "features": features, "opt": 3, "codemodel": "jitdefault", "jit": True}
+    return llvm.Target.from_triple(llvm.get_process_triple()).create_target_machine(**options)
+
+
+def processor() -> tuple[str, str]:
+    """Its name, and what it can do."""
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()

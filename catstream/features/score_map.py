@@ -1,0 +1,120 @@
+"""The scores of all windows of a part of a frame at one scale, with the features from which they were computed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from catstream.box import Window
+from catstream.features.cells import Cells
+from catstream.features.layout import WINDOW
+from catstream.features.pyramid import Pyramid, Region
+from catstream.messages.kinds import Model
+
+__all__ = ["ScoreMap", "non_maximum_suppression", "vertex"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoreMap:
+    """Features of a part of a frame at one scale, and the score of each window in them.
+
+    cells    of rows x columns
+    scores   float32 (rows - 7, columns - 7), each of the window whose first cell is there
+    origin   corner of the first cell in the frame, (x, y) in pixels
+    step     width and height of a cell, in pixels of the frame
+    """
+
+    cells: Cells
+    scores: np.ndarray
+    origin: tuple[float, float]
+    step: tuple[float, float]
+
+    @classmethod
+    def around(cls, frame: Pyramid, window: Window, side: int, model: Model | None) -> ScoreMap:
+        """All windows in `side` x `side` cells around a window, of its size; without a model all scores are 0."""
+        patch = frame.around(window, side)
+        cells = Cells.within(patch)
+        if model is None:
+            scores = np.zeros((side - WINDOW + 1,) * 2, np.float32)
+        else:
+            scores = cells.respond(model.weights, model.bias)
+        step, (x, y) = (window.w / WINDOW, window.h / WINDOW), window.centre
+        return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step)
+
+    @classmethod
+    def within(cls, frame: Pyramid, region: Region, window: Window, model: Model) -> ScoreMap:
+        """All windows of a size in a region of a frame."""
+        image, step = frame.part(region).resized(window)
+        cells = Cells.of(image)
+        return cls(cells, cells.respond(model.weights, model.bias), (float(region.left), float(region.top)), step)
+
+    @classmethod
+    def whole(cls, frame: Pyramid, window: Window, model: Model) -> ScoreMap:
+        """All windows of a size in a frame, or in as large a part around the window as can be searched in time."""
+        return cls.within(frame, frame.region_around(window), window, model)
+
+    def window(self, row: float, column: float) -> Window:
+        """The window at (row, column), which may lie between cells."""
+        (x, y), (w, h) = self.origin, self.step
+        return Window(x + column * w, y + row * h, WINDOW * w, WINDOW * h)
+
+    def place(self, window: Window) -> tuple[float, float]:
+        """Row and column, between the cells, of the window with the same centre: the inverse of `window`."""
+        (x, y), (w, h), (left, top) = window.centre, self.step, self.origin
+        return (y - top) / h - WINDOW / 2, (x - left) / w - WINDOW / 2
+
+    def row(self, row: int, column: int) -> np.ndarray:
+        """Feature row of the window at (row, column), float32 (d,)."""
+        return self.cells.row(row, column)
+
+    def highest(self, penalty: np.ndarray | float = 0.0) -> tuple[int, int]:
+        """Row and column of the window with the highest score less a penalty."""
+        row, column = divmod(int((self.scores - penalty).argmax()), self.scores.shape[1])
+        return row, column
+
+    def best(self, penalty: np.ndarray | float = 0.0) -> tuple[float, Window]:
+        """The score of the window with the highest score less a penalty; and the window, refined between the cells."""
+        row, column = self.highest(penalty)
+        return float(self.scores[row, column]), self.window(*self.refined(row, column))
+
+    def refined(self, row: int, column: int) -> tuple[float, float]:
+        """The maximum at (row, column) refined between the cells, by a parabola in each direction."""
+        scores = self.scores
+        return row + vertex(scores[:, column], row), column + vertex(scores[row], column)
+
+    def apart(self, window: Window) -> ScoreMap:
+        """The same, but the score of each window that touches another one is -inf."""
+        (x, y), (w, h) = self.origin, self.step
+        rows, columns = self.scores.shape
+        top, left = y + h * np.arange(rows), x + w * np.arange(columns)
+        beyond = (top >= window.y + window.h) | (top + WINDOW * h <= window.y)
+        beside = (left >= window.x + window.w) | (left + WINDOW * w <= window.x)
+        return replace(self, scores=np.where(beyond[:, None] | beside, self.scores, np.float32(-np.inf)))
+
+
+def non_maximum_suppression(scores: np.ndarray, most: int, apart: int, least: float = -np.inf) -> list[tuple[int, int]]:
+    """The highest windows, each more than `apart` cells from any higher one.
+
+    Returns
+    -------
+    up to `most` pairs (row, column) with a score above `least`, highest first
+    """
+    left = scores.copy()
+    maxima = []
+    for _ in range(most):
+        row, column = divmod(int(left.argmax()), left.shape[1])
+        if not left[row, column] > least:
+            break
+        maxima.append((row, column))
+        left[max(row - apart, 0) : row + apart + 1, max(column - apart, 0) : column + apart + 1] = -np.inf
+    return maxima
+
+
+def vertex(values: np.ndarray, i: int) -> float:
+    """Offset of the vertex of the parabola through three neighbours, -0.5 to 0.5."""
+    if not 0 < i < len(values) - 1:
+        return 0.0
+    before, here, after = float(values[i - 1]), float(values[i]), float(values[i + 1])
+    bend = before - 2 * here + after
+    return min(max((before - after) / (2 * bend), -0.5), 0.5) if bend < 0 else 0.0
