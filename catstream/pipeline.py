@@ -60,7 +60,7 @@ class Pipeline:
         objects by name: `{"anna": (120, 80, 64, 48), "ben": (300, 90, 60, 150)}`. Without a box or a model, the run
         waits for the box that `catstream.control` gives: a file stays at its first frame, a live source continues.
     settings : Settings or mapping of str
-        The settings that differ from the defaults, or from those of the run that is resumed.
+        All settings; or by name, those that differ from the defaults, or from those of the run that is resumed.
     model : path, or a mapping of names to paths
         File that `catstream save` wrote. The object is searched for, and absent until it is found; learning continues
         from the file.
@@ -134,13 +134,12 @@ class Pipeline:
         start_server()  # it imports while this process opens the source
         self._resumed_job = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
-        given = settings.changed() if isinstance(settings, Settings) else settings or {}
         job = self._resumed_job or Job(started=time.time())
         job = replace(
             job if box is None and model is None else job.with_objects(box, model),
             source=source_text(source) if source is not None else job.source,
             part=job.part if part == ALL_FRAMES else part,
-            settings=job.settings.but(given),
+            settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),
             results=job.results if results is None else results.after(job.results),
         )
         self._record = Path(record) if record is not None else None

@@ -213,13 +213,6 @@ class BeliefSettings(_Group):
     jump_margin: Annotated[
         float, _about("Difference of score by which a window elsewhere in the frame must exceed the local one.")
     ] = 0.4
-    sighting_lead: Annotated[
-        float,
-        _about(
-            "Difference of score to the best window elsewhere in the frame that an object of a saved model needs to be "
-            "detected for the first time."
-        ),
-    ] = 0.1
     sighting_likeness: Annotated[
         float,
         _about(
@@ -227,9 +220,6 @@ class BeliefSettings(_Group):
             "window's appearance in the subspace of the object, relative to that of the object itself."
         ),
     ] = 0.5
-    sighting_frames: Annotated[
-        int, _about("Successive frames that must agree before an object of a saved model is detected.", ge=1)
-    ] = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,14 +263,6 @@ class TeachingSettings(_Group):
     hard_negatives: Annotated[
         int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
     ] = 10
-    mining_interval: Annotated[
-        int,
-        _about(
-            "Frames between two searches for hard negatives. A large frame is searched in parts, one of them in each "
-            "frame.",
-            ge=1,
-        ),
-    ] = 8
 
 
 @dataclass(frozen=True, kw_only=True)

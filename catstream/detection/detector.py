@@ -88,8 +88,8 @@ class Detector:
 
         Another object before it is forgotten.
 
-        It is found at a window that looks like the object and scores `sighting_lead` higher than the rest of the
-        frame, in `sighting_frames` successive frames. Of two objects that look alike, neither is found.
+        It is found at a window that looks like the object and scores higher than the rest of the frame, in several
+        successive frames. Of two objects that look alike, neither is found.
 
         Parameters
         ----------

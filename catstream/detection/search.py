@@ -40,6 +40,8 @@ _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole fram
 _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
 _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
 _LIKELY_STEPS = 8  # larger or smaller than the size at which an object was first found, that are tried
+_SIGHTINGS = 3  # successive frames that must agree before the object of a saved model is found
+_SIGHTING_LEAD = 0.1  # difference of score to the best window elsewhere that it needs
 _LEAD_OVER_ALIKE = 0.25  # difference of score to another window whose likeness to the object is at least half as high
 SAME_OVERLAP = 0.3  #: above which two windows in successive frames show the same object
 
@@ -122,7 +124,7 @@ def seek(
         sightings=0 if not seen else state.sightings + 1 if again else 1,
         confident_window=best.window,
     )
-    if state.sightings < limits.sighting_frames:
+    if state.sightings < _SIGHTINGS:
         return state, best
     found = replace(_at_likely_size(frame, best, model, likeness), score=best.score, redetected=True)
     return replace(state, window=found.window, first_window=found.window), found
@@ -261,7 +263,7 @@ def _sighting(frame: Pyramid, window: Window, factors: tuple[float, ...], model:
 def _stands_out(sighting: _Sighting, likeness: Likeness, limits: BeliefSettings) -> bool:
     """Whether the best window looks like the object, and leads the rest of the frame."""
     lead, alike = sighting.found.score - sighting.rival, likeness(sighting.row)
-    if alike < limits.sighting_likeness or lead < limits.sighting_lead:
+    if alike < limits.sighting_likeness or lead < _SIGHTING_LEAD:
         return False
     rival = 0.0 if sighting.rival_row is None else likeness(sighting.rival_row)
     return lead >= _LEAD_OVER_ALIKE or rival < alike / 2

@@ -51,6 +51,7 @@ _EXTENT_INTERVAL = 2  # frames from one set of rows of windows of wrong extents 
 _OBJECT_WEIGHT = 8.0  # of a frame's rows of the object together; any other row has weight 1
 _BACKGROUND = 12  # windows of the background around the object, of each frame
 _SIDE = 20  # cells around the object, at least, from which background is taken
+_MINING_INTERVAL = 8  # frames between two searches for hard negatives; a large frame is searched in parts
 _MOST_CELLS = 4096  # limit of a search for hard negatives in one frame: about 4 ms
 _HARD_OVERLAP = 0.2  # of a hard negative with the object's window, at most
 
@@ -149,12 +150,12 @@ def _mined(frame: Pyramid, window: Window, seq: int, model: Model, teaching: Tea
     Each part has its share of the rows, so that their number over many frames does not depend on that of the parts.
     """
     parts = frame.region_around(window).split(window, _MOST_CELLS)
-    number = due(seq, teaching.mining_interval, len(parts))
+    number = due(seq, _MINING_INTERVAL, len(parts))
     if number is None:
         return None
-    # Rows of a round: hard_negatives / mining_interval for each of its frames. Each part has an equal share of them.
-    rows = teaching.hard_negatives * max(len(parts), teaching.mining_interval)
-    end, begin = (each * rows // (len(parts) * teaching.mining_interval) for each in (number + 1, number))
+    # Rows of a round: hard_negatives / _MINING_INTERVAL for each of its frames. Each part has an equal share of them.
+    rows = teaching.hard_negatives * max(len(parts), _MINING_INTERVAL)
+    end, begin = (each * rows // (len(parts) * _MINING_INTERVAL) for each in (number + 1, number))
     if begin == end:
         return None
     scores = ScoreMap.within(frame, parts[number], window, model)

@@ -131,11 +131,11 @@ def test_hard_negatives_of_a_round_are_as_many_however_many_parts_are_searched_i
     monkeypatch.setattr(teacher, "_strongest", lambda scores, _, most: [scores.row(0, 0)] * most)
     teaching = SETTINGS.teaching
     parts = frame.region.split(OBJECT, most)
-    frames = max(len(parts), teaching.mining_interval)
+    frames = max(len(parts), teacher._MINING_INTERVAL)
     mined = [teacher._mined(frame, OBJECT, seq, model, teaching) for seq in range(frames)]
     counts = [len(each) for each in mined if each is not None]
-    assert sum(counts) == teaching.hard_negatives * frames // teaching.mining_interval
-    assert max(counts) <= -(-teaching.hard_negatives // min(len(parts), teaching.mining_interval))
+    assert sum(counts) == teaching.hard_negatives * frames // teacher._MINING_INTERVAL
+    assert max(counts) <= -(-teaching.hard_negatives // min(len(parts), teacher._MINING_INTERVAL))
     again = teacher._mined(frame, OBJECT, 0, model, teaching)
     np.testing.assert_array_equal(again.rows, mined[0].rows)
 

@@ -7,6 +7,7 @@ import pytest
 from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
 from catstream.run.state import files, position, restore, skip
+from catstream.settings import Settings
 
 
 @pytest.fixture
@@ -30,6 +31,12 @@ def test_numbers_go_on_after_the_frames_that_were_lost(state):
     settings = Pipeline(resume=state).settings
     assert skip(state, settings, 42) == 30
     assert (position(state).seq, position(state).frame) == (42, 41)
+
+
+def test_a_run_is_resumed_with_all_settings_that_are_given_also_if_they_are_the_defaults(state):
+    assert Pipeline(resume=state).settings.run.lockstep
+    assert Pipeline(resume=state, settings={"run.lag_frames": 3}).settings.run.lockstep
+    assert Pipeline(resume=state, settings=Settings()).settings == Settings()
 
 
 def test_a_folder_without_a_checkpoint_has_no_files(tmp_path):
