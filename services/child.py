@@ -16,7 +16,9 @@ from catstream.services.watchdog import Watchdog
 
 __all__ = ["Child"]
 
-_STEP_SECONDS = 0.5  # the most that counts between two calls of `hangs`, as the parent itself may have been suspended
+_STEP_SECONDS = (
+    0.5  # the most that counts between two calls of `count_turns`, as the parent itself may have been suspended
+)
 _TURN_SECONDS = 0.01  # from one turn of the parent to the next, while it waits for the end of the process
 _STOPPED_SECONDS = 2.0  # a process that SIGSTOP has stopped for so long counts as hung
 
@@ -89,14 +91,18 @@ class Child:
         """Whether the process ended normally, or because the source broke."""
         return self.code in (0, SOURCE_FAILED)
 
-    def hangs(self, seconds: float) -> bool:
-        """Whether the loop of the process has been stuck for too long; the last call was `seconds` ago."""
+    def count_turns(self, seconds: float) -> None:
+        """Note whether the loop of the process has turned since the last call, which was `seconds` ago."""
         if (turns := self._watchdog.turns) != self._turns:
             self._turns, self.silent, self._stopped = turns, 0.0, 0.0
-            return False
+            return
         seconds = min(seconds, _STEP_SECONDS)
         self.silent += seconds
         self._stopped = self._stopped + seconds if self.silent > _STEP_SECONDS and self._is_stopped() else 0.0
+
+    @property
+    def hangs(self) -> bool:
+        """Whether the loop of the process has been stuck for too long."""
         return self.silent > self._watchdog.patience or self._stopped > _STOPPED_SECONDS
 
     def _is_stopped(self) -> bool:

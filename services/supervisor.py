@@ -105,7 +105,8 @@ class Supervisor:
 
     def _check_hanging(self, child: Child, seconds: float) -> None:
         """Kill a child that has hung for too long, `seconds` after the last check."""
-        if child.hangs(seconds) and not child.killed:
+        child.count_turns(seconds)
+        if child.hangs and not child.killed:
             _log.warning("the %s hangs, and is killed: its loop has stood still for %.1f s", child.name, child.silent)
             child.killed = True
             child.kill()
