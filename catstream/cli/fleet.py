@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,53 +17,31 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
+from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
+from catstream.errors import FleetError, ServiceError
+from catstream.messages import storage
 from catstream.messages.kinds import FleetStatus, StreamStatus
-from catstream.messages.names import split_name
+from catstream.messages.names import UNNAMED, split_name
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
 
 __all__ = ["fleet"]
 
-#: Subcommand -> module that holds it, where it is not this one, and its name there; imported when it is called.
-_ELSEWHERE = {"view": ("view", "fleet_view"), "merge": ("fleet_merge", "merge")}
-
-_SUMMARIES = {
-    "up": "Start the streams of a file, or apply its changes.",
-    "status": "Show all streams and nodes.",
-    "view": "Watch all streams in a browser.",
-    "add": "Add a stream.",
-    "remove": "Remove streams.",
-    "move": "Move a stream to a node.",
-    "drain": "Move all streams from a node.",
-    "logs": "Print what a stream has logged.",
-    "merge": "Merge what several streams have learned of an object.",
-    "down": "Stop all streams, and end the fleet.",
-}
-
 _STARTED = ("running", "waiting", "paused", "ended", "failed", "unplaced")
 _UP_SECONDS = 120.0  # limit for the streams to start
 _LOOK_SECONDS = 0.5
 
 
-class _Fleet(click.Group):
+class _InOrder(click.Group):
+    """Lists the commands in the order in which they are defined."""
+
     def list_commands(self, _: click.Context) -> list[str]:
-        return list(_SUMMARIES)
-
-    def get_command(self, context: click.Context, name: str) -> click.Command | None:
-        if name in _ELSEWHERE:
-            module, attribute = _ELSEWHERE[name]
-            command: click.Command = getattr(import_module(f"catstream.cli.{module}"), attribute)
-            return command
-        return super().get_command(context, name)
-
-    def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl(list(_SUMMARIES.items()))
+        return list(self.commands)
 
 
-@click.group(cls=_Fleet)
+@click.group(cls=_InOrder)
 def fleet() -> None:
     """Run many streams on one machine or on many, and change them while they run.
 
@@ -84,7 +61,7 @@ def fleet() -> None:
 
 
 def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that select a fleet by its controller; the command gets them as keywords of `Fleet`."""
+    """Add the options that select a fleet by its controller; the command gets it, connected, as its first argument."""
 
     @click.option(
         "--name", "fleet_name", default="", metavar="NAME", help="Name of the fleet; not needed if only one runs here."
@@ -96,13 +73,16 @@ def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
         help="Head of a cluster of Ray, of which this machine is a node; default: RAY_ADDRESS, or this machine alone.",
     )
     @wraps(command)
-    def wrapped(fleet_name: str, address: str, **options: object) -> None:
-        command(of={"name": fleet_name, "address": address}, **options)
+    def wrapped(fleet_name: str, address: str, file: Path | None = None, **options: object) -> None:
+        from catstream.fleet.fleet import Fleet
+
+        with Fleet(file, name=fleet_name, address=address) as running:
+            command(running, **options)
 
     return wrapped
 
 
-@fleet.command()
+@fleet.command(short_help="Start the streams of a file, or apply its changes.")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--nodes", type=click.IntRange(1, 64), help="Nodes to start on this machine; default: as the file says.")
 @click.option("--cores", type=click.IntRange(1), help="Cores of each of them; default: equal shares.")
@@ -110,7 +90,7 @@ def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
 @click.option("--replace", is_flag=True, help="Replace the streams of another file that run under this name.")
 @click.option("--wait", is_flag=True, help="Let streams that do not fit wait for nodes that join later.")
 @with_fleet
-def up(file: Path, replace: bool, of: dict[str, object], **options: Any) -> None:
+def up(running: Fleet, replace: bool, **options: Any) -> None:
     """Start the streams of FILE, or apply its changes to a fleet that runs.
 
     On a cluster of Ray (--address), or if the fleet runs already, the command
@@ -125,26 +105,22 @@ def up(file: Path, replace: bool, of: dict[str, object], **options: Any) -> None
       catstream fleet up examples/fleet.toml --detach
       catstream fleet up fleet.toml --address 10.0.0.1:6379
     """
-    from catstream.errors import FleetError
-    from catstream.fleet.fleet import Fleet
-
     console = Console()
-    with Fleet(file, **of) as running:  # type: ignore[arg-type]  # the options of `with_fleet`
-        try:
-            lines = _up(running, replace=replace, **options)
-        except FleetError as error:
-            if "(--replace)" not in str(error) or not sys.stdin.isatty():
-                raise
-            click.confirm(f"{str(error).partition(': give')[0]}. Replace them?", abort=True)
-            lines = _up(running, replace=True, **options)
-        for line in lines:
-            click.echo(line)
-        with suppress(KeyboardInterrupt):
-            _watch(console, running)
-        if running.is_owner:
-            with Console(stderr=True).status("storing the states of all streams"):
-                running.down()
-            click.echo(f"the fleet {running.name} is down")
+    try:
+        lines = _up(running, replace=replace, **options)
+    except FleetError as error:
+        if "(--replace)" not in str(error) or not sys.stdin.isatty():
+            raise
+        click.confirm(f"{str(error).partition(': give')[0]}. Replace them?", abort=True)
+        lines = _up(running, replace=True, **options)
+    for line in lines:
+        click.echo(line)
+    with suppress(KeyboardInterrupt):
+        _watch(console, running)
+    if running.is_owner:
+        with Console(stderr=True).status("storing the states of all streams"):
+            running.down()
+        click.echo(f"the fleet {running.name} is down")
 
 
 def _up(fleet: Fleet, **options: Any) -> list[str]:
@@ -196,6 +172,9 @@ def status(place: str, keys: str, as_json: bool) -> None:
         sys.exit(1)
 
 
+fleet.add_command(fleet_view)
+
+
 @fleet.command()
 @click.argument("name")
 @click.option("--source", required=True, metavar="SOURCE", help="Video, folder, camera or stream.")
@@ -207,6 +186,7 @@ def status(place: str, keys: str, as_json: bool) -> None:
 @click.option("--follow", multiple=True, metavar="OBJECT", help="Search for an object by its merged model.")
 @with_fleet
 def add(
+    running: Fleet,
     name: str,
     source: str,
     boxes: tuple[str, ...],
@@ -215,7 +195,6 @@ def add(
     cores: float | None,
     labels: tuple[str, ...],
     follow: tuple[str, ...],
-    of: dict[str, object],
 ) -> None:
     """Add a stream, or change the one of that name.
 
@@ -225,7 +204,6 @@ def add(
     EXAMPLE
       catstream fleet add cam-7 --source rtsp://10.0.0.7/1 --box 120,80,64,48 --label site=north
     """
-    from catstream.fleet.fleet import Fleet
     from catstream.fleet.spec import StreamSpec
 
     table = {
@@ -237,34 +215,30 @@ def add(
         "follow": list(follow),
     }
     spec = StreamSpec.parse(name, table | ({} if cores is None else {"cores": cores}), Path.cwd())
-    with Fleet(**of) as running:  # type: ignore[arg-type]
-        for line in running.add(spec):
-            click.echo(line)
+    for line in running.add(spec):
+        click.echo(line)
 
 
 @fleet.command()
 @click.argument("names", nargs=-1, required=True)
 @click.option("--forget", is_flag=True, help="Remove what they have learned, too.")
 @with_fleet
-def remove(names: tuple[str, ...], forget: bool, of: dict[str, object]) -> None:
+def remove(running: Fleet, names: tuple[str, ...], forget: bool) -> None:
     """Remove streams; what they have learned stays in the store.
 
     \b
     EXAMPLE
       catstream fleet remove cam-7
     """
-    from catstream.fleet.fleet import Fleet
-
-    with Fleet(**of) as running:  # type: ignore[arg-type]
-        for line in running.remove(*names, forget=forget):
-            click.echo(line)
+    for line in running.remove(*names, forget=forget):
+        click.echo(line)
 
 
-@fleet.command()
+@fleet.command(short_help="Move a stream to a node.")
 @click.argument("name")
 @click.argument("node")
 @with_fleet
-def move(name: str, node: str, of: dict[str, object]) -> None:
+def move(running: Fleet, name: str, node: str) -> None:
     """Move the stream NAME to a NODE, where it stays until the node dies or drains.
 
     The stream stores its state, ends, and continues on the other node; a live
@@ -274,53 +248,73 @@ def move(name: str, node: str, of: dict[str, object]) -> None:
     EXAMPLE
       catstream fleet move cam-7 node-2
     """
-    from catstream.fleet.fleet import Fleet
-
-    with Fleet(**of) as running:  # type: ignore[arg-type]
-        click.echo(running.move(name, node))
+    click.echo(running.move(name, node))
 
 
-@fleet.command()
+@fleet.command(short_help="Move all streams from a node.")
 @click.argument("node")
 @click.option("--undo", is_flag=True, help="Let the node take streams again.")
 @with_fleet
-def drain(node: str, undo: bool, of: dict[str, object]) -> None:
+def drain(running: Fleet, node: str, undo: bool) -> None:
     """Move all streams from a NODE and place none there, before it is switched off.
 
     \b
     EXAMPLE
       catstream fleet drain node-2
     """
-    from catstream.fleet.fleet import Fleet
-
-    with Fleet(**of) as running:  # type: ignore[arg-type]
-        click.echo(running.drain(node, undo=undo))
+    click.echo(running.drain(node, undo=undo))
 
 
-@fleet.command()
+@fleet.command(short_help="Print what a stream has logged.")
 @click.argument("name")
 @click.option("--lines", default=100, show_default=True, help="How many of the last lines.")
 @with_fleet
-def logs(name: str, lines: int, of: dict[str, object]) -> None:
+def logs(running: Fleet, name: str, lines: int) -> None:
     """Print what the stream NAME has logged on its node since it started there."""
-    from catstream.fleet.fleet import Fleet
+    for line in running.logs(name, lines):
+        click.echo(line)
 
-    with Fleet(**of) as running:  # type: ignore[arg-type]
-        for line in running.logs(name, lines):
-            click.echo(line)
+
+@fleet.command(short_help="Merge what several streams have learned of an object.")
+@click.argument("names", nargs=-1)
+@click.option(
+    "--object", "object_name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one."
+)
+@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write the model to a file, too.")
+@with_fleet
+def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path | None) -> None:
+    """Merge what the streams NAMES have learned of an object; default: all.
+
+    The model is kept in the store of the fleet, and each stream that follows
+    the object searches for it by this model. A state in the store is a few
+    seconds old. Frames that several states contain are counted once.
+
+    \b
+    EXAMPLES
+      catstream fleet merge --object anna
+      catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
+    """
+    merged = running.merge(*names, object=object_name)
+    if output is not None:
+        try:
+            storage.write_atomically(output, merged.model)
+        except OSError as error:
+            raise ServiceError(f"cannot write {str(output)!r} ({error.strerror}): give another file") from None
+    line = f"merged: {', '.join(merged.streams)}"
+    if merged.skipped:
+        line += f"; the frames of these are in them already, at least in part: {', '.join(merged.skipped)}"
+    click.echo(line)
 
 
 @fleet.command()
 @with_fleet
-def down(of: dict[str, object]) -> None:
+def down(running: Fleet) -> None:
     """Stop all streams after their state was stored, and end the fleet.
 
     On this machine, Ray ends with the fleet. On a cluster, Ray stays.
     `catstream fleet up` continues from the last states.
     """
-    from catstream.fleet.fleet import Fleet
-
-    with Fleet(**of) as running, Console(stderr=True).status("storing the states of all streams"):  # type: ignore[arg-type]
+    with Console(stderr=True).status("storing the states of all streams"):
         running.down()
     click.echo(f"the fleet {running.name} is down")
 
