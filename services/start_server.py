@@ -391,9 +391,12 @@ class _Server:
         self._poll = select.poll()
         self._poll.register(requests, select.POLLIN)
         self._poll.register(self._ended, select.POLLIN)
-        with suppress(OSError):  # a kernel before 5.3: then only the end of the socket shows the end of the program
+        try:
             self._descriptors.append(program_end := os.pidfd_open(program))
             self._poll.register(program_end, select.POLLIN)
+        except OSError:  # a kernel before 5.3: then only the end of the socket shows the end of the program
+            if self._is_shared:  # it has ended meanwhile
+                raise
         self._logged = False
 
     def serve(self) -> tuple[Request, int] | None:

@@ -99,10 +99,10 @@ class Trial:
         self.fleet.up(cores=CORES, detach=True)
 
     def processes(self, node: str) -> list[psutil.Process]:
-        """The processes of a node, its raylet first."""
+        """The processes of a node, its raylet first, with its start server and what that has started."""
         keeper = psutil.Process(int((self.local.folder / "pid").read_text()))
         raylet = next(each for each in keeper.children() if f"--node-name={node}" in each.cmdline())
-        return [raylet, *raylet.children(recursive=True)]
+        return [raylet, *(each for each in psutil.process_iter() if _raylet_of(each) == str(raylet.pid))]
 
     def send(self, number: signal.Signals, *nodes: str) -> None:
         """Send a signal to all processes of nodes."""
@@ -197,6 +197,13 @@ class Trial:
             return not waiting
 
         self.until(step, f"{fault}: the recovery of {', '.join(waiting)}")
+
+
+def _raylet_of(process: psutil.Process) -> str:
+    """The raylet that has started a process, or its start server; empty for another process."""
+    with suppress(psutil.Error):
+        return process.environ().get("RAY_RAYLET_PID", "")
+    return ""
 
 
 def _is_up(stream: StreamStatus) -> bool:

@@ -141,16 +141,12 @@ class Stream:
     place : where it runs
     store : the store of the fleet
     every : seconds between two states in the store
-
-    Raises
-    ------
-    FleetError
-        From the constructor, if the store is not a valid one.
     """
 
     def __init__(self, spec: StreamSpec, order: Order, place: Place, store: str, every: float) -> None:
-        self._spec, self._order, self._place, self._every = spec, order, place, every
-        self._store = Store(store)
+        self._spec, self._order, self._place = spec, order, place
+        self._url, self._every = store, every
+        self._store: Store
         self._status = StreamStatus(spec.name, "starting", place.node, source=without_password(spec.source))
         self._rates = _Rates()
         self._stop, self._lock = threading.Event(), threading.Lock()
@@ -216,11 +212,10 @@ class Stream:
                     return self._run_once()
                 except StoreError as error:  # the claim: nothing has begun
                     self._store_trouble = str(error)
-                except CatstreamError as error:
-                    self._fail(str(error))
                 except Exception as error:  # the controller has to see it
-                    _log.exception("The stream %s failed.", self._spec.name)
-                    self._fail(f"{type(error).__name__}: {error}")
+                    if not isinstance(error, CatstreamError):
+                        _log.exception("The stream %s failed.", self._spec.name)
+                    self._fail(str(error) if isinstance(error, CatstreamError) else f"{type(error).__name__}: {error}")
                 pause = _FIRST_PAUSE if time.monotonic() - began > _FORGOTTEN_SECONDS else pause
                 self._stop.wait(pause)
                 pause = min(2 * pause, _LONGEST_PAUSE)
@@ -237,6 +232,7 @@ class Stream:
 
     def _run_once(self) -> None:
         """Claim the stream, and run the pipeline from the state in the store, or from the start."""
+        self._store = Store(self._url)
         claim = self._store.claim(self._spec.name, f"{self._place.node} process {os.getpid()}")
         self._store_trouble = ""
         shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
@@ -344,15 +340,12 @@ class Stream:
                 with suppress(CommandRejectedError):  # it was forgotten already
                     steering.forget(name)
         for name in sorted(self._spec.models.keys() - before):
-            self._search(pipeline, given_model(self._spec.name, name), name)
+            if (model := self._store.get_model(given_model(self._spec.name, name))) is None:
+                raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
+            self._search(pipeline, model, name)
 
-    def _search(self, pipeline: Pipeline, stored: str, name: str) -> None:
+    def _search(self, pipeline: Pipeline, model: Generation, name: str) -> None:
         """Search for an object by a saved model in the store."""
-        if (model := self._store.get_model(stored)) is None:
-            raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
-        self._search_by(pipeline, model, name)
-
-    def _search_by(self, pipeline: Pipeline, model: Generation, name: str) -> None:
         learned = Learned.from_bytes(model.files["model"], f"the model of {name!r} in the store")
         with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as steering:
             steering.search(learned, name)
@@ -362,7 +355,7 @@ class Stream:
         for name in self._follow:
             if name not in self._present and (model := self._store.get_model(name, known.get(name, 0))) is not None:
                 known[name] = model.token
-                self._search_by(pipeline, model, name)
+                self._search(pipeline, model, name)
 
     def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
         """Count a frame; an empty mapping means that none has arrived for a while."""

@@ -107,12 +107,18 @@ def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, un
     assert (report.status.trouble, report.superseded) == ("", False)
 
 
+def test_a_store_that_the_node_cannot_use_is_named(spec, until):
+    with started(spec, "s3://Not_a_bucket") as stream:
+        until(lambda: stream.report().status.state == "failed")
+        assert "the URL of the store is not valid" in stream.report().status.trouble
+
+
 def test_followed_objects_are_searched_for_by_the_newest_merged_model_once_they_are_absent(
     long_spec, store, until, monkeypatch
 ):
     """However many models are merged meanwhile, each is searched for once, and without a thread of its own."""
     searched = []
-    monkeypatch.setattr(Stream, "_search_by", lambda _, __, model, name: searched.append((name, model.files["model"])))
+    monkeypatch.setattr(Stream, "_search", lambda _, __, model, name: searched.append((name, model.files["model"])))
     threads = threading.active_count()
     with started(replace(long_spec, follow=("anna",)), store, every=0.05) as stream:
         until(lambda: stream.report().status.frame >= 3)

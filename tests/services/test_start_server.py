@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from contextlib import suppress
@@ -292,6 +293,16 @@ def test_a_shared_server_that_was_killed_is_replaced_by_another_one(sharing, unt
         _, other = sharing(node.pid)
         assert other.ppid() != server.pid
         node.kill()
+
+
+def test_a_shared_server_whose_process_has_ended_before_it_started_ends_too():
+    with subprocess.Popen(["true"]) as node:
+        node.wait()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind("")  # any free name
+        listener.listen()
+        server = module._start(listener, node.pid, subprocess.DEVNULL)
+    assert server.wait(60) != 0
 
 
 def test_a_program_whose_partner_has_ended_has_a_server_of_its_own(sharing):
