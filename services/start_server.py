@@ -193,14 +193,14 @@ class StartServer:
     def __init__(self, shared_with: int | None = None) -> None:
         self._program, self._imports, self.shared_with = os.getpid(), _imports(), shared_with
         self._processes: WeakSet[StartedProcess] = WeakSet()
-        self.log = ProcessLog("start server", cast(BinaryIO, tempfile.TemporaryFile()))  # noqa: SIM115
         self._process: subprocess.Popen[bytes] | None = None
+        if shared_with is not None:
+            self._requests = _connected(shared_with)
+        self.log = ProcessLog("start server", cast(BinaryIO, tempfile.TemporaryFile()))  # noqa: SIM115
         if shared_with is None:
             self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
                 self._process = _start(theirs, self._program, self.log.fileno())
-        else:
-            self._requests = _connected(shared_with)
 
     @property
     def pid(self) -> int:

@@ -305,6 +305,20 @@ def test_a_shared_server_whose_process_has_ended_before_it_started_ends_too():
     assert server.wait(60) != 0
 
 
+def test_a_start_server_of_another_user_is_not_used(monkeypatch):
+    """This process takes itself for one of another user than the server that it reaches."""
+    monkeypatch.setattr(module, "_servers", [])
+    monkeypatch.setattr(module.os, "getuid", lambda: 12345)
+    with subprocess.Popen(["sleep", "600"]) as node:
+        monkeypatch.setattr(module, "_shared_with", node.pid)
+        with pytest.raises(PermissionError, match="of another user"):
+            module._connected(node.pid)
+        own = start_server()
+        assert psutil.Process(own.pid).ppid() == os.getpid()
+        own.close()
+        node.kill()
+
+
 def test_a_program_whose_partner_has_ended_has_a_server_of_its_own(sharing):
     with subprocess.Popen(["true"]) as node:
         node.wait()
