@@ -284,9 +284,9 @@ def kill_controller(trial: Trial, status: FleetStatus) -> None:
 
 def kill_head(trial: Trial, status: FleetStatus) -> None:
     trial.send(signal.SIGKILL, "node-1")
+    trial.fleet.close()  # Ray ends a program that stays connected to a dead head for a minute
     while trial.local.running:
         sleep(0.05)
-    trial.fleet.close()
     begin = monotonic()
     trial.up()
     trial.recovered("head killed, and `up`", _on(status, "node-1", *NODES), begin)
