@@ -139,64 +139,40 @@ class Controller:
         if self._trouble is not None:
             raise self._trouble
 
-    def apply(
-        self,
-        spec: FleetSpec,
-        models: Models | None = None,
-        origin: str = "",
-        *,
-        replace_other: bool = False,
-        may_wait: bool = False,
+    def change(
+        self, how: str, *arguments: object, models: Models | None = None, may_wait: bool = False, **options: object
     ) -> list[str]:
-        """Make a spec the desired state; returns what will be done, a line for each stream.
+        """Change the desired state by a method of `Desired`; returns what will be done, a line for each stream.
 
         Parameters
         ----------
-        spec : the streams
-        models : contents of the saved models that it names, by stream and object
-        origin : machine and file of the spec
-        replace_other : whether the streams of another file may be replaced
+        how : name of the method; its arguments and options follow
+        models : contents of the saved models that streams name, by stream and object
         may_wait : whether streams may wait for nodes that join later
 
         Raises
         ------
         FleetError
-            If the streams of another file run, or not all streams can run. Nothing is changed then.
+            If the method refuses it, or not all streams can run. Nothing is changed then.
         StoreError
             If the change cannot be stored. Nothing is changed then.
         """
         with self._changing:
-            desired = self._desired.applied(spec, origin, replace_other=replace_other)
-            return self._change(desired, models, may_wait=may_wait)
-
-    def add(self, spec: StreamSpec, models: Models | None = None) -> list[str]:
-        """Add a stream to those that there are, or change the one of its name."""
-        with self._changing:
-            lines = self._change(self._desired.added(spec), models)
-        return [line for line in lines if line.startswith(f"{spec.name}:")]
-
-    def remove(self, names: list[str], *, forget: bool) -> list[str]:
-        """Remove streams; their states stay in the store, unless they are to be forgotten."""
-        with self._changing:
-            lines = self._change(self._desired.removed(names))
-            for name in names if forget else ():
-                self._store.remove(name)  # its actor is superseded, if it still runs
-        return [line for line in lines if line.partition(":")[0] in names]
-
-    def move(self, name: str, node: str) -> str:
-        """Move a stream to a node, where it stays until the node dies or drains."""
-        with self._changing:
-            desired = self._desired.moved(name, node, self._nodes)
-            before = self.status().streams[name].node
-            self._change(desired)
-        return f"{name} stays on {node}" if before == node else f"{name} moves from {before or 'no node'} to {node}"
-
-    def drain(self, node: str, *, undo: bool) -> str:
-        """Move all streams from a node and place none there, or take that back."""
-        with self._changing:
-            count = sum(each.node == node for each in self.status().streams.values())
-            self._change(self._desired.drained(node, self._nodes, undo=undo))
-        return f"{node} takes streams again" if undo else f"{node} is draining: its {count} streams move to other nodes"
+            self.ready()
+            desired: Desired = getattr(self._desired, how)(*arguments, **options)
+            if not may_wait:
+                desired.check_fits(self._nodes)
+            for (stream, name), data in (models or {}).items():
+                self._store.put_model(given_model(stream, name), data, {})
+            self._store.put_fleet(to_json(desired))
+            with self._lock:
+                lines: list[str] = self._desired.spec.changes(desired.spec)
+                self._desired, self._closing = desired, False
+                for name in self._streams.keys() - desired.spec.streams.keys():  # only the actor is left, until it ends
+                    known = self._streams[name]
+                    self._streams[name] = _Known(known.seen, known.handle, known.call)
+                self._recent = self.status()
+            return lines
 
     def status(self) -> FleetStatus:
         """The state of all streams and nodes."""
@@ -234,23 +210,6 @@ class Controller:
             self._registry.close()
 
     # What it does.
-
-    def _change(self, desired: Desired, models: Models | None = None, *, may_wait: bool = False) -> list[str]:
-        """Store the desired state, and then let it hold; returns a line for each stream."""
-        self.ready()
-        if not may_wait:
-            desired.check_fits(self._nodes)
-        for (stream, name), data in (models or {}).items():
-            self._store.put_model(given_model(stream, name), data, {})
-        self._store.put_fleet(to_json(desired))
-        with self._lock:
-            lines: list[str] = self._desired.spec.changes(desired.spec)
-            self._desired, self._closing = desired, False
-            for name in self._streams.keys() - desired.spec.streams.keys():  # only the actor is left, until it ends
-                known = self._streams[name]
-                self._streams[name] = _Known(known.seen, known.handle, known.call)
-            self._recent = self.status()
-        return lines
 
     def _begin(self) -> None:
         """Open the registry, read what should run, and find what runs."""
@@ -290,7 +249,7 @@ class Controller:
         """Look at the cluster and the actors, and do what makes them those that should run."""
         found, existing = nodes(), actors(self._name)  # without the lock: they ask the head
         with self._lock:
-            self._nodes = [replace(node, draining=node.name in self._desired.draining) for node in found]
+            self._nodes = self._desired.with_draining(found)
             if self._keys is not None and time.monotonic() >= self._clients_due:
                 self._clients_due = time.monotonic() + _CLIENTS_SECONDS
                 self._clients = allowed(self._keys)  # the next reports tell the streams

@@ -53,19 +53,20 @@ class Desired:
         pins = {name: node for name, node in self.pins.items() if name in streams}
         return replace(self, spec=replace(self.spec, streams=streams), pins=pins)
 
-    def moved(self, name: str, node: str, nodes: Collection[Node]) -> Desired:
+    def moved(self, name: str, node: Node) -> Desired:
         """With a stream on a node, until that dies or drains: a node that was started again has another id."""
         self.check_stream(name)
-        _check_node(node, nodes)
-        there = [each for each in nodes if each.name == node]
-        if reason := objection(name, self.wanted(name), there):
+        if reason := objection(name, self.wanted(name), self.with_draining([node])):
             raise FleetError(reason)
-        return replace(self, pins=self.pins | {name: there[0].id})
+        return replace(self, pins=self.pins | {name: node.id})
 
-    def drained(self, node: str, nodes: Collection[Node], *, undo: bool) -> Desired:
+    def drained(self, node: str, *, undo: bool) -> Desired:
         """With a node that streams leave; `undo` takes that back."""
-        _check_node(node, nodes)
         return replace(self, draining=self.draining - {node} if undo else self.draining | {node})
+
+    def with_draining(self, nodes: Collection[Node]) -> list[Node]:
+        """Nodes, with those marked that streams leave."""
+        return [replace(node, draining=node.name in self.draining) for node in nodes]
 
     def wanted(self, name: str) -> Wanted:
         """A stream as it should run."""
@@ -89,12 +90,6 @@ class Desired:
                 + "\nGive streams fewer cores (catstream fleet status shows what they use), add nodes, or let streams "
                 "wait for nodes that join later (catstream fleet up --wait)"
             )
-
-
-def _check_node(name: str, nodes: Collection[Node]) -> None:
-    known = [node.name for node in nodes]
-    if name not in known:
-        raise FleetError(f"there is no node {name!r} in the fleet: there are {', '.join(known)}")
 
 
 def objection(name: str, wanted: Wanted, nodes: Collection[Node]) -> str:

@@ -17,7 +17,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +28,7 @@ from catstream.errors import CatstreamError, FleetError, require_extra
 from catstream.fleet import cluster
 from catstream.fleet.cluster import NAMESPACE, actor_name
 from catstream.fleet.controller import Controller
+from catstream.fleet.life import Node
 from catstream.fleet.local import LocalCluster
 from catstream.fleet.merge import Merged, merge_streams
 from catstream.fleet.spec import FleetSpec, StreamSpec
@@ -143,23 +144,31 @@ class Fleet:
 
     def add(self, spec: StreamSpec) -> list[str]:
         """Add a stream, or change the one of the same name."""
-        lines: list[str] = self._ask("add", spec, _models([spec]))
-        return lines
+        lines: list[str] = self._ask("change", "added", spec, models=_models([spec]))
+        return _about(lines, [spec.name])
 
     def remove(self, *names: str, forget: bool = False) -> list[str]:
         """Remove streams. Unless `forget`, their state stays in the store: they continue if they are added again."""
-        answer: list[str] = self._ask("remove", list(names), forget=forget)
-        return answer
+        lines: list[str] = self._ask("change", "removed", names)
+        if forget:
+            store = Store(self._ask("spec").store)
+            for name in names:
+                store.remove(name)  # its actor is superseded, if it still runs
+        return _about(lines, names)
 
     def move(self, name: str, node: str) -> str:
         """Move a stream to a node, where it stays until the node dies or drains."""
-        answer: str = self._ask("move", name, node)
-        return answer
+        there, status = self._node(node), self.status()
+        self._ask("change", "moved", name, there)
+        before = status.streams[name].node
+        return f"{name} stays on {node}" if before == node else f"{name} moves from {before or 'no node'} to {node}"
 
     def drain(self, node: str, *, undo: bool = False) -> str:
         """Move all streams from a node and place none there, for example before it is switched off."""
-        answer: str = self._ask("drain", node, undo=undo)
-        return answer
+        self._node(node)
+        count = sum(each.node == node for each in self.status().streams.values())
+        self._ask("change", "drained", node, undo=undo)
+        return f"{node} takes streams again" if undo else f"{node} is draining: its {count} streams move to other nodes"
 
     def status(self) -> FleetStatus:
         """The state of all streams and nodes."""
@@ -195,18 +204,13 @@ class Fleet:
         deadline = time.monotonic() + _DOWN_SECONDS
         while self._ask("close") and time.monotonic() < deadline:
             time.sleep(_TURN_SECONDS)
-        self.end_controller()
-        if self._local is not None:
-            self.close()
-            self._local.stop()
-
-    def end_controller(self) -> None:
-        """End the controller, and leave streams and nodes as they are; `up` starts another one."""
         self._ask("end")
         import ray
 
         ray.kill(self._controller)
-        self._controller = None
+        if self._local is not None:
+            self.close()
+            self._local.stop()
 
     def close(self) -> None:
         """Disconnect. A fleet on a cluster goes on, and a detached one; another one of this program ends."""
@@ -321,6 +325,14 @@ class Fleet:
             what = str(error).partition("\n")[0] or type(error).__name__
         raise FleetError(f"the controller of {self.name} did not do it ({what}): see its log in the folder of Ray")
 
+    def _node(self, name: str) -> Node:
+        """The living node of the cluster with a name."""
+        self._connect()
+        known = {node.name: node for node in cluster.nodes() if node.alive}
+        if name not in known:
+            raise FleetError(f"there is no node {name!r}, or it has died: there are {', '.join(known) or 'none'}")
+        return known[name]
+
     def _only_fleet(self) -> str:
         """The name of the only fleet of the connected cluster."""
         if len(names := cluster.fleets()) == 1:
@@ -332,6 +344,11 @@ class Fleet:
 def _home() -> Path:
     """The folder with one for each fleet of this user."""
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream" / "fleets"
+
+
+def _about(lines: Iterable[str], names: Collection[str]) -> list[str]:
+    """The lines of a change about some streams."""
+    return [line for line in lines if line.partition(":")[0] in names]
 
 
 def _origin(file: Path) -> str:

@@ -148,7 +148,7 @@ def made(ray, spec, monkeypatch, folder):  # noqa: ARG001  the module finds it a
 @pytest.fixture
 def site(made, spec):
     site = made()
-    site.apply(spec, origin="vm:/a/fleet.toml")
+    site.change("applied", spec, "vm:/a/fleet.toml", replace_other=False)
     site._turn()
     return site
 
@@ -180,7 +180,7 @@ def test_a_controller_that_starts_again_touches_no_stream_that_runs(site, ray, m
     again = made()
     again._turn()
     assert (ray.actors, ray.started) == (actors, ["gate", "roof"])
-    assert again.apply(spec) == ["gate: is unchanged", "roof: is unchanged"]
+    assert again.change("applied", spec, "", replace_other=False) == ["gate: is unchanged", "roof: is unchanged"]
     assert states(again) == {"gate": "running", "roof": "running"}
 
 
@@ -193,7 +193,7 @@ def test_each_node_gets_its_start_server_once_before_there_is_a_stream_for_it(si
 
 def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
     running(site, ray, "gate")
-    assert site.move("gate", "n2") == "gate moves from n1 to n2"
+    site.change("moved", "gate", ray.nodes[1])
     site._turn()
     assert states(site)["gate"] == "moving"
     assert ray.actors["site/stream/gate"].asked[-1] == ("stop",)
@@ -201,24 +201,26 @@ def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
         site._turn()
     assert ray.actors["site/stream/gate"].options["scheduling_strategy"] == ("2", True)
     running(site, ray, "gate", "2")
-    assert site.move("gate", "n2") == "gate stays on n2"
+    site.change("moved", "gate", ray.nodes[1])
+    site._turn()
+    assert states(site)["gate"] == "running", "it is there already"
 
 
 def test_a_drained_node_loses_its_streams_and_gets_them_back_only_if_it_takes_streams_again(site, ray):
     running(site, ray, "gate")
-    assert site.drain("n1", undo=False) == "n1 is draining: its 1 streams move to other nodes"
+    site.change("drained", "n1", undo=False)
     for _ in range(4):
         site._turn()
     assert ray.actors["site/stream/gate"].options["label_selector"] == {"ray.io/node-id": "!in(1)"}
     assert site.status().nodes["n1"].state == "draining"
     running(site, ray, "gate", "2")
-    site.drain("n1", undo=True)
+    site.change("drained", "n1", undo=True)
     site._turn()
     assert states(site)["gate"] == "running", "it stays where it is"
 
 
 def test_a_stream_that_was_moved_to_a_node_that_died_is_placed_by_ray_and_stays_there(site, ray):
-    site.move("gate", "n2")
+    site.change("moved", "gate", ray.nodes[1])
     for _ in range(3):
         site._turn()
     running(site, ray, "gate", "2")
@@ -238,7 +240,7 @@ def test_a_stream_that_has_ended_is_stopped_and_runs_again_only_if_it_is_changed
     for _ in range(3):
         site._turn()
     assert (states(site)["gate"], ray.started.count("gate")) == ("ended", 1)
-    site.add(replace(GATE, source="demo:3"))
+    site.change("added", replace(GATE, source="demo:3"))
     for _ in range(2):
         site._turn()
     assert (states(site)["gate"], ray.started.count("gate")) == ("starting", 2)
@@ -257,29 +259,30 @@ def test_one_that_another_process_has_claimed_is_killed_and_claims_again(site, r
 def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, spec):
     store = Store(spec.store)
     store.claim("gate", "n1").write({"a": b""}, {"ended": False})
-    site.move("gate", "n2")
-    assert site.remove(["gate"], forget=True) == ["gate: is removed"]
+    site.change("moved", "gate", ray.nodes[1])
+    assert site.change("removed", ["gate"]) == ["gate: is removed", "roof: is unchanged"]
+    store.remove("gate")
     for _ in range(4):
         site._turn()
     assert store.newest("gate") is None
     assert from_json(store.get_fleet(), Desired).pins == {}
     assert "gate" not in site._streams
-    site.add(GATE)
+    site.change("added", GATE)
     site._turn()
     assert "scheduling_strategy" not in ray.actors["site/stream/gate"].options
 
 
-def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, monkeypatch):
+def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, ray, monkeypatch):
     def fails(*_):
         raise StoreError("the store cannot be reached")
 
     with monkeypatch.context() as patch:
         patch.setattr(Store, "put_fleet", fails)
         for change in (
-            lambda: site.add(replace(GATE, name="new")),
-            lambda: site.move("gate", "n2"),
-            lambda: site.drain("n1", undo=False),
-            lambda: site.remove(["gate"], forget=False),
+            lambda: site.change("added", replace(GATE, name="new")),
+            lambda: site.change("moved", "gate", ray.nodes[1]),
+            lambda: site.change("drained", "n1", undo=False),
+            lambda: site.change("removed", ["gate"]),
         ):
             with pytest.raises(StoreError, match="cannot be reached"):
                 change()
@@ -295,7 +298,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
         goes_on.wait(60)
 
     monkeypatch.setattr(Store, "put_fleet", put)
-    change = threading.Thread(target=site.drain, args=("n1",), kwargs={"undo": False})
+    change = threading.Thread(target=site.change, args=("drained", "n1"), kwargs={"undo": False})
     change.start()
     try:
         assert hangs.wait(60)
@@ -312,7 +315,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
 
 def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_is_back(made, spec, monkeypatch):
     before = made()
-    before.apply(spec)
+    before.change("applied", spec, "", replace_other=False)
     before.end()
     with monkeypatch.context() as patch:
         patch.setattr(Store, "get_fleet", lambda _: (_ for _ in ()).throw(StoreError("the store cannot be reached")))
@@ -320,7 +323,7 @@ def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_i
         with pytest.raises(StoreError, match="cannot be reached"):
             again.ready()
         with pytest.raises(StoreError, match="cannot be reached"):
-            again.apply(spec)
+            again.change("applied", spec, "", replace_other=False)
     with Registry("site", timeout=0.5) as registry, pytest.raises(SilenceError):
         registry.streams()  # an empty answer would be the end of each stream for those who follow it
     again._begin()
@@ -331,20 +334,20 @@ def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_i
 def test_streams_of_another_file_are_replaced_only_if_that_is_said(site, spec):
     other = replace(spec, streams={"lake": StreamSpec("lake", "demo:3")})
     with pytest.raises(FleetError, match=r"runs the streams of vm:/a/fleet.toml, not of vm:/b/fleet.toml.*--replace"):
-        site.apply(other, origin="vm:/b/fleet.toml")
+        site.change("applied", other, "vm:/b/fleet.toml", replace_other=False)
     assert sorted(site.status().streams) == ["gate", "roof"]
-    site.apply(other, origin="vm:/b/fleet.toml", replace_other=True)
+    site.change("applied", other, "vm:/b/fleet.toml", replace_other=True)
     assert sorted(site.status().streams) == ["lake"]
 
 
 def test_too_many_streams_are_refused_before_they_start_unless_they_may_wait(site, spec):
     many = replace(spec, streams={f"cam-{n}": StreamSpec(f"cam-{n}", "demo:1") for n in range(20)})
     with pytest.raises(FleetError, match="the 20 streams need 20 cores, and the nodes have 4"):
-        site.apply(many)
+        site.change("applied", many, "", replace_other=False)
     with pytest.raises(FleetError, match="lake needs 4 cores, and the largest node that it may run on, n1, has 2"):
-        site.add(StreamSpec("lake", "demo:3", cores=4.0))
+        site.change("added", StreamSpec("lake", "demo:3", cores=4.0))
     assert sorted(site.status().streams) == ["gate", "roof"]
-    site.apply(many, may_wait=True)
+    site.change("applied", many, "", replace_other=False, may_wait=True)
     assert len(site.status().streams) == 20
 
 
@@ -358,7 +361,7 @@ def test_what_a_stream_waits_for_is_said(site, ray):
 
 
 def test_followed_objects_and_clients_reach_a_stream_with_each_question(site, ray):
-    site.add(replace(GATE, follow=("anna",)))
+    site.change("added", replace(GATE, follow=("anna",)))
     running(site, ray, "gate")
     assert ray.actors["site/stream/gate"].asked[-1] == ("report", None, ("anna",))
 

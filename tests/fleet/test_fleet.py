@@ -87,7 +87,7 @@ def test_a_subscriber_stays_attached_to_a_stream_that_moves(site, until):
     other = "node-2" if before.node == "node-1" else "node-1"
     with catstream.subscribe("fleet://site/gate", "tracks", timeout=60) as tracks:
         first = next(tracks)
-        fleet.move("gate", other)
+        assert fleet.move("gate", other) == f"gate moves from {before.node} to {other}"
         until(lambda: fleet.status().streams["gate"].token > before.token)
         until(lambda: fleet.status().streams["gate"].node == other)
         later = next(track for track in tracks if track.time > first.time + 1)
@@ -136,6 +136,8 @@ def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
         fleet.add(StreamSpec("cam-9", LIVE, labels={"site": "north"}))
     with pytest.raises(FleetError, match="no stream 'cam-8'"):
         fleet.move("cam-8", "node-1")
+    with pytest.raises(FleetError, match="no node 'node-9'"):
+        fleet.move("gate", "node-9")
     assert set(fleet.status().streams) == {"film", "gate"}
 
 
@@ -146,7 +148,7 @@ def test_a_stream_whose_source_cannot_be_opened_has_failed_until_it_is_changed_a
     assert any("missing.mp4" in line for line in fleet.logs("cam-8"))
     fleet.add(StreamSpec("cam-8", LIVE, cores=0.1))
     until(lambda: fleet.status().streams["cam-8"].state in ("waiting", "running"))
-    fleet.remove("cam-8", forget=True)
+    assert fleet.remove("cam-8", forget=True) == ["cam-8: is removed"]
     until(lambda: "cam-8" not in Store(site[1].store).streams())
 
 
@@ -154,9 +156,9 @@ def test_a_node_that_is_drained_gives_its_streams_away(site, until):
     fleet, _ = site
     until(lambda: fleet.status().streams["gate"].state == "running")
     node = fleet.status().streams["gate"].node
-    fleet.drain(node)
+    assert fleet.drain(node).startswith(f"{node} is draining: its ")
     until(lambda: (found := fleet.status().streams["gate"]).node not in ("", node) and found.state == "running")
-    fleet.drain(node, undo=True)
+    assert fleet.drain(node, undo=True) == f"{node} takes streams again"
 
 
 def test_a_merge_runs_on_the_nodes(site):
