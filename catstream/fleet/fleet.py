@@ -133,7 +133,8 @@ class Fleet:
                     self.is_owner = not detach
                 self._start_controller(spec)
                 models = _models(spec.streams.values())
-                lines: list[str] = self._ask("apply", spec, models, self._origin, replace_other=replace, may_wait=wait)
+                change = ("change", "applied", spec, self._origin)
+                lines: list[str] = self._ask(*change, replace_other=replace, models=models, may_wait=wait)
             except BaseException:
                 if self._local is not None and began:
                     self.is_owner = False  # there is nothing to be stored
