@@ -17,7 +17,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +28,7 @@ from catstream.errors import CatstreamError, FleetError, require_extra
 from catstream.fleet import cluster
 from catstream.fleet.cluster import NAMESPACE, actor_name
 from catstream.fleet.controller import Controller
+from catstream.fleet.desired import Desired
 from catstream.fleet.life import Node
 from catstream.fleet.local import LocalCluster
 from catstream.fleet.merge import Merged, merge_streams
@@ -133,8 +134,9 @@ class Fleet:
                     self.is_owner = not detach
                 self._start_controller(spec)
                 models = _models(spec.streams.values())
-                change = ("change", "applied", spec, self._origin)
-                lines: list[str] = self._ask(*change, replace_other=replace, models=models, may_wait=wait)
+                lines = self._change(
+                    Desired.applied, spec, self._origin, replace_other=replace, models=models, may_wait=wait
+                )
             except BaseException:
                 if self._local is not None and began:
                     self.is_owner = False  # there is nothing to be stored
@@ -145,12 +147,12 @@ class Fleet:
 
     def add(self, spec: StreamSpec) -> list[str]:
         """Add a stream, or change the one of the same name."""
-        lines: list[str] = self._ask("change", "added", spec, models=_models([spec]))
+        lines = self._change(Desired.added, spec, models=_models([spec]))
         return _about(lines, [spec.name])
 
     def remove(self, *names: str, forget: bool = False) -> list[str]:
         """Remove streams. Unless `forget`, their state stays in the store: they continue if they are added again."""
-        lines: list[str] = self._ask("change", "removed", names)
+        lines = self._change(Desired.removed, names)
         if forget:
             store = Store(self._ask("spec").store)
             for name in names:
@@ -160,7 +162,7 @@ class Fleet:
     def move(self, name: str, node: str) -> str:
         """Move a stream to a node, where it stays until the node dies or drains."""
         there, status = self._node(node), self.status()
-        self._ask("change", "moved", name, there)
+        self._change(Desired.moved, name, there)
         before = status.streams[name].node
         return f"{name} stays on {node}" if before == node else f"{name} moves from {before or 'no node'} to {node}"
 
@@ -168,7 +170,7 @@ class Fleet:
         """Move all streams from a node and place none there, for example before it is switched off."""
         self._node(node)
         count = sum(each.node == node for each in self.status().streams.values())
-        self._ask("change", "drained", node, undo=undo)
+        self._change(Desired.drained, node, undo=undo)
         return f"{node} takes streams again" if undo else f"{node} is draining: its {count} streams move to other nodes"
 
     def status(self) -> FleetStatus:
@@ -300,6 +302,11 @@ class Fleet:
             cluster.connect(address, self._local.variables)
         else:
             raise FleetError(f"the fleet {self.name} does not run: start it with catstream fleet up")
+
+    def _change(self, method: Callable[..., Desired], *arguments: object, **options: object) -> list[str]:
+        """Let the controller change the desired state by one of its methods."""
+        lines: list[str] = self._ask("change", method.__name__, *arguments, **options)
+        return lines
 
     def _ask(self, method: str, *arguments: object, **options: object) -> Any:
         """Call a method of the controller, and wait for its answer."""
