@@ -286,7 +286,7 @@ def _connected(program: int) -> socket.socket:
     """A connection to the server that ends with a program and has imported what this process would; it may be new."""
     os.close(os.pidfd_open(program))  # it lives, and the server will see its end
     began = Path(f"/proc/{program}/stat").read_text().rpartition(") ")[2].split()[19]
-    key = json.dumps([os.getuid(), program, began, _imports()])
+    key = json.dumps([os.getuid(), program, began, _imports()], sort_keys=True)  # variables have no order
     name = f"\0catstream-start-{hashlib.sha256(key.encode()).hexdigest()}"  # the kernel removes it with the server
     deadline = time.monotonic() + _SHARED_SECONDS
     while True:

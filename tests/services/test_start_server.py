@@ -254,7 +254,8 @@ def sharing(folder, tmp_path):
 
     def start(program):
         words = [sys.executable, "-c", SHARING, str(program), str(file)]
-        programs.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        variables = dict(sorted(os.environ.items(), reverse=bool(len(programs) % 2)))  # their order does not matter
+        programs.append(subprocess.Popen(words, env=variables, stdout=subprocess.PIPE, text=True))
         return programs[-1], psutil.Process(int(programs[-1].stdout.readline()))
 
     yield start
