@@ -295,14 +295,6 @@ class Store:
         """Return the newest state of a stream; None if there is none."""
         return self._states(_streams(stream)).newest()
 
-    def streams(self) -> list[str]:
-        """Return the names of all streams that have a state."""
-        names: dict[str, list[str]] = {}
-        for name in self._objects.names("streams"):
-            stream, _, rest = name.partition("/")
-            names.setdefault(stream, []).append(rest)
-        return sorted(stream for stream, below in names.items() if Listing.of(below).newest())
-
     def remove(self, stream: str) -> None:
         """Remove the states of a stream. A process that still holds it can write no more."""
         self._states(_streams(stream)).clear(_this_process())

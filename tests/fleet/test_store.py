@@ -125,14 +125,6 @@ def test_a_damaged_state_is_passed_over(store):
     assert store.claim("cam-7", "node-2").state.facts == {"frame": 1}
 
 
-def test_streams_are_those_that_have_a_state(store):
-    for stream in ("one", "two", "gone"):
-        store.claim(stream, "node-1").write(STATE, {})
-    store.claim("claimed", "node-1")
-    store.remove("gone")
-    assert store.streams() == ["one", "two"]
-
-
 def test_a_removed_stream_begins_anew_and_its_old_holder_is_fenced(store):
     old = store.claim("cam-7", "node-1")
     old.write(STATE, {"frame": 1})
