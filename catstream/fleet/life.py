@@ -25,7 +25,6 @@ __all__ = [
     "State",
     "Step",
     "Wanted",
-    "diagram",
     "diff",
     "event",
 ]
@@ -235,11 +234,3 @@ def _is_as_wanted(wanted: Wanted, seen: Seen, nodes: Collection[Node], now: floa
     if node is None:
         return seen.order.selector == order.selector and order.node in ("", seen.order.node)
     return wanted.fits(node) and wanted.target(nodes) in (None, node)
-
-
-def diagram() -> str:
-    """The table as a diagram in the language of Mermaid, for the documentation."""
-    lines = ["stateDiagram-v2", "    [*] --> absent"]
-    for (state, what), (after, action) in TABLE.items():
-        lines.append(f"    {state} --> {after} : {what}{f' / {action}' if action else ''}")
-    return "\n".join(lines)

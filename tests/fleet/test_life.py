@@ -44,12 +44,6 @@ def test_each_state_and_event_is_described_and_each_state_is_left():
     assert {action for _, action in TABLE.values()} == set(get_args(life.Action))
 
 
-def test_the_diagram_has_each_line_of_the_table():
-    lines = life.diagram().splitlines()
-    assert len(lines) == len(TABLE) + 2
-    assert "    working --> stopping : unwanted / stop" in lines
-
-
 @given(WANTED, NODES)
 def test_a_stream_that_was_just_placed_where_it_may_be_stays(wanted, nodes):
     order = wanted.order(nodes)
