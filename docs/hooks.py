@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from catstream.cli import VERBS, verb
+from catstream.cli import COMMANDS, load_command
 from catstream.settings import PRESETS, describe
 
 RECORDS = sorted((Path(__file__).parent / "decisions").glob("0*.md"))
@@ -53,7 +53,7 @@ def settings() -> str:
 
 def commands() -> str:
     """Return the help of every command in Markdown."""
-    return "\n".join(line for name in VERBS for line in described(verb(name), f"catstream {name}", level=2))
+    return "\n".join(line for name in COMMANDS for line in described(load_command(name), f"catstream {name}", level=2))
 
 
 def described(command: click.Command, path: str, level: int) -> Iterator[str]:

@@ -19,9 +19,7 @@ import click
 from catstream.errors import CatstreamError
 from catstream.run.job import Job
 from catstream.services.loop import Parent, log_as, run, run_child
-from catstream.services.options import with_model, with_object, with_part, with_settings
-
-_PATH = click.Path(path_type=Path)
+from catstream.services.options import PATH, with_model, with_object, with_part, with_settings
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
@@ -40,8 +38,8 @@ def main() -> None:
 
 
 _source = click.argument("source")
-_state = click.option("--state", type=_PATH, help="Folder for the checkpoints and the desired state.")
-_record = click.option("--record", type=_PATH, help="Recording that the compressor writes or continues.")
+_state = click.option("--state", type=PATH, help="Folder for the checkpoints and the desired state.")
+_record = click.option("--record", type=PATH, help="Recording that the compressor writes or continues.")
 
 
 @main.command()
@@ -93,7 +91,7 @@ def supervisor(**options: Any) -> None:
 
 @main.command(hidden=True)
 @click.argument("name", type=click.Choice(["detector", "compressor", "trainer"]))
-@click.argument("file", type=_PATH)
+@click.argument("file", type=PATH)
 @click.option("--parent", type=int, required=True, help="Process id of the parent; this process ends with it.")
 @click.option("--watchdog", type=int, help="File descriptor of the watchdog's shared memory.")
 @click.option("--restarted", is_flag=True, help="Continue the work of a process that died.")

@@ -1,59 +1,55 @@
-"""Options that several commands share: settings, the objects, and the frames of a source.
+"""The parameter types and options that several commands share, each with one help text.
 
-Each decorator adds options to a click command, and passes them on as one argument of the command's function.
+The first part are decorators of one option. Those after it add several options that belong together, and pass them on
+as one argument of the command's function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any
 
 import click
 
 from catstream.errors import ObjectError
 from catstream.messages.names import boxes_by_name, split_name
+from catstream.run.job import files_by_name
 from catstream.settings import PRESETS, Settings
 
-__all__ = ["named", "with_given", "with_model", "with_object", "with_part", "with_reading", "with_settings"]
+__all__ = [
+    "PATH",
+    "Command",
+    "Decorator",
+    "by_name",
+    "combined",
+    "named",
+    "with_given",
+    "with_json",
+    "with_keys",
+    "with_model",
+    "with_object",
+    "with_overwrite",
+    "with_part",
+    "with_reading",
+    "with_settings",
+    "with_skip_damaged",
+]
 
-_Command = TypeVar("_Command", bound=Callable[..., None])
+Command = Callable[..., Any]
+Decorator = Callable[[Command], Command]
 
+#: Parameter type of a file or folder.
+PATH = click.Path(path_type=Path)
 
-def with_model(command: _Command) -> _Command:
-    """Add `--model`, which may be repeated, as the argument `models`: a dict of files by the names of the objects."""
-
-    @click.option(
-        "--model",
-        "files",
-        multiple=True,
-        metavar="[NAME=]FILE",
-        help="Model of an object, written by `catstream save`.",
-    )
-    @wraps(command)
-    def wrapped(files: tuple[str, ...], **options: object) -> None:
-        command(models={name: Path(file) for name, file in named("--model", files).items()}, **options)
-
-    return cast(_Command, wrapped)
-
-
-def with_object(command: _Command) -> _Command:
-    """Add `--box` and `--model`, which may be repeated, as the arguments `boxes` and `models`: dicts by name."""
-
-    @click.option(
-        "--box",
-        "texts",
-        multiple=True,
-        metavar="[NAME=]X,Y,W,H",
-        help="An object in the first frame, in pixels; may be repeated with names.",
-    )
-    @with_model
-    @wraps(command)
-    def wrapped(texts: tuple[str, ...], **options: object) -> None:
-        command(boxes=boxes_by_name(named("--box", texts)), **options)
-
-    return cast(_Command, wrapped)
+with_overwrite = click.option("--overwrite", is_flag=True, help="Replace existing results.")
+with_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+with_keys = click.option(
+    "--keys", default="", metavar="DIR", help="Folder of keys, if the pipeline or fleet requires keys."
+)
+with_skip_damaged = click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video file.")
 
 
 def named(option: str, texts: Iterable[str]) -> dict[str, str]:
@@ -80,55 +76,86 @@ def named(option: str, texts: Iterable[str]) -> dict[str, str]:
     return values
 
 
-def with_part(command: _Command) -> _Command:
-    """Add `--start`, `--end` and `--stride`, as the argument `part`, a slice."""
+def by_name(
+    flag: str, argument: str, metavar: str, convert: Callable[[Mapping[str, str]], Mapping[str, object]], help: str
+) -> Decorator:
+    """An option [NAME=]VALUE for objects, which may be repeated, as a dict of what `convert` makes of `named`."""
 
-    @click.option("--start", type=click.IntRange(0), metavar="N", help="First frame, for a file or folder.")
-    @click.option("--end", type=click.IntRange(0), metavar="N", help="Frame before which to stop.")
-    @click.option("--stride", type=click.IntRange(1), metavar="N", help="Track only every N-th frame.")
-    @wraps(command)
-    def wrapped(start: int | None, end: int | None, stride: int | None, **options: object) -> None:
-        command(part=slice(start, end, stride), **options)
+    def values(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> Mapping[str, object]:
+        return convert(named(flag, texts))
 
-    return cast(_Command, wrapped)
+    return click.option(flag, argument, multiple=True, metavar=metavar, callback=values, help=help)
 
 
-def with_given(command: _Command) -> _Command:
-    """Add `--settings`, `--preset` and `--set`, as the argument `given`: a dict of the settings that were given."""
+with_model = by_name(
+    "--model", "models", "[NAME=]FILE", files_by_name, help="Model of an object, written by `catstream save`."
+)
 
-    @click.option("--settings", "file", type=click.Path(path_type=Path), help="TOML file of settings.")
-    @click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings.")
-    @click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="One setting; may be repeated.")
-    @wraps(command)
-    def wrapped(file: Path | None, preset: str | None, pairs: tuple[str, ...], **options: object) -> None:
-        command(given=Settings.given(preset=preset, file=file, overrides=pairs), **options)
-
-    return cast(_Command, wrapped)
+_with_box = by_name(
+    *("--box", "boxes", "[NAME=]X,Y,W,H", boxes_by_name),
+    help="An object in the first frame, in pixels; may be repeated with names.",
+)
 
 
-def with_reading(command: _Command) -> _Command:
-    """Add `--fps`, `--skip-damaged` and `--resize`, settings for reading a source, to the argument `given`."""
-
-    @click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default.")
-    @click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video file.")
-    @click.option("--resize", is_flag=True, help="Scale images of another size to that of the first one.")
-    @wraps(command)
-    def wrapped(
-        given: dict[str, object], fps: float | None, skip_damaged: bool, resize: bool, **options: object
-    ) -> None:
-        flags = {"run.skip_damaged": skip_damaged, "run.resize": resize}
-        rate = {} if fps is None else {"run.image_rate": fps}
-        command(given=given | rate | {name: True for name, flag in flags.items() if flag}, **options)
-
-    return cast(_Command, wrapped)
+def with_object(command: Command) -> Command:
+    """Add `--box` and `--model`, which may be repeated, as the arguments `boxes` and `models`: dicts by name."""
+    return _with_box(with_model(command))
 
 
-def with_settings(command: _Command) -> _Command:
-    """Add the options of `with_given`, as the argument `settings`: those that were given, the others by default."""
+def combined(argument: str, value: Callable[..., object], *options: Decorator) -> Decorator:
+    """Add options, and pass on what `value` makes of them as one argument.
 
-    @with_given
-    @wraps(command)
-    def wrapped(given: dict[str, object], **options: object) -> None:
-        command(settings=Settings.from_values(given), **options)
+    The parameters of `value` are the names of the options; one of them may be an argument that another decorator, above
+    this one or among `options`, passes on.
+    """
+    names = list(signature(value).parameters)
 
-    return cast(_Command, wrapped)
+    def decorate(command: Command) -> Command:
+        @wraps(command)
+        def wrapped(**given: object) -> object:
+            made = value(**{name: given.pop(name) for name in names})
+            return command(**{argument: made}, **given)
+
+        whole: Command = wrapped
+        for option in reversed(options):
+            whole = option(whole)
+        return whole
+
+    return decorate
+
+
+#: Adds `--start`, `--end` and `--stride`, as the argument `part`, a slice.
+with_part = combined(
+    "part",
+    lambda start, end, stride: slice(start, end, stride),
+    click.option("--start", type=click.IntRange(0), metavar="N", help="First frame, for a file or folder."),
+    click.option("--end", type=click.IntRange(0), metavar="N", help="Frame before which to stop."),
+    click.option("--stride", type=click.IntRange(1), metavar="N", help="Track only every N-th frame."),
+)
+
+#: Adds `--settings`, `--preset` and `--set`, as the argument `given`: a dict of the settings that were given.
+with_given = combined(
+    "given",
+    lambda file, preset, pairs: Settings.given(preset=preset, file=file, overrides=pairs),
+    click.option("--settings", "file", type=PATH, help="TOML file of settings."),
+    click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings."),
+    click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="One setting; may be repeated."),
+)
+
+#: Adds the same options, as the argument `settings`: those that were given, the others by default.
+with_settings = combined("settings", lambda given: Settings.from_values(given), with_given)
+
+
+def _reading(given: dict[str, object], fps: float | None, skip_damaged: bool, resize: bool) -> dict[str, object]:
+    values = {"run.image_rate": fps, "run.skip_damaged": skip_damaged or None, "run.resize": resize or None}
+    return given | {name: value for name, value in values.items() if value is not None}
+
+
+#: Adds `--fps`, `--skip-damaged` and `--resize`, settings for reading a source, to the argument `given`.
+with_reading = combined(
+    "given",
+    _reading,
+    click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default."),
+    with_skip_damaged,
+    click.option("--resize", is_flag=True, help="Scale images of another size to that of the first one."),
+)

@@ -134,7 +134,7 @@ def test_a_process_that_dies_resumes_from_its_state():
 def test_the_video_is_mounted_read_only_and_named_by_the_user():
     _, options = parsed("detector")
     assert f"{SERVICES['detector']['working_dir']}/{options['source']}" == "/videos/walk.mp4"
-    assert [Box.parse(text) for text in options["texts"]] == [(1, 2, 30, 40)]
+    assert options["boxes"] == {"": Box(1, 2, 30, 40)}
     assert [filled_in(volume, VIDEOS="/films") for volume in SERVICES["detector"]["volumes"]] == ["/films:/videos:ro"]
     for name in ("SOURCE", "BOX"):
         assert f"${{{name}:?" in " ".join(SERVICES["detector"]["command"])

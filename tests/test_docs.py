@@ -13,6 +13,7 @@ import shlex
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +23,7 @@ import pytest
 from mypy import api as mypy
 
 import catstream
-from catstream.cli import VERBS, verb
+from catstream.cli import COMMANDS, load_command
 from catstream.fleet import life
 from catstream.settings import PRESETS, describe
 from catstream.wire.channels import CHANNELS
@@ -67,7 +68,7 @@ def commands(path: Path) -> Iterator[list[str]]:
 def anchors(path: Path) -> set[str]:
     """Anchors of a page, which a link may name after #."""
     headings = re.findall(r"^#+ (.*)", prose(path), re.MULTILINE)
-    headings += VERBS if path.name == "command-line.md" else ()  # hooks.py adds their sections
+    headings += COMMANDS if path.name == "command-line.md" else ()  # hooks.py adds their sections
     return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
@@ -94,20 +95,17 @@ def test_the_life_of_a_stream_is_shown_as_its_table_says():
     assert life_of_a_stream() in shown[0], "docs/how-to/fleet.md does not show the table as it is: run `make life`"
 
 
-def verbs() -> dict[str, click.Command]:
-    return {name: verb(name) for name in VERBS}
-
-
-def commands_of(verb: click.Command) -> Iterator[click.Command]:
-    """A command, or the commands of a group."""
-    yield from by_name(verb).values() if isinstance(verb, click.Group) else [verb]
-
-
-def by_name(group: click.Group) -> dict[str, click.Command]:
-    """The commands of a group; a module that holds one may be imported for it."""
-    with click.Context(group) as context:
-        found = {name: group.get_command(context, name) for name in group.list_commands(context)}
-    return {name: command for name, command in found.items() if command is not None}
+@cache
+def every_command() -> dict[str, click.Command]:
+    """All commands by their words, also those of the groups: "track", "fleet", "fleet up"."""
+    found = {}
+    for name in COMMANDS:
+        found[name] = group = load_command(name)
+        if isinstance(group, click.Group):
+            with click.Context(group) as context:
+                each = {word: group.get_command(context, word) for word in group.list_commands(context)}
+            found |= {f"{name} {word}": command for word, command in each.items() if command is not None}
+    return found
 
 
 def built(name: str) -> str:
@@ -129,8 +127,8 @@ def test_every_channel_has_its_row(name):
     assert f"`{name}`" in page("docs/protocol.md"), f"docs/protocol.md: add the channel {name}"
 
 
-@pytest.mark.parametrize("name", VERBS)
-def test_every_verb_is_shown(name):
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_is_shown(name):
     assert f"`{name}`" in page("README.md") or f"catstream {name}" in page("README.md"), f"README.md: add {name}"
     assert re.search(rf"catstream {name}\b", everything()), f"no page of docs/ shows `catstream {name}`"
 
@@ -143,11 +141,10 @@ def test_the_index_of_decisions_lists_every_record():
 
 def test_every_command_and_option_has_help():
     """The page of the command line is made from it when the documentation is built."""
-    for top in verbs().values():
-        for command in {top, *commands_of(top)}:
-            assert command.help, f"{command.name}: write its docstring"
-            for option in command.params:
-                assert not isinstance(option, click.Option) or option.help, f"{command.name} --{option.name}: add help"
+    for words, command in every_command().items():
+        assert command.help, f"{words}: write its docstring"
+        for option in command.params:
+            assert not isinstance(option, click.Option) or option.help, f"{words} --{option.name}: add help"
 
 
 def test_the_page_of_the_architecture_names_each_entry_of_the_library():
@@ -160,13 +157,12 @@ def test_the_page_of_the_architecture_names_each_entry_of_the_library():
 
 
 def test_the_page_of_the_command_line_shows_every_command_and_option():
-    shown = built("command-line.md")
-    for name, top in verbs().items():
-        section = shown.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
-        for option in (option for command in commands_of(top) for option in command.params):
-            assert max(option.opts, key=len) in section or isinstance(option, click.Argument)
-        if isinstance(top, click.Group):
-            assert all(f"### {name} {command}\n" in section for command in by_name(top))
+    _, *parts = re.split(r"^###? ([a-z -]+)\n", built("command-line.md"), flags=re.MULTILINE)
+    sections = dict(zip(parts[::2], parts[1::2], strict=True))
+    assert sections.keys() == every_command().keys()
+    for words, command in every_command().items():
+        for option in command.params:
+            assert max(option.opts, key=len) in sections[words] or isinstance(option, click.Argument)
 
 
 def test_every_file_that_track_writes_is_explained():
@@ -202,24 +198,19 @@ def wrong_commands(path: Path) -> Iterator[str]:
         if program == "make" and words[0] not in targets:
             yield f"shows `make {words[0]}`, but there is no such target"
         if program == "catstream":
-            yield from wrong_words(*words)
+            yield from wrong_words(words)
 
 
-def wrong_words(name: str, *words: str) -> Iterator[str]:
+def wrong_words(words: list[str]) -> Iterator[str]:
     """Of a command of catstream."""
-    if name not in VERBS:
-        yield f"shows `catstream {name}`, but there is no such command"
+    known = every_command()
+    name = next((name for name in (" ".join(words[:2]), words[0]) if name in known), "")
+    if not name or isinstance(known[name], click.Group):
+        yield f"shows `catstream {' '.join(words[:2])}`, but there is no such command"
         return
-    verb = verbs()[name]
-    if isinstance(verb, click.Group):
-        command, *words = words
-        if command not in by_name(verb):
-            yield f"shows `catstream {name} {command}`, but there is no such command"
-            return
-        verb = by_name(verb)[command]
-    with click.Context(verb) as context:
-        known = {flag for option in verb.get_params(context) for flag in option.opts}
-    if wrong := {word for word in words if word.startswith("--")} - known:
+    with click.Context(known[name]) as context:
+        flags = {flag for option in known[name].get_params(context) for flag in option.opts}
+    if wrong := {word for word in words if word.startswith("--")} - flags:
         yield f"shows `catstream {name}` with {wrong}, which are no options of it"
 
 

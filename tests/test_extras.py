@@ -22,11 +22,11 @@ for module in {[module for _, modules in EXTRAS.values() for module in modules]}
     sys.modules[module] = None
 import catstream
 catstream.Tracker, catstream.Pipeline, catstream.subscribe, catstream.control
-from catstream.cli import VERBS, verb
+from catstream.cli import COMMANDS, load_command
 from catstream.services.__main__ import main
 import catstream.applications.evaluation.runs, catstream.applications.evaluation.report
-for name in VERBS:
-    verb(name)
+for name in COMMANDS:
+    load_command(name)
 """
 
 

@@ -13,13 +13,13 @@ import click
 
 from catstream.errors import CatstreamError
 
-__all__ = ["INTERRUPTED", "VERBS", "interruptible", "main", "verb"]
+__all__ = ["COMMANDS", "INTERRUPTED", "interruptible", "load_command", "main"]
 
 #: Exit code of a command that was interrupted by Ctrl-C.
 INTERRUPTED = 130
 
 #: Command -> summary. The module of a command is imported when it is called, because some imports take long.
-VERBS = {
+COMMANDS = {
     "track": "Track objects in a video.",
     "demo": "Track an object in a rendered demo video.",
     "find": "Find the objects of saved models in videos, folders and images.",
@@ -45,12 +45,12 @@ VERBS = {
     "settings": "List all settings with their defaults and descriptions.",
 }
 
-#: Module of the commands that share one.
+#: Module of the commands that share a module.
 _MODULES = dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "steer")
 
 
-def verb(name: str) -> click.Command:
-    """Return the click command of one of the `VERBS`."""
+def load_command(name: str) -> click.Command:
+    """Import the module of one of the `COMMANDS`, and return the click command."""
     command: click.Command = getattr(import_module(f"catstream.cli.{_MODULES.get(name, name)}"), name.replace("-", "_"))
     return command
 
@@ -77,12 +77,12 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-class _Verbs(click.Group):
+class _Commands(click.Group):
     def list_commands(self, _: click.Context) -> list[str]:
-        return list(VERBS)
+        return list(COMMANDS)
 
     def get_command(self, _: click.Context, name: str) -> click.Command | None:
-        return verb(name) if name in VERBS or name == "fleet" else None  # listed once its commands are complete
+        return load_command(name) if name in COMMANDS else None
 
     def invoke(self, context: click.Context) -> object:
         try:
@@ -92,11 +92,11 @@ class _Verbs(click.Group):
             context.exit(INTERRUPTED)
 
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Verbs"):
-            formatter.write_dl(list(VERBS.items()))
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
 
 
-@click.command(cls=_Verbs, context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="catstream", prog_name="catstream")
 def group() -> None:
     """Track objects in a video stream; each is learned online from a single box, on a CPU.

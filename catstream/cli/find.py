@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING
 
 import click
@@ -17,7 +15,9 @@ from catstream.cli import INTERRUPTED, interruptible
 from catstream.cli.interrupts import Interrupts
 from catstream.cli.line import line_of
 from catstream.errors import CatstreamError, VideoError
+from catstream.messages.names import counted
 from catstream.numerics.threads import one_thread
+from catstream.services.options import PATH, with_overwrite, with_skip_damaged
 from catstream.settings import RunSettings
 
 if TYPE_CHECKING:
@@ -48,24 +48,18 @@ class _Sizes(click.ParamType):  # type: ignore[type-arg]  # generic since click 
 
 
 @click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
 @click.option(
     "--model",
     "models",
-    type=click.Path(path_type=Path),
+    type=PATH,
     multiple=True,
     required=True,
     metavar="FILE",
     help="Model of an object, written by `catstream save`; may be repeated.",
 )
-@click.option(
-    "--output",
-    type=click.Path(path_type=Path),
-    default=Path("found"),
-    show_default=True,
-    help="Folder for the results.",
-)
-@click.option("--overwrite", is_flag=True, help="Replace existing results, and search all files again.")
+@click.option("--output", type=PATH, default="found", show_default=True, help="Folder for the results.")
+@with_overwrite
 @click.option(
     "--threshold",
     type=click.FloatRange(0, 2),
@@ -90,7 +84,7 @@ class _Sizes(click.ParamType):  # type: ignore[type-arg]  # generic since click 
     help="Smallest and largest size, as multiples of the learned size.  [default: 0.4,2.5]",
 )
 @click.option("--fps", type=float, default=25.0, show_default=True, metavar="N", help="Images of a folder per second.")
-@click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video.")
+@with_skip_damaged
 def find(
     paths: tuple[Path, ...],
     models: tuple[Path, ...],
@@ -113,7 +107,8 @@ def find(
     Of a video, one frame in 0.2 seconds is searched, and the frame in which an
     object appears or disappears is determined between them. Ctrl-C keeps the
     results so far. The same command then continues where it was; files that
-    were searched to the end are not searched again, unless they have changed.
+    were searched to the end are not searched again, unless they have changed
+    or --overwrite is given.
 
     \b
     Writes
@@ -168,18 +163,18 @@ def find(
     for problem in problems:
         click.echo(f"catstream: {problem}", err=True)
     if problems:
-        counted = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        raise CatstreamError(f"{counted} in {len(files)} files: what could be read was searched")
+        found = f"{counted(len(problems), 'problem')} in {counted(len(files), 'file')}"
+        raise CatstreamError(f"{found}: what could be read was searched")
 
 
 def _search(search: Search, files: list[File], log: SearchLog, interrupts: Interrupts, console: Console) -> None:
     """Search all files that are not complete, and show the progress."""
-    state = _State(len(files))
     with line_of(console, _line) as progress:
-        task = progress.add_task("", total=None, state=state)
-        for number, file in enumerate(files):
+        task = progress.add_task("", total=None, files=len(files), result=None, searched=0.0)
+        searched = 0.0  # seconds of video
+        for number, file in enumerate(files, 1):
             result = log.begin(file)
-            state.begin(number, result)
+            progress.update(task, number=number, result=result)
             if result.complete:
                 continue
 
@@ -191,50 +186,25 @@ def _search(search: Search, files: list[File], log: SearchLog, interrupts: Inter
 
             try:
                 for step in search.file(file, result.position, opened=opened, damaged=damaged):
+                    searched += step.time - result.time
                     with interrupts.deferred():  # a step is in the log as a whole
                         log.step(result, step)
-                    state.searched += step.time - state.time
-                    state.time = step.time
-                    progress.update(task)
+                    progress.update(task, searched=searched)
             except VideoError as error:
                 log.note(result, problem=str(error))
             log.note(result, complete=True)
 
 
-@dataclass(slots=True)
-class _State:
-    """The state that the progress line shows.
-
-    files     number of files
-    number    of the file that is searched, from 0
-    result    of this file
-    time      of its last step, in seconds
-    searched  seconds of video that were searched by this command
-    """
-
-    files: int
-    number: int = 0
-    result: FileResult | None = None
-    time: float = 0.0
-    searched: float = 0.0
-    started: float = field(default_factory=perf_counter)
-
-    def begin(self, number: int, result: FileResult) -> None:
-        self.number, self.result, self.time = number, result, result.time
-
-
 def _line(task: Task) -> list[str]:
     """File, frames and sightings."""
-    state: _State = task.fields["state"]
-    result = state.result
+    result: FileResult | None = task.fields["result"]
     if result is None:
         return ["starting"]
-    speed = state.searched / max(perf_counter() - state.started, 1e-6)
     return [
-        f"file {state.number + 1}/{state.files}",
+        f"file {task.fields['number']}/{task.fields['files']}",
         f"frame {(result.position or 0) + 1}/{result.frames or '?'}",
         f"{len(result.sightings)} sightings",
-        f"{speed:.1f} x real time",
+        f"{task.fields['searched'] / max(task.elapsed or 0.0, 1e-6):.1f} x real time",
         Path(result.file).name,
     ]
 

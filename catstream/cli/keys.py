@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
+from catstream.services.options import PATH
 from catstream.wire.channels import CHANNELS, Role
 from catstream.wire.keys import ROLES, allow, clients, create, revoke
 
 __all__ = ["keys"]
 
-_folder = click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+_folder = click.argument("folder", metavar="DIR", type=PATH)
 _name = click.argument("name")
 
 
@@ -54,7 +55,7 @@ def new(folder: Path) -> None:
 @_folder
 @_name
 @click.option("--role", type=click.Choice(ROLES), default="watch", show_default=True, help="Role of the client.")
-@click.option("--output", type=click.Path(path_type=Path), help="Folder for the new keys of the client.")
+@click.option("--output", type=PATH, help="Folder for the new keys of the client.")
 @click.option("--public", metavar="KEY", help="Public key of a client that already has a key pair.")
 def allow_(folder: Path, name: str, role: Role, output: Path | None, public: str | None) -> None:
     """Allow a client to connect.

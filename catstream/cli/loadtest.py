@@ -109,7 +109,7 @@ def loadtest(
       catstream loadtest --duration 60 --chaos --limit recovery=5
       catstream loadtest --find-limit --size 320x240
     """
-    # Imported here so that --help and the other verbs start faster.
+    # Imported here so that --help and the other commands start faster.
     from catstream.applications.loadtest.limits import Limit, violations
     from catstream.applications.loadtest.load_test import run_load_test
     from catstream.applications.loadtest.plan import Plan

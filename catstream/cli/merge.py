@@ -10,14 +10,15 @@ import click
 from catstream.errors import ServiceError
 from catstream.run.learned import Learned
 from catstream.run.learned import merge as merged
+from catstream.services.options import PATH, with_overwrite
 
 __all__ = ["merge"]
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="FILE", help="File to write.")
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+@click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
+@click.option("-o", "--output", required=True, type=PATH, metavar="FILE", help="File to write.")
+@with_overwrite
 @click.option("--force", is_flag=True, help="Merge models although their objects look different.")
 def merge(files: tuple[Path, ...], output: Path, overwrite: bool, force: bool) -> None:
     """Merge saved models of one object, for example from two cameras.

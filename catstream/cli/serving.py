@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import secrets
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import click
 
 from catstream.errors import ServiceError
+from catstream.services.options import PATH, Decorator, combined
 
 __all__ = ["PORT", "Address", "AddressType", "with_token"]
 
@@ -43,51 +42,48 @@ class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since c
         return Address(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
 
 
-def with_token(prefix: str = "") -> Callable[[Callable[..., None]], Callable[..., None]]:
+def with_token(prefix: str = "") -> Decorator:
     """Add --PREFIXtoken, --PREFIXtoken-file and --no-PREFIXtoken; the command gets one argument `token`.
 
     It is the given token, a new random one if none is given, or None with --no-PREFIXtoken.
     """
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        @click.option(
+    def chosen(token: str | None, token_file: Path | None, no_token: bool) -> str | None:
+        given = token or (_read(token_file) if token_file else None)
+        if no_token and given:
+            raise click.UsageError(
+                f"--no-{prefix}token contradicts the token of --{prefix}token, --{prefix}token-file, VIEW_TOKEN or "
+                "VIEW_TOKEN_FILE: leave out one of them"
+            )
+        return None if no_token else given or secrets.token_hex(16)
+
+    return combined(
+        "token",
+        chosen,
+        click.option(
             f"--{prefix}token",
             "token",
             envvar="VIEW_TOKEN",
             show_envvar=True,
             metavar="TOKEN",
             help="Token for access to the page, at least 16 characters; by default a random one.",
-        )
-        @click.option(
+        ),
+        click.option(
             f"--{prefix}token-file",
             "token_file",
             envvar="VIEW_TOKEN_FILE",
             show_envvar=True,
-            type=click.Path(path_type=Path),
+            type=PATH,
             metavar="FILE",
             help="File with this token.",
-        )
-        @click.option(
+        ),
+        click.option(
             f"--no-{prefix}token",
             "no_token",
             is_flag=True,
             help="Serve the page without a token: every user of this machine can watch the pictures and steer.",
-        )
-        @functools.wraps(command)
-        def with_one(
-            *args: object, token: str | None, token_file: Path | None, no_token: bool, **others: object
-        ) -> None:
-            given = token or (_read(token_file) if token_file else None)
-            if no_token and given:
-                raise click.UsageError(
-                    f"--no-{prefix}token contradicts the token of --{prefix}token, --{prefix}token-file, VIEW_TOKEN or "
-                    "VIEW_TOKEN_FILE: leave out one of them"
-                )
-            command(*args, token=None if no_token else given or secrets.token_hex(16), **others)
-
-        return with_one
-
-    return decorate
+        ),
+    )
 
 
 def _read(path: Path) -> str:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from catstream.errors import SettingsError
+from catstream.services.options import with_json
 from catstream.settings import describe
 
 __all__ = ["settings"]
@@ -17,7 +18,7 @@ __all__ = ["settings"]
 
 @click.command()
 @click.argument("words", nargs=-1, metavar="[WORD]...")
-@click.option("--json", "as_json", is_flag=True, help="Print a JSON array.")
+@with_json
 def settings(words: tuple[str, ...], as_json: bool) -> None:
     """List the settings with their defaults and descriptions.
 

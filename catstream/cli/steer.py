@@ -17,6 +17,7 @@ from catstream.errors import ServiceError
 from catstream.messages.names import UNNAMED, check_name, split_name
 from catstream.run.job import Job
 from catstream.run.state import learned
+from catstream.services.options import PATH, combined
 
 __all__ = ["forget", "pause", "resume", "save", "search", "set_box", "stop"]
 
@@ -52,24 +53,25 @@ class _Target:
         return pipeline
 
 
-def _with_pipeline(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that select a pipeline; the command gets them as one argument `target`."""
+def _target(endpoint: str, source: str, keys: str, timeout: float, yes: bool) -> _Target:
+    if endpoint and source:
+        raise click.UsageError("--endpoint and --source both select the pipeline: give one of them")
+    return _Target(endpoint, source, keys, timeout, yes)
 
-    @with_endpoint
-    @click.option(
+
+#: Adds the options that select a pipeline, as one argument `target`.
+_with_pipeline = combined(
+    "target",
+    _target,
+    with_endpoint,
+    click.option(
         "--source", default="", metavar="SOURCE", help="The source that the pipeline tracks, instead of --endpoint."
-    )
-    @click.option(
+    ),
+    click.option(
         "--timeout", default=5.0, show_default=True, type=click.FloatRange(0), help="Seconds to wait for an answer."
-    )
-    @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
-    @wraps(command)
-    def wrapped(endpoint: str, source: str, keys: str, timeout: float, yes: bool, **options: object) -> None:
-        if endpoint and source:
-            raise click.UsageError("--endpoint and --source both select the pipeline: give one of them")
-        command(target=_Target(endpoint, source, keys, timeout, yes), **options)
-
-    return wrapped
+    ),
+    click.option("--yes", is_flag=True, help="Do not ask for confirmation."),
+)
 
 
 def _with_control(command: Callable[..., str]) -> Callable[..., None]:
@@ -173,11 +175,9 @@ def resume(pipeline: Control) -> str:
 
 
 @click.command()
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=PATH)
 @click.option("--object", "name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one.")
-@click.option(
-    "--state", type=click.Path(path_type=Path), metavar="FOLDER", help="State folder of a run, which may have ended."
-)
+@click.option("--state", type=PATH, metavar="FOLDER", help="State folder of a run, which may have ended.")
 @_with_pipeline
 def save(target: _Target, file: Path, state: Path | None, name: str) -> None:
     """Save everything that a pipeline has learned of an object to FILE.

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -22,27 +23,111 @@ from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, doubtful, listed
 from catstream.messages.storage import why_not_writable
 from catstream.pipeline import Pipeline
-from catstream.run.job import Results
-from catstream.services.options import named, with_given, with_object, with_part, with_reading
+from catstream.run.job import Results, files_by_name
+from catstream.services.options import PATH, by_name, with_given, with_object, with_overwrite, with_part, with_reading
 from catstream.sinks.recording.file import Recording
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT
 
 __all__ = ["track"]
 
-_FOLDER = _FILE = click.Path(path_type=Path)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Request:
+    """The options of the command.
+
+    given   the settings that were given
+    boxes   the objects in the first frame, by name
+    models  the saved models of objects that are searched for, by name
+    saved   the files for what is learned of each object, by name
+    view    address of the web page; None for none
+    """
+
+    source: str | None
+    boxes: dict[str, Box]
+    models: dict[str, Path]
+    given: dict[str, object]
+    part: slice
+    output: Path | None
+    video: bool
+    write: tuple[Path, ...]
+    overwrite: bool
+    saved: dict[str, Path]
+    record: Path | None
+    view: Address | None
+    token: str | None
+    lockstep: bool
+    state: Path | None
+    resume: Path | None
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder of the checkpoints, None if there are none."""
+        return self.state or self.resume
+
+    def check(self) -> None:
+        """Raise UsageError if the options contradict each other."""
+        several = len(self.boxes) + len(self.models) > 1
+        _reject_if(
+            (self.state and self.resume, "--state starts a new run, and --resume continues one: give one of them"),
+            (
+                not self.resume and not self.source,
+                "a run needs SOURCE: a video, a folder of images, a camera or a stream",
+            ),
+            (
+                self.resume and self.overwrite,
+                "--resume continues the existing results, and --overwrite replaces them: give one of them",
+            ),
+            (
+                several and UNNAMED in self.saved,
+                "--save-model FILE is for a single object: for each of several, give NAME=FILE",
+            ),
+        )
+
+    def pipeline(self) -> Pipeline:
+        """The pipeline of the run, not started; a resumed run continues the results of its earlier part."""
+        return Pipeline(
+            self.source,
+            self.boxes or None,
+            self.given | ({"run.lockstep": True} if self.lockstep else {}),
+            model=self.models or None,
+            part=self.part,
+            state=self.state,
+            record=self.record,
+            resume=self.resume,
+            results=Results(  # absolute, to resume from any folder
+                output=self.output and self.output.absolute(),
+                video=self.video,
+                write=tuple(file.absolute() for file in self.write if file != STDOUT),
+                models={name: file.absolute() for name, file in self.saved.items()},
+            ),
+        )
+
+    def files(self, pipeline: Pipeline) -> RunFiles:
+        """The files to which the tracks are written, including the standard output if requested."""
+        results = pipeline.results
+        return RunFiles(
+            pipeline.name,
+            pipeline.source,
+            pipeline.part,
+            results.output,
+            results.video,
+            [*results.write, *([STDOUT] if STDOUT in self.write else [])],
+            pipeline.settings.run.image_rate,
+            [*self.boxes, *self.models],
+        )
 
 
 @click.command()
 @click.argument("source", required=False)
-@click.option("--output", type=_FOLDER, help="Folder for the results.")
+@click.option("--output", type=PATH, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
-@click.option("--write", type=_FILE, multiple=True, metavar="FILE", help="Also write the tracks to FILE; - for stdout.")
-@click.option("--overwrite", is_flag=True, help="Replace existing results.")
-@click.option(
-    "--save-model", multiple=True, metavar="[NAME=]FILE", help="Save the model of an object to FILE at the end."
+@click.option("--write", type=PATH, multiple=True, metavar="FILE", help="Also write the tracks to FILE; - for stdout.")
+@with_overwrite
+@by_name(
+    *("--save-model", "saved", "[NAME=]FILE", files_by_name), help="Save the model of an object to FILE at the end."
 )
-@click.option("--record", type=click.Path(path_type=Path), help="Record the run to a file for `catstream replay`.")
+@click.option("--record", type=PATH, help="Record the run to a file for `catstream replay`.")
 @click.option(
     "--view",
     type=AddressType(),
@@ -53,30 +138,13 @@ _FOLDER = _FILE = click.Path(path_type=Path)
 )
 @with_token("view-")
 @click.option("--lockstep", is_flag=True, help="Wait for each model: the run is reproducible bit for bit.")
-@click.option("--state", type=_FOLDER, help="Folder for checkpoints, to resume the run from.")
-@click.option("--resume", type=_FOLDER, help="Resume the run of such a folder.")
+@click.option("--state", type=PATH, help="Folder for checkpoints, to resume the run from.")
+@click.option("--resume", type=PATH, help="Resume the run of such a folder.")
 @with_object
 @with_part
 @with_given
 @with_reading
-def track(
-    given: dict[str, object],
-    part: slice,
-    source: str | None,
-    boxes: dict[str, Box],
-    models: dict[str, Path],
-    output: Path | None,
-    video: bool,
-    write: tuple[Path, ...],
-    overwrite: bool,
-    save_model: tuple[str, ...],
-    record: Path | None,
-    view: Address | None,
-    token: str | None,
-    lockstep: bool,
-    state: Path | None,
-    resume: Path | None,
-) -> None:
+def track(**options: Any) -> None:
     """Track one or several objects in a video.
 
     An object is given by its box in the first frame, or by a saved model. If
@@ -149,179 +217,154 @@ def track(
       catstream track walk.mp4 --box 120,80,64,48 --output out --state checkpoints
       catstream track --resume checkpoints
     """
-    if state is not None and resume is not None:
-        raise click.UsageError("--state starts a new run, and --resume continues one: give one of them")
-    if resume is None and source is None:
-        raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
-    if resume is not None and overwrite:
-        raise click.UsageError(
-            "--resume continues the existing results, and --overwrite replaces them: give one of them"
-        )
-    saved = {name: Path(file) for name, file in named("--save-model", save_model).items()}
-    pipeline = Pipeline(
-        source,
-        boxes or None,
-        given | ({"run.lockstep": True} if lockstep else {}),
-        model=models or None,
-        part=part,
-        state=state,
-        record=record,
-        resume=resume,
-        results=Results(  # absolute, to resume from any folder
-            output=output and output.absolute(),
-            video=video,
-            write=tuple(file.absolute() for file in write if file != STDOUT),
-            models={name: file.absolute() for name, file in saved.items()},
+    request = _Request(**options)
+    request.check()
+    pipeline = request.pipeline()
+    if request.view is not None:
+        require_extra("view")
+    files = request.files(pipeline)
+    _check_files(request, pipeline, files)
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    for line in _doubts(request, pipeline):
+        console.print(line)
+    if request.resume is not None:
+        pipeline = pipeline.starting_after(files.position())
+        if pipeline.complete:
+            console.print(_completed(request, pipeline, files))
+            return
+    _Run(request, pipeline, files, console).execute()
+
+
+def _reject_if(*cases: tuple[object, str]) -> None:
+    """Raise UsageError with the message of the first case that holds."""
+    for holds, message in cases:
+        if holds:
+            raise click.UsageError(message)
+
+
+def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None:
+    """Raise an error before the run if one of its files could not be written."""
+    _reject_if(
+        (files.video and files.output is None, "--video requires --output, the folder for the video"),
+        (
+            pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)),
+            "a video needs the frames once more, and a live source cannot repeat them: omit the video",
         ),
     )
-    results, earlier = pipeline.results, pipeline.earlier_results
-    if view is not None:
-        require_extra("view")
-    files = _files(pipeline, results, STDOUT in write, [*boxes, *models])
+    earlier = pipeline.earlier_results
     files.check_writable(
-        overwrite=overwrite,
-        resumable=state is not None or resume is not None,
+        overwrite=request.overwrite,
+        resumable=request.folder is not None,
         known=[*earlier.write, *([earlier.output] if earlier.output is not None else [])],
     )
-    _check_models(saved, overwrite)
-    if UNNAMED in saved and len(boxes) + len(models) > 1:
-        raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
-    console = Console(stderr=True, soft_wrap=True)
-    if (boxes or models) and (unknown := saved.keys() - {*boxes, *models}):
-        console.print(
-            f"there is no object {listed(sorted(unknown))} yet: its model is saved if one begins under this name",
-            highlight=False,
-        )
-    for line in doubtful(boxes, *pipeline.size):
-        console.print(line, highlight=False)
-    if resume is not None:
-        pipeline = pipeline.starting_after(files.position())
-    output = results.output
-    if resume is not None and pipeline.complete:
-        if boxes:
-            raise click.UsageError(f"{_complete(pipeline, resume, output)}: no frame is left for a box")
-        if not files.complete:
-            with files.opened(resume=True):  # creates new files, and those that are made at the end
-                pass
-        console.print(_complete(pipeline, resume, output), highlight=False)
-        return
-    recording: Recording | None = None
-    run = RunProgress(pipeline, files.names() if resume is not None else ())
-    serve = partial(_serve, pipeline, view, token, console) if view is not None else None
-    try:
-        interrupted = _run(pipeline, files, run, console, serve, resumed=resume is not None)
-    finally:
-        if run.frames and not isinstance(sys.exception(), BrokenPipeError):
-            console.print(run.summary([*([output] if output is not None else []), *files.files]), highlight=False)
-            if record is not None:
-                recording = Recording(record)
-                console.print(f"recording: {record}, {recording}", highlight=False)
-    if resume is not None and not run.frames and not interrupted:
-        console.print(f"no frames were left to track: the run in {resume} is complete", highlight=False)
-    for file in results.models.values():
-        console.print(f"saved model: {file}", highlight=False)
-    if interrupted:
-        hint = f"; to continue: catstream track --resume {state or resume}" if state or resume else ""
-        console.print(f"stopped: the results so far are kept{hint}", highlight=False)
-        sys.exit(INTERRUPTED)
-    if recording is not None and not recording.complete:
-        raise RecordingError(f"{record} is not complete: see why above, and record the run again if you need it whole")
-
-
-def _run(
-    pipeline: Pipeline,
-    files: RunFiles,
-    run: RunProgress,
-    console: Console,
-    serve: Callable[[ExitStack], None] | None,
-    *,
-    resumed: bool,
-) -> bool:
-    """Run the pipeline to its end, with the page if `serve` starts one; returns whether Ctrl-C or a signal ended it."""
-    interrupts = Interrupts()
-    interrupts.install()
-    try:
-        with pipeline, ExitStack() as stack:
-            if serve is not None:
-                serve(stack)
-            if pipeline.waits:
-                console.print(f"waiting for a box: {_ways_to_set_box(pipeline, serve is not None)}", highlight=False)
-            _write_tracks(pipeline, files, run, console, interrupts, resumed=resumed)
-    except KeyboardInterrupt:
-        return True
-    return False
-
-
-def _serve(pipeline: Pipeline, view: Address, token: str | None, console: Console, stack: ExitStack) -> None:
-    """Serve the web page of a pipeline until the stack is left."""
-    from catstream.web.app import pipeline_site
-    from catstream.web.server import Server
-
-    site = pipeline_site(pipeline.endpoint, pipeline.settings.run.keys)
-    server = Server(site, host=view.host, port=view.port, token=token)
-    stack.enter_context(server.in_background())
-    for url in server.urls:
-        console.print(f"page: {url}", highlight=False, soft_wrap=True)
-
-
-def _write_tracks(
-    pipeline: Pipeline, files: RunFiles, run: RunProgress, console: Console, interrupts: Interrupts, *, resumed: bool
-) -> None:
-    """Write every track to all files, and show the progress."""
-    with run.progress(console) as progress, ExitStack() as stack:
-        write: Callable[[Mapping[str, Track], float], None] | None = None
-        moment = time.perf_counter()
-        for tracks in pipeline.by_frame():
-            # The files are opened with the first track: a run that cannot start does not change older results.
-            write = write or stack.enter_context(files.opened(resume=resumed))
-            before, moment = moment, time.perf_counter()
-            with interrupts.deferred():  # so that a frame is in all results or in none
-                write(tracks, moment - before)
-                run.show(progress, tracks)
-
-
-def _complete(pipeline: Pipeline, resume: Path, output: Path | None) -> str:
-    """The message for a resumed run that is complete."""
-    results = f", its results are in {output}" if output is not None else ""
-    return (
-        f"the run in {resume} is complete, all {pipeline.frames} frames were tracked{results}; "
-        "to track the source again, start a new run in another folder (--state DIR)"
-    )
-
-
-def _files(pipeline: Pipeline, results: Results, stdout: bool, objects: Sequence[str]) -> RunFiles:
-    """The files to which the tracks are written, including the standard output if requested."""
-    files = RunFiles(
-        pipeline.name,
-        pipeline.source,
-        pipeline.part,
-        results.output,
-        results.video,
-        [*results.write, *([STDOUT] if stdout else [])],
-        pipeline.settings.run.image_rate,
-        objects,
-    )
-    if files.video and files.output is None:
-        raise click.UsageError("--video requires --output, the folder for the video")
-    if pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)):
-        raise click.UsageError(
-            "a video needs the frames once more, and a live source cannot repeat them: omit the video"
-        )
-    return files
-
-
-def _check_models(files: Mapping[str, Path], overwrite: bool) -> None:
-    """Raise ServiceError if one of the files for models cannot be written."""
-    for name, file in files.items():
-        if file.exists() and not overwrite:
+    for file in request.saved.values():
+        if file.exists() and not request.overwrite:
             raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
         if reason := why_not_writable(file):
             raise ServiceError(reason)
-        if any(file == other for named, other in files.items() if named != name):
+        if [*request.saved.values()].count(file) > 1:
             raise ServiceError(f"{file} is named twice: give each object its own file")
 
 
-def _ways_to_set_box(pipeline: Pipeline, page: bool) -> str:
-    place = f"--endpoint {pipeline.endpoint}"
-    drawn = "draw one on the page" if page else f"draw one on the page of catstream view {place}"
-    return f"{drawn}, or run catstream set-box [NAME=]X,Y,W,H {place}"
+def _doubts(request: _Request, pipeline: Pipeline) -> Iterator[str]:
+    """Yield descriptions of options that are valid, but hardly are what was meant."""
+    objects = {*request.boxes, *request.models}
+    if objects and (unknown := request.saved.keys() - objects):
+        yield f"there is no object {listed(sorted(unknown))} yet: its model is saved if one begins under this name"
+    yield from doubtful(request.boxes, *pipeline.size)
+
+
+def _completed(request: _Request, pipeline: Pipeline, files: RunFiles) -> str:
+    """Complete the files of a run to resume whose frames were all tracked; return the message about it."""
+    results = f", its results are in {files.output}" if files.output is not None else ""
+    message = (
+        f"the run in {request.resume} is complete, all {pipeline.frames} frames were tracked{results}; "
+        "to track the source again, start a new run in another folder (--state DIR)"
+    )
+    if request.boxes:
+        raise click.UsageError(f"{message}: no frame is left for a box")
+    if not files.complete:
+        with files.opened(resume=True):  # creates new files, and those that are made at the end
+            pass
+    return message
+
+
+class _Run:
+    """Runs the pipeline, writes its tracks to the files, and prints the progress and the results."""
+
+    def __init__(self, request: _Request, pipeline: Pipeline, files: RunFiles, console: Console) -> None:
+        self._request, self._pipeline, self._files, self._console = request, pipeline, files, console
+        self._progress = RunProgress(pipeline, files.names() if request.resume is not None else ())
+        self._interrupts = Interrupts()
+        self._recording: Recording | None = None
+
+    def execute(self) -> None:
+        """Run to the end, or until Ctrl-C or a signal; then the exit code is `INTERRUPTED`."""
+        try:
+            interrupted = self._run()
+        finally:
+            if self._progress.frames and not isinstance(sys.exception(), BrokenPipeError):
+                self._print_summary()
+        request, folder = self._request, self._request.folder
+        if request.resume is not None and not self._progress.frames and not interrupted:
+            self._console.print(f"no frames were left to track: the run in {request.resume} is complete")
+        for file in self._pipeline.results.models.values():
+            self._console.print(f"saved model: {file}")
+        if interrupted:
+            hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
+            self._console.print(f"stopped: the results so far are kept{hint}")
+            sys.exit(INTERRUPTED)
+        if self._recording is not None and not self._recording.complete:
+            raise RecordingError(
+                f"{request.record} is not complete: see why above, and record the run again if you need it whole"
+            )
+
+    def _run(self) -> bool:
+        """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
+        self._interrupts.install()
+        try:
+            with self._pipeline, ExitStack() as stack:
+                if self._request.view is not None:
+                    self._serve(self._request.view, stack)
+                if self._pipeline.waits:
+                    self._console.print(f"waiting for a box: {self._ways_to_set_box()}")
+                self._write_tracks()
+        except KeyboardInterrupt:
+            return True
+        return False
+
+    def _serve(self, view: Address, stack: ExitStack) -> None:
+        """Serve the web page of the pipeline until the stack is left."""
+        from catstream.web.app import pipeline_site
+        from catstream.web.server import Server
+
+        site = pipeline_site(self._pipeline.endpoint, self._pipeline.settings.run.keys)
+        server = Server(site, host=view.host, port=view.port, token=self._request.token)
+        stack.enter_context(server.in_background())
+        for url in server.urls:
+            self._console.print(f"page: {url}")
+
+    def _ways_to_set_box(self) -> str:
+        place = f"--endpoint {self._pipeline.endpoint}"
+        page = "the page" if self._request.view is not None else f"the page of catstream view {place}"
+        return f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
+
+    def _write_tracks(self) -> None:
+        """Write every track to all files, and show the progress."""
+        with self._progress.progress(self._console) as progress, ExitStack() as stack:
+            write: Callable[[Mapping[str, Track], float], None] | None = None
+            moment = time.perf_counter()
+            for tracks in self._pipeline.by_frame():
+                # The files are opened with the first track: a run that cannot start does not change older results.
+                write = write or stack.enter_context(self._files.opened(resume=self._request.resume is not None))
+                before, moment = moment, time.perf_counter()
+                with self._interrupts.deferred():  # so that a frame is in all results or in none
+                    write(tracks, moment - before)
+                    self._progress.show(progress, tracks)
+
+    def _print_summary(self) -> None:
+        folder = [self._files.output] if self._files.output is not None else []
+        self._console.print(self._progress.summary([*folder, *self._files.files]))
+        if self._request.record is not None:
+            self._recording = Recording(self._request.record)
+            self._console.print(f"recording: {self._request.record}, {self._recording}")

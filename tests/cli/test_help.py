@@ -1,4 +1,4 @@
-"""Help teaches: what a verb does, what it writes, and an example that works. And what all verbs do alike."""
+"""Help teaches: what a command does, what it writes, and an example that works. And what all commands do alike."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from catstream.cli import VERBS
+from catstream.cli import COMMANDS
 from catstream.services.start_server import NAMES
 
 
 @pytest.fixture
 def help_of(said):
-    """What `catstream VERB --help` says."""
+    """What `catstream COMMAND --help` says."""
 
-    def ask(*verb):
-        code, output, errors = said(*verb, "--help")
+    def ask(*words):
+        code, output, errors = said(*words, "--help")
         assert (code, errors) == (0, "")
         return " ".join(output.split())
 
@@ -30,13 +30,13 @@ def test_the_help_lists_the_commands_and_shows_a_first_example(said_by_process):
     assert (code, errors) == (0, "")
     text = " ".join(output.split())
     assert "Track objects in a video stream" in text
-    assert all(verb in text for verb in VERBS)
+    assert all(command in text for command in COMMANDS)
     assert "catstream track walk.mp4 --box 120,80,64,48" in text
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_command_has_a_help_text(help_of, verb):
-    assert help_of(verb).startswith(f"Usage: catstream {verb}")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_help_text(help_of, command):
+    assert help_of(command).startswith(f"Usage: catstream {command}")
 
 
 def test_the_help_of_track_lists_its_files_and_how_to_stop_it(help_of):
@@ -70,16 +70,16 @@ def test_every_process_has_a_help_text(name):
     assert run.stdout.startswith(f"Usage: python -P -m catstream.services {name}")
 
 
-#: Verbs that take long, and how one sees that they are at it.
+#: Commands that take long, and how one sees that they are at it.
 LONG = {
     "status": (["--wait", 60, "--endpoint", "."], lambda tasks, _: any("ZMQ" in task.read_text() for task in tasks)),
     "demo": (["--frames", 100_000], lambda _, folder: list(folder.glob("demo/*"))),
 }
 
 
-@pytest.mark.parametrize(("verb", "options", "begun"), [(verb, *how) for verb, how in LONG.items()], ids=LONG)
-def test_ctrl_c_ends_any_command_with_130_and_no_traceback(catstream, until, tmp_path, verb, options, begun):
-    process = catstream(verb, *options, cwd=tmp_path)
+@pytest.mark.parametrize(("command", "options", "begun"), [(command, *how) for command, how in LONG.items()], ids=LONG)
+def test_ctrl_c_ends_any_command_with_130_and_no_traceback(catstream, until, tmp_path, command, options, begun):
+    process = catstream(command, *options, cwd=tmp_path)
     until(lambda: begun(Path(f"/proc/{process.pid}/task").glob("*/comm"), tmp_path) or process.poll() is not None)
     process.send_signal(signal.SIGINT)
     errors = process.communicate(timeout=60)[1]

@@ -1,4 +1,4 @@
-"""Where a page listens, and the token that opens it, as the verbs that serve one take them."""
+"""Where a page listens, and the token that opens it, as the commands that serve one accept them."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def test_the_token_of_a_page_is_read_from_an_option_a_variable_or_a_file(prefix,
 
     @click.command()
     @with_token(prefix)
-    def verb(token):
+    def command(token):
         click.echo(str(token))
 
     def says(*words, **variables):
-        return CliRunner().invoke(verb, list(words), env=variables, standalone_mode=False)
+        return CliRunner().invoke(command, list(words), env=variables, standalone_mode=False)
 
     made = [says().output, says(VIEW_TOKEN="").output]
     assert all(re.fullmatch(r"[0-9a-f]{32}\n", each) for each in made), "a random one"

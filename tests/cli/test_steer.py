@@ -10,7 +10,7 @@ from threading import Event
 
 import pytest
 
-from catstream.cli import VERBS
+from catstream.cli import COMMANDS
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
 
@@ -144,7 +144,7 @@ def test_a_box_and_a_model_for_one_object_are_an_error(video, said, tmp_path):
 
 @pytest.mark.parametrize("verb", STEER)
 def test_if_no_pipeline_runs_that_is_reported_in_one_line(said, tmp_path, verb):
-    assert verb in VERBS
+    assert verb in COMMANDS
     words = {"set-box": ["1,2,3,4"], "save": [tmp_path / "one"]}.get(verb, [])
     (tmp_path / "run").mkdir()  # as a pipeline leaves it; one that is not there may be starting
     code, output, errors = said(verb, *words, "--endpoint", tmp_path / "run", "--timeout", 600)
