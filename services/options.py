@@ -6,7 +6,7 @@ as one argument of the command's function.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from functools import wraps
 from inspect import signature
 from pathlib import Path
@@ -16,16 +16,14 @@ import click
 
 from catstream.errors import ObjectError
 from catstream.messages.names import boxes_by_name, split_name
-from catstream.run.job import files_by_name
 from catstream.settings import PRESETS, Settings
 
 __all__ = [
     "PATH",
     "Command",
     "Decorator",
-    "by_name",
     "combined",
-    "named",
+    "with_files",
     "with_given",
     "with_json",
     "with_keys",
@@ -40,11 +38,12 @@ __all__ = [
 
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
+_Converter = Callable[[dict[str, str]], object]
 
 #: Parameter type of a file or folder.
 PATH = click.Path(path_type=Path)
 
-with_overwrite = click.option("--overwrite", is_flag=True, help="Replace existing results.")
+with_overwrite = click.option("--overwrite", is_flag=True, help="Replace existing files.")
 with_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 with_keys = click.option(
     "--keys", default="", metavar="DIR", help="Folder of keys, if the pipeline or fleet requires keys."
@@ -52,49 +51,32 @@ with_keys = click.option(
 with_skip_damaged = click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video file.")
 
 
-def named(option: str, texts: Iterable[str]) -> dict[str, str]:
-    """Return the values of an option by the names of the objects, from texts NAME=VALUE; the name "" if it has none.
+def _by_name(flag: str, argument: str, metavar: str, convert: _Converter, help: str) -> Decorator:
+    """An option for objects, which may be repeated; the argument is what `convert` makes of the values by name."""
 
-    Raises
-    ------
-    ObjectError
-        If a name is not valid, or two values have the same name.
+    def by_name(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> object:
+        values: dict[str, str] = {}
+        for text in texts:
+            name, value = split_name(text)
+            if name in values:
+                earlier = f"{name}={values[name]}" if name else values[name]
+                hint = "its own name" if name else f"a name, NAME={value}"
+                raise ObjectError(f"{flag} {earlier} and {flag} {text}: give each object {hint}")
+            values[name] = value
+        return convert(values)
 
-    Examples
-    --------
-    >>> named("--box", ["anna=120,80,64,48", "ben=300,90,60,150"])
-    {'anna': '120,80,64,48', 'ben': '300,90,60,150'}
-    """
-    values: dict[str, str] = {}
-    for text in texts:
-        name, value = split_name(text)
-        if name in values and name:
-            raise ObjectError(f"{option} {name}={values[name]} and {option} {text}: give each object its own name")
-        if name in values:
-            raise ObjectError(f"{option} {values[name]} and {option} {text}: give each object a name, NAME={value}")
-        values[name] = value
-    return values
+    return click.option(flag, argument, multiple=True, metavar=metavar, callback=by_name, help=help)
 
 
-def by_name(
-    flag: str, argument: str, metavar: str, convert: Callable[[Mapping[str, str]], Mapping[str, object]], help: str
-) -> Decorator:
-    """An option [NAME=]VALUE for objects, which may be repeated, as a dict of what `convert` makes of `named`."""
-
-    def values(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> Mapping[str, object]:
-        return convert(named(flag, texts))
-
-    return click.option(flag, argument, multiple=True, metavar=metavar, callback=values, help=help)
+def with_files(flag: str, argument: str, help: str) -> Decorator:
+    """Add an option [NAME=]FILE, which may be repeated, as a dict of files by the names of the objects."""
+    return _by_name(flag, argument, "[NAME=]FILE", lambda files: {name: Path(files[name]) for name in files}, help)
 
 
-with_model = by_name(
-    "--model", "models", "[NAME=]FILE", files_by_name, help="Model of an object, written by `catstream save`."
-)
+with_model = with_files("--model", "models", "Model of an object, written by `catstream save`.")
 
-_with_box = by_name(
-    *("--box", "boxes", "[NAME=]X,Y,W,H", boxes_by_name),
-    help="An object in the first frame, in pixels; may be repeated with names.",
-)
+_HELP = "An object in the first frame, in pixels; may be repeated with names."
+_with_box = _by_name("--box", "boxes", "[NAME=]X,Y,W,H", boxes_by_name, _HELP)
 
 
 def with_object(command: Command) -> Command:

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from catstream.box import Box
 from catstream.cli.track import track
+from catstream.services.options import PATH
 
 __all__ = ["demo"]
 
@@ -20,7 +21,7 @@ Truth = TypeVar("Truth")
 
 
 @click.command()
-@click.option("--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder.")
+@click.option("--output", type=PATH, default=Path("demo"), show_default=True, help="Folder.")
 @click.option(
     "--objects", type=click.IntRange(1, 16), default=1, show_default=True, help="How many objects; 8 is a good number."
 )

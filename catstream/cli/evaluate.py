@@ -16,7 +16,7 @@ from rich.table import Table
 from catstream.cli import INTERRUPTED, interruptible
 from catstream.cli.figures import check_json, write_json
 from catstream.errors import CatstreamError
-from catstream.services.options import with_settings
+from catstream.services.options import PATH, with_settings
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
@@ -27,16 +27,16 @@ __all__ = ["evaluate"]
 
 
 @click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
 @click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see below.")
 @click.option("--starts", type=click.IntRange(min=1), help="Run from N frames of each sequence (TRE).")
 @click.option("--shifts", is_flag=True, help="Run from 12 shifted or scaled first boxes (SRE).")
 @click.option("--jitter", type=click.IntRange(min=1), help="Run from K first boxes that differ by at most 2 %.")
-@click.option("--attributes", type=click.Path(path_type=Path), help="JSON file {sequence: [attribute]}.")
-@click.option("--peer-models", type=click.Path(path_type=Path), help="Folder of model files for nano and vit.")
+@click.option("--attributes", type=PATH, help="JSON file {sequence: [attribute]}.")
+@click.option("--peer-models", type=PATH, help="Folder of model files for nano and vit.")
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of processes.")
-@click.option("--output", type=click.Path(path_type=Path), help="Folder for results and report.html.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all figures and their provenance.")
+@click.option("--output", type=PATH, help="Folder for results and report.html.")
+@click.option("--json", "json_file", type=PATH, help="File for all figures and their provenance.")
 @with_settings
 def evaluate(
     settings: Settings,

@@ -16,7 +16,7 @@ from rich.table import Table
 from catstream.cli import INTERRUPTED
 from catstream.cli.figures import check_json, write_json
 from catstream.errors import CatstreamError
-from catstream.services.options import with_settings
+from catstream.services.options import PATH, with_settings
 
 if TYPE_CHECKING:
     from catstream.applications.loadtest.limits import Limit
@@ -59,7 +59,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option(
     "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see below."
 )
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="File for all figures.")
+@click.option("--json", "json_file", type=PATH, help="File for all figures.")
 @click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and .hgrm.")
 @with_settings
 def loadtest(

@@ -14,6 +14,7 @@ from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.client.registry import locate
 from catstream.errors import RecordingError
 from catstream.messages.kinds import End, Features, Run, Track
+from catstream.services.options import PATH
 from catstream.services.recorder import Recorder
 from catstream.sinks.recording.file import Recording, RecordingWriter
 from catstream.wire.channels import TRACKS, TRAINING
@@ -26,7 +27,7 @@ _END_SECONDS = 1.0  # at most, between the ends of the tracks and of the feature
 
 
 @click.command()
-@click.option("--output", required=True, type=click.Path(path_type=Path), help="The file to write; it must not exist.")
+@click.option("--output", required=True, type=PATH, help="The file to write; it must not exist.")
 @with_endpoint
 @with_wait
 def record(output: Path, endpoint: str, keys: str, wait: float) -> None:

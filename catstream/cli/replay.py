@@ -14,6 +14,7 @@ from rich.table import Column, Table
 
 from catstream.errors import RecordingError
 from catstream.messages.kinds import Features, Model, Run, Track
+from catstream.services.options import PATH
 from catstream.sinks.recording.file import Recording, RecordingWriter
 from catstream.sinks.recording.learning import Prequential, Retraining, learn, prequential_of_recorded, require_features
 from catstream.sinks.recording.player import Player
@@ -23,7 +24,7 @@ __all__ = ["replay"]
 
 
 @click.command()
-@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("recording", type=PATH)
 @click.option("--endpoint", default="", metavar="PLACE", help="Endpoint for subscribers; a new one by default.")
 @click.option("--keys", default="", metavar="DIR", help="Folder of keys; subscribers then need keys.")
 @click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Factor to the speed of recording.")
@@ -31,7 +32,7 @@ __all__ = ["replay"]
 @click.option("--wait", is_flag=True, help="Start when the tracks have a subscriber.")
 @click.option("--learn", "learns", is_flag=True, help="Train from the recorded features again.")
 @click.option("--set", "pairs", multiple=True, metavar="NAME=VALUE", help="With --learn, a setting to change.")
-@click.option("--output", type=click.Path(path_type=Path), help="With --learn, write the models to this recording.")
+@click.option("--output", type=PATH, help="With --learn, write the models to this recording.")
 @click.option("--incomplete", is_flag=True, help="With --learn, accept missing features.")
 def replay(
     recording: Path,

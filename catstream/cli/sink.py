@@ -13,7 +13,7 @@ from catstream.cli.interrupts import Interrupts
 from catstream.client.subscription import subscribe
 from catstream.messages.kinds import Run
 from catstream.messages.names import counted, listed
-from catstream.services.options import with_part
+from catstream.services.options import PATH, with_part
 from catstream.settings import Settings
 from catstream.sinks.sink import check_writable, open_files, with_logs
 from catstream.wire.channels import TRAINING
@@ -26,7 +26,7 @@ _RUN_SECONDS = 1.0  # time-out for the message with the settings of the run
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("files", nargs=-1, required=True, type=PATH)
 @with_endpoint
 @with_wait
 @click.option("--source", metavar="SOURCE", help="The source that the pipeline tracks, for an MP4.")

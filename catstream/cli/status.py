@@ -13,6 +13,7 @@ from catstream.cli.attach import with_endpoint
 from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health
+from catstream.services.options import with_json
 from catstream.wire.channels import CHANNELS
 
 __all__ = ["status"]
@@ -22,7 +23,7 @@ _NAMES = CHANNELS["health"].senders
 
 @click.command()
 @with_endpoint
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@with_json
 @click.option(
     "--wait",
     default=3.0,

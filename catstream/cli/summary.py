@@ -14,7 +14,7 @@ from catstream.cli import interruptible
 from catstream.cli.interrupts import Interrupts
 from catstream.errors import ObjectError, SettingsError, VideoError
 from catstream.messages.names import boxes_by_name, listed, split_name
-from catstream.services.options import with_settings
+from catstream.services.options import PATH, with_overwrite, with_settings
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _RECORDING = ".mcap"
 
 
 @click.command()
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=PATH)
 @click.option("-k", "count", type=click.IntRange(1), default=12, show_default=True, help="Number of images or frames.")
 @click.option("--box", metavar="X,Y,W,H", help="Object in the first frame of a video that is tracked.")
 @click.option("--object", "name", metavar="NAME", help="Object of a recording or run that has several.")
@@ -41,7 +41,7 @@ _RECORDING = ".mcap"
     metavar="FILE",
     help="Contact sheet; the JSON file is written beside it.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace existing files.")
+@with_overwrite
 @with_settings
 def summary(
     settings: Settings,

@@ -23,8 +23,16 @@ from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, doubtful, listed
 from catstream.messages.storage import why_not_writable
 from catstream.pipeline import Pipeline
-from catstream.run.job import Results, files_by_name
-from catstream.services.options import PATH, by_name, with_given, with_object, with_overwrite, with_part, with_reading
+from catstream.run.job import Results
+from catstream.services.options import (
+    PATH,
+    with_files,
+    with_given,
+    with_object,
+    with_overwrite,
+    with_part,
+    with_reading,
+)
 from catstream.sinks.recording.file import Recording
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT
@@ -124,9 +132,7 @@ class _Request:
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--write", type=PATH, multiple=True, metavar="FILE", help="Also write the tracks to FILE; - for stdout.")
 @with_overwrite
-@by_name(
-    *("--save-model", "saved", "[NAME=]FILE", files_by_name), help="Save the model of an object to FILE at the end."
-)
+@with_files("--save-model", "saved", "Save the model of an object to FILE at the end.")
 @click.option("--record", type=PATH, help="Record the run to a file for `catstream replay`.")
 @click.option(
     "--view",

@@ -13,6 +13,9 @@ import pytest
 
 from catstream.cli import main
 
+#: The command `catstream` in a process of its own.
+PROGRAM = [sys.executable, "-c", "from catstream.cli import main; main()"]
+
 
 @pytest.fixture(scope="session")
 def video(demo_video):
@@ -41,10 +44,10 @@ def whole_run(video, once):
 
     def run(folder):
         source, box = video
-        command = [sys.executable, "-c", "from catstream.cli import main; main()", "track", source, "--box", box]
         files = ["--output", "out", "--video", "--save-model", "model", "--record", "rec", "--write", "-"]
         with (folder / "stdout").open("w") as output, (folder / "stderr").open("w") as errors:
-            subprocess.run([*command, *files, "--lockstep"], cwd=folder, stdout=output, stderr=errors, check=True)
+            command = [*PROGRAM, "track", source, "--box", box, *files, "--lockstep"]
+            subprocess.run(command, cwd=folder, stdout=output, stderr=errors, check=True)
 
     return once("whole-run", run)
 
@@ -58,7 +61,7 @@ def catstream():
 
         def start(*arguments, **options):
             process = subprocess.Popen(
-                [sys.executable, "-c", "from catstream.cli import main; main()", *map(str, arguments)],
+                [*PROGRAM, *map(str, arguments)],
                 **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options},
             )
             stack.callback(process.communicate)
@@ -109,5 +112,32 @@ def said():
             except SystemExit as end:
                 code = end.code or 0
         return code, output.getvalue(), errors.getvalue()
+
+    return run
+
+
+@pytest.fixture
+def succeed(said):
+    """Runs the command in this process, which must succeed: output, errors."""
+
+    def run(*arguments, **options):
+        code, output, errors = said(*arguments, **options)
+        assert code == 0, errors
+        return output, errors
+
+    return run
+
+
+@pytest.fixture
+def fail(said):
+    """Runs the command in this process, which must end with an error of one line, and print no output: this line."""
+
+    def run(*arguments, **options):
+        code, output, errors = said(*arguments, **options)
+        lines = [line for line in errors.splitlines() if line.startswith(("catstream: ", "Error: "))]
+        assert (output, len(lines)) == ("", 1), errors
+        assert code == (2 if lines[0].startswith("Error: ") else 1)
+        assert "Traceback" not in errors
+        return lines[0]
 
     return run

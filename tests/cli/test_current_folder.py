@@ -1,4 +1,4 @@
-"""No file in the current folder is run, whichever verb is started there."""
+"""No file in the current folder is run, whichever command is started there."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.cli import VERBS
+from catstream.cli import COMMANDS
 from catstream.video.demo import render
 
 cv2 = pytest.importorskip("cv2")
@@ -24,12 +24,12 @@ TRAPS = [
     *("catstream/__init__", "services/__init__", "sitecustomize", "usercustomize"),
 ]
 
-EVERY_VERB = """
+EVERY_COMMAND = """
 import sys
 from click.testing import CliRunner
 from catstream.cli import group
-for verb in sys.argv[1:]:
-    assert CliRunner().invoke(group, [verb, "--help"]).exit_code == 0, verb
+for name in sys.argv[1:]:
+    assert CliRunner().invoke(group, [name, "--help"]).exit_code == 0, name
 """
 
 PROGRAM = """
@@ -63,8 +63,8 @@ def traps(tmp_path):
     return folder
 
 
-@pytest.mark.parametrize("verb", ["track", "demo", "evaluate", "loadtest", "program", "all others"])
-def test_no_file_in_the_current_folder_is_imported(verb, sequence, traps, tmp_path):
+@pytest.mark.parametrize("name", ["track", "demo", "evaluate", "loadtest", "program", "all others"])
+def test_no_file_in_the_current_folder_is_imported(name, sequence, traps, tmp_path):
     (tmp_path / "program.py").write_text(PROGRAM)
     (folder, box), out = sequence, tmp_path / "out"
     load = ["--rate", "20", "--duration", "1", "--size", "160x120", "--subscribers", "1"]
@@ -74,8 +74,8 @@ def test_no_file_in_the_current_folder_is_imported(verb, sequence, traps, tmp_pa
         "evaluate": [CATSTREAM, "evaluate", folder, "--starts", "2", "--jobs", "2", "--output", out],
         "loadtest": [CATSTREAM, "loadtest", *load],
         "program": [sys.executable, tmp_path / "program.py", folder / "img", box, str(FRAMES)],
-        "all others": [sys.executable, "-P", "-c", EVERY_VERB, *VERBS],
-    }[verb]
+        "all others": [sys.executable, "-P", "-c", EVERY_COMMAND, *COMMANDS],
+    }[name]
     done = subprocess.run(command, cwd=traps, capture_output=True, text=True, timeout=240, check=False)
     assert not [str(path.relative_to(traps)) for path in traps.rglob("*.sprung")]
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""The verb `loadtest`: a real run, its figures in three forms, and an exit code that says whether it held."""
+"""`catstream loadtest`: a real run, its figures in three forms, and an exit code that says whether it held."""
 
 from __future__ import annotations
 
@@ -52,7 +52,5 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
         (["--set", "run.lockstep=true"], "leave out lockstep"),
     ],
 )
-def test_contradictory_options_are_errors_before_the_start(said, tmp_path, arguments, message):
-    code, _, errors = said("loadtest", *arguments, cwd=tmp_path)
-    assert code in (1, 2)
-    assert message in " ".join(errors.split())
+def test_contradictory_options_are_errors_before_the_start(fail, tmp_path, arguments, message):
+    assert message in fail("loadtest", *arguments, cwd=tmp_path)

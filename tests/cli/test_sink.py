@@ -92,8 +92,7 @@ def test_repeated_frames_of_a_restarted_detector_are_skipped_and_another_run_end
     assert "310 tracks, 0 missed: the run had no end, and another one started" in errors
 
 
-def test_without_a_pipeline_no_file_is_left(said, tmp_path):
-    code, _, errors = said("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path, "--wait", 1)
-    assert code == 1
-    assert "is a pipeline running there?" in errors
+def test_without_a_pipeline_no_file_is_left(fail, tmp_path):
+    error = fail("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path, "--wait", 1)
+    assert "is a pipeline running there?" in error
     assert not (tmp_path / "tracks.csv").exists()

@@ -24,9 +24,8 @@ def folder(tmp_path, rng):
     return tmp_path / "photos"
 
 
-def test_the_images_of_a_folder_are_summarised_and_damaged_ones_named(folder, said, tmp_path):
-    code, _, errors = said("summary", folder, "-k", 3, cwd=tmp_path)
-    assert code == 0, errors
+def test_the_images_of_a_folder_are_summarised_and_damaged_ones_named(folder, succeed, tmp_path):
+    _, errors = succeed("summary", folder, "-k", 3, cwd=tmp_path)
     assert "skipped 7.png: not an image that can be read" in errors
     assert "3 of 9 images keep " in errors
     figures = json.loads((tmp_path / "summary.json").read_text())
@@ -40,9 +39,8 @@ def test_the_images_of_a_folder_are_summarised_and_damaged_ones_named(folder, sa
     assert "http" not in page
 
 
-def test_the_frames_of_a_recording_are_shown_with_the_pictures_of_its_video(whole_run, said, tmp_path):
-    code, _, errors = said("summary", whole_run / "rec", "-k", 4, cwd=tmp_path)
-    assert code == 0, errors
+def test_the_frames_of_a_recording_are_shown_with_the_pictures_of_its_video(whole_run, succeed, tmp_path):
+    succeed("summary", whole_run / "rec", "-k", 4, cwd=tmp_path)
     figures = json.loads((tmp_path / "summary.json").read_text())
     frames = [each["frame"] for each in figures["selected"]]
     assert len(frames) == 4
@@ -51,17 +49,15 @@ def test_the_frames_of_a_recording_are_shown_with_the_pictures_of_its_video(whol
     assert (tmp_path / "summary.html").read_text().count("<img ") == 4
 
 
-def test_the_frames_are_found_without_the_video(whole_run, said, tmp_path):
-    code, _, errors = said("summary", whole_run / "rec", "-k", 4, "--source", tmp_path / "gone.mp4", cwd=tmp_path)
-    assert code == 0, errors
+def test_the_frames_are_found_without_the_video(whole_run, succeed, tmp_path):
+    _, errors = succeed("summary", whole_run / "rec", "-k", 4, "--source", tmp_path / "gone.mp4", cwd=tmp_path)
     assert "the sheet has no pictures: there is no video or folder" in errors
     assert (tmp_path / "summary.html").read_text().count("no picture</div>") == 4
 
 
-def test_a_video_with_a_box_is_tracked(video, said, tmp_path):
+def test_a_video_with_a_box_is_tracked(video, succeed, tmp_path):
     source, box = video
-    code, _, errors = said("summary", source, "--box", box, "-k", 3, "--output", tmp_path / "frames.html")
-    assert code == 0, errors
+    _, errors = succeed("summary", source, "--box", box, "-k", 3, "--output", tmp_path / "frames.html")
     assert "The 3 of " in errors
     assert (tmp_path / "frames.html").read_text().count("<img ") == 3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames.html", "frames.json"]
@@ -78,27 +74,22 @@ def test_a_video_with_a_box_is_tracked(video, said, tmp_path):
         (["0"], "0 is a live source: record it to a video first"),
     ],
 )
-def test_bad_input_is_an_error_of_one_line_and_nothing_is_written(arguments, problem, folder, said, tmp_path):
+def test_bad_input_is_an_error_of_one_line_and_nothing_is_written(arguments, problem, folder, fail, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "old.html").write_text("old")
     before = sorted(tmp_path.rglob("*"))
-    code, _, errors = said("summary", *arguments, cwd=folder.parent)
-    assert code == 1
-    assert problem in errors.splitlines()[-1]
+    assert problem in fail("summary", *arguments, cwd=folder.parent)
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_an_object_that_is_not_in_the_run_is_an_error(whole_run, said, tmp_path):
-    code, _, errors = said("summary", whole_run / "rec", "--object", "ben", cwd=tmp_path)
-    assert code == 1
-    assert "the objects of this run are: the object without a name; give one of them with --object NAME" in errors
+def test_an_object_that_is_not_in_the_run_is_an_error(whole_run, fail, tmp_path):
+    error = fail("summary", whole_run / "rec", "--object", "ben", cwd=tmp_path)
+    assert "the objects of this run are: the object without a name; give one of them with --object NAME" in error
 
 
-def test_a_run_whose_objects_were_given_by_commands_is_not_tracked_again(video, said, tmp_path):
+def test_a_run_whose_objects_were_given_by_commands_is_not_tracked_again(video, fail, tmp_path):
     Job(video[0]).save(tmp_path)
-    code, _, errors = said("summary", tmp_path, cwd=tmp_path)
-    assert code == 1
-    assert "record it with `catstream track --record`" in errors
+    assert "record it with `catstream track --record`" in fail("summary", tmp_path, cwd=tmp_path)
 
 
 def test_an_interrupt_leaves_no_file(folder, said, tmp_path, monkeypatch):

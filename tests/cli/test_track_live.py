@@ -164,20 +164,15 @@ REJECTED = {
 
 
 @pytest.mark.parametrize(("options", "words"), REJECTED.values(), ids=REJECTED)
-def test_options_that_a_stream_does_not_support_are_rejected_before_anything_starts(said, tmp_path, options, words):
-    code, _, errors = said("track", LIVE, "--box", "10,10,20,20", *options, cwd=tmp_path)
-    assert code in (1, 2)
-    assert "Traceback" not in errors
-    assert words in " ".join(errors.split())
+def test_options_that_a_stream_does_not_support_are_rejected_before_anything_starts(fail, tmp_path, options, words):
+    assert words in fail("track", LIVE, "--box", "10,10,20,20", *options, cwd=tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_frames_of_a_stream_cannot_be_read_again_for_a_video(camera, said, story, tmp_path):
+def test_the_frames_of_a_stream_cannot_be_read_again_for_a_video(camera, fail, story, tmp_path):
     cam = camera(lambda _: story[0][0])
     with Pipeline(cam.url, story[0][1], state=tmp_path / "kept"):
         pass
     for run in ([cam.url, "--box", ",".join(map(str, story[0][1]))], ["--resume", tmp_path / "kept"]):
-        code, _, errors = said("track", *run, "--output", tmp_path / "out", "--video")
-        assert code == 2
-        assert "omit the video" in " ".join(errors.split())
+        assert "omit the video" in fail("track", *run, "--output", tmp_path / "out", "--video")
         assert not (tmp_path / "out").exists()

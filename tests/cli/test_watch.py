@@ -124,9 +124,8 @@ def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting
 
 
 @pytest.mark.parametrize(("channel", "word"), [("samples", "  levels "), ("health", "  counters ")])
-def test_without_a_terminal_each_message_is_one_line(resting, said, channel, word):
-    code, output, _ = said("watch", channel, "--count", 1, "--endpoint", resting.endpoint)
-    assert code == 0
+def test_without_a_terminal_each_message_is_one_line(resting, succeed, channel, word):
+    output, _ = succeed("watch", channel, "--count", 1, "--endpoint", resting.endpoint)
     (line,) = output.splitlines()
     assert word in line
 
@@ -180,10 +179,9 @@ def test_status_shows_all_processes(resting, said):
     assert all(name in output for name in NAMES)
 
 
-def test_status_has_a_json_form(resting, said, until):
+def test_status_has_a_json_form(resting, succeed, until):
     def at_rest():
-        code, output, _ = said("status", "--endpoint", resting.endpoint, "--json", "--wait", SECONDS)
-        assert code == 0
+        output, _ = succeed("status", "--endpoint", resting.endpoint, "--json", "--wait", SECONDS)
         return (found := json.loads(output))["frames_per_second"] == 0 and found
 
     found = until(at_rest)  # nobody takes its tracks
