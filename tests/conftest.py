@@ -104,6 +104,40 @@ def rng():
 
 
 @pytest.fixture
+def image(rng):
+    """Noise of 240 x 200 pixels."""
+    return rng.integers(0, 256, (200, 240, 3), np.uint8)
+
+
+@pytest.fixture
+def texture():
+    """A function that paints coloured blotches: uint8 (height, width, 3), each blotch about `cell` pixels wide."""
+    rng = np.random.default_rng(11)
+
+    def paint(height, width, cell):
+        coarse = rng.integers(0, 256, (height // cell + 1, width // cell + 1, 3), np.uint8)
+        return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+    return paint
+
+
+@pytest.fixture
+def scene(texture):
+    """A function that draws a frame with the object at (x, y), a share of it covered from the left, or without it."""
+    background, thing, cover = texture(240, 320, 20), texture(40, 48, 8), texture(40, 48, 4)
+
+    def draw(at=None, covered=0.0):
+        frame = background.copy()
+        if at is not None:
+            frame[at[1] : at[1] + 40, at[0] : at[0] + 48] = thing
+            edge = round(48 * covered)
+            frame[at[1] : at[1] + 40, at[0] : at[0] + edge] = cover[:, :edge]
+        return frame
+
+    return draw
+
+
+@pytest.fixture
 def folder():
     """A private folder with a name that is short enough for sockets."""
     with private_folder() as path:

@@ -10,7 +10,6 @@ import pytest
 
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
-from catstream.errors import SettingsError
 from catstream.messages.heads import GROUPS
 from catstream.messages.kinds import Features, ObjectFeatures, Position, TrainingRows
 from catstream.settings import Settings
@@ -131,8 +130,3 @@ def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, m
     assert not store.failing
     assert not store.trouble
     assert CheckpointStore(kept).load(SETTINGS).seq == 65
-
-
-def test_another_coreset_size_is_rejected_and_not_reported_as_damage(kept):
-    with pytest.raises(SettingsError, match="same settings"):
-        CheckpointStore(kept).load(SETTINGS.but({"coreset.size": 16}))

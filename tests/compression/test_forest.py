@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -61,12 +62,18 @@ def changed(message: Features, **changes: object) -> Features:
     return dataclasses.replace(message, objects={name: dataclasses.replace(part, **changes)})
 
 
+def merged(seq: int, **parts: Features) -> Features:
+    """One message of several objects, by name."""
+    objects = {name: message.objects[""] for name, message in parts.items()}
+    return Features(seq, seq - 1, (seq - 1) / 25, objects)
+
+
 def take(forest: Forest, messages: Iterator[Features], count: int) -> list[Sample]:
     return [sample for _ in range(count) for sample in forest.take(next(messages))]
 
 
 def assert_same(sample: Sample, other: Sample) -> None:
-    assert (sample.version, sample.frame) == (other.version, other.frame)
+    assert (sample.version, sample.frame, sample.object) == (other.version, other.frame, other.object)
     assert_array_equal(sample.centres, other.centres)
     assert sample.trees.keys() == other.trees.keys()
     for name, summary in sample.trees.items():
@@ -86,37 +93,32 @@ def test_each_row_is_inserted_into_the_tree_of_its_label(settings, messages):
     assert {name: tree.count for name, tree in sample.trees.items()} == counts
 
 
-def test_rows_of_the_loss_tree_give_the_loss_of_any_model(settings, messages, rng):
+def assert_gives_the_loss(tree: CoresetTree, model: np.ndarray, parts: list[TrainingRows], labels: np.ndarray) -> None:
     """||A [w; b; -1]||^2 is the weighted squared error, and C keeps it within the energy dropped."""
+    rows, weights = np.vstack([part.rows for part in parts]), np.concatenate([part.weights for part in parts])
+    loss = float(weights @ (rows @ model[:WIDTH] + model[WIDTH] - labels) ** 2)
+    kept = np.vstack([*(node.rows for node in tree.nodes), tree.pending]).astype(np.float64)
+    approximate = float(np.sum((kept @ model) ** 2))
+    assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
+
+
+def test_rows_of_the_loss_tree_give_the_loss_of_any_model_and_those_of_the_extent_tree_of_each_head(
+    settings, messages, rng
+):
     forest, seen = Forest(settings), [next(messages) for _ in range(60)]
     for message in seen:
         forest.take(message)
-    trained = [message.objects[""].training[APPEARANCE] for message in seen]
-    tree = forest.compressors[""].trees["loss"]
-    kept = np.vstack([*(node.rows for node in tree.nodes), tree.pending]).astype(np.float64)
+    trees = forest.compressors[""].trees
+    parts = [message.objects[""].training[APPEARANCE] for message in seen]
     for _ in range(10):
-        model = rng.normal(size=WIDTH + 2)
-        model[-1] = -1
-        loss = sum(float(m.weights @ (m.rows @ model[:-2] + model[-2] - m.labels) ** 2) for m in trained)
-        approximate = float(np.sum((kept @ model) ** 2))
-        assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
-
-
-def test_rows_of_the_extent_tree_give_the_loss_of_each_of_its_heads(settings, messages, rng):
-    forest, seen = Forest(settings), [next(messages) for _ in range(60)]
-    for message in seen:
-        forest.take(message)
-    trained = [message.objects[""].training[EXTENT] for message in seen]
-    tree = forest.compressors[""].trees[EXTENT]
-    kept = np.vstack([*(node.rows for node in tree.nodes), tree.pending]).astype(np.float64)
+        model = np.append(rng.normal(size=WIDTH + 1), -1)
+        assert_gives_the_loss(trees["loss"], model, parts, np.concatenate([part.labels for part in parts]))
+    parts = [message.objects[""].training[EXTENT] for message in seen]
+    labels = np.vstack([np.column_stack([part.labels, part.offsets]) for part in parts])
     for column in range(3):
         model = np.zeros(WIDTH + 4)
         model[: WIDTH + 1], model[WIDTH + 1 + column] = rng.normal(size=WIDTH + 1), -1
-        labels = [np.column_stack([m.labels, m.offsets])[:, column] for m in trained]
-        errors = [m.rows @ model[:WIDTH] + model[WIDTH] - y for m, y in zip(trained, labels, strict=True)]
-        loss = sum(float(m.weights @ error**2) for m, error in zip(trained, errors, strict=True))
-        approximate = float(np.sum((kept @ model) ** 2))
-        assert loss - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
+        assert_gives_the_loss(trees[EXTENT], model, parts, labels[:, column])
 
 
 def test_an_object_that_begins_again_has_new_trees(settings, messages):
@@ -155,16 +157,6 @@ def test_a_missing_message_is_an_error_and_is_still_accepted_later(settings, mes
     assert forest.seq == 2
 
 
-def test_rows_of_another_length_are_rejected_and_nothing_is_stored(settings, messages):
-    forest, (first, second) = Forest(settings), (next(messages), next(messages))
-    forest.take(first)
-    before = forest.counters()
-    with pytest.raises(ProtocolError, match="same settings"):
-        forest.take(changed(second, training={EXTENT: TrainingRows.labelled(np.ones((3, WIDTH - 1)), 1)}))
-    assert forest.counters() == before
-    forest.take(second)
-
-
 def test_frames_that_teach_nothing_count_as_seen(settings, messages):
     forest, message = Forest(settings), next(messages)
     forest.take(changed(message, training={}))
@@ -197,16 +189,18 @@ def test_centres_are_sent_in_whole_blocks_with_nan_for_absent_objects(settings, 
             assert_allclose(centre, (frame + 10, 25) if frame % 5 else (np.nan, np.nan))
 
 
+@pytest.mark.parametrize("names", [[""], ["anna", "ben"]], ids=["one", "two"])
 @pytest.mark.parametrize("count", [0, 1, 37])
-def test_a_saved_forest_continues_bit_for_bit(settings, messages, count, tmp_path):
+def test_a_saved_forest_continues_bit_for_bit(settings, messages, names, count, tmp_path):
+    stream = (merged(seq, **{name: next(messages) for name in names}) for seq in itertools.count(1))
     forest = Forest(settings)
-    take(forest, messages, count)
+    take(forest, stream, count)
     forest.save(tmp_path / "state")
     loaded = Forest.load(tmp_path / "state", settings)
+    assert list(loaded.compressors) == (names if count else [])
     assert loaded.counters() == forest.counters()
     assert_equal(dataclasses.asdict(loaded.position), dataclasses.asdict(forest.position))
-    for _ in range(40):
-        message = next(messages)
+    for message in itertools.islice(stream, 40):
         for sample, again in zip(forest.take(message), loaded.take(message), strict=True):
             assert_same(sample, again)
 
@@ -242,71 +236,43 @@ def test_memory_is_flat_between_doublings(settings, messages):
     assert forest.counters()["bytes"] < 2.5 * small
 
 
-@pytest.mark.parametrize("share", [0, 0.2, 0.9])
-def test_an_incomplete_state_is_rejected(settings, messages, share, tmp_path):
-    forest, path = Forest(settings), tmp_path / "state"
-    take(forest, messages, 37)
-    forest.save(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ProtocolError, match="use an older copy"):
-        Forest.load(path, settings)
-
-
 @pytest.mark.parametrize(("energy", "level"), [("0x1p9999", 0), ("nan", 0), ("0x1p3", 10**9)])
 def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path):
     """Its checksum fits: whoever writes one on purpose sees to that."""
     forest, path = Forest(settings), tmp_path / "state"
     take(forest, messages, 37)
-    forest.save(path)
-    arrays, metadata = storage.read(path)
+    arrays, metadata = forest.state()
     metadata["objects"][0]["trees"]["object"]["nodes"][0] |= {"level": level, "energy": energy}
-    storage.write(path, arrays, metadata)
+    storage.write(path, arrays, metadata | {"kind": "forest 2"})
     with pytest.raises(ProtocolError, match="use an older copy"):
         Forest.load(path, settings)
 
 
-def test_a_tree_is_no_forest(settings, tmp_path):
-    Compressor(settings).trees["object"].save(tmp_path / "tree")
-    with pytest.raises(ServiceError, match="is of kind None, this catstream reads 'forest 2'"):
-        Forest.load(tmp_path / "tree", settings)
-
-
-def test_a_checkpoint_of_another_version_is_rejected_with_one_line(settings, messages, tmp_path):
-    forest, path = Forest(settings), tmp_path / "000000000001.safetensors"
-    take(forest, messages, 37)
-    arrays, metadata = forest.state()
-    storage.write(path, arrays, metadata | {"kind": "compressor 1"})
-    with pytest.raises(ServiceError, match="is of kind 'compressor 1', this catstream reads 'forest 2'") as error:
+@pytest.mark.parametrize("kind", [None, "compressor 1"])
+def test_a_file_of_another_kind_or_version_is_rejected_with_one_line(settings, kind, tmp_path):
+    arrays, metadata = Forest(settings).state()
+    storage.write(tmp_path / "000000000001.safetensors", arrays, metadata | ({"kind": kind} if kind else {}))
+    with pytest.raises(ServiceError, match=rf"is of kind {kind!r}, this catstream reads 'forest 2'") as error:
         CheckpointStore(tmp_path).load(settings)
     assert "\n" not in str(error.value)
 
 
-def test_a_state_of_another_coreset_size_is_rejected(settings, messages, tmp_path):
-    forest = Forest(settings)
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [("size", "same settings"), ("reduction", r"holds trees of coreset.reduction=.*same settings")],
+)
+def test_a_state_of_other_trees_is_rejected_and_not_reported_as_damage(settings, messages, other, message, tmp_path):
+    store, forest = CheckpointStore(tmp_path), Forest(settings)
     take(forest, messages, 37)
-    forest.save(tmp_path / "state")
-    with pytest.raises(SettingsError, match="same settings"):
-        Forest.load(tmp_path / "state", settings.but({"coreset.size": 16}))
-
-
-def test_a_state_of_another_reduction_is_rejected(settings, messages, tmp_path):
-    forest = Forest(settings)
-    take(forest, messages, 37)
-    forest.save(tmp_path / "state")
-    (other,) = REDUCTIONS.keys() - {settings.coreset.reduction}
-    with pytest.raises(SettingsError, match=r"holds trees of coreset.reduction=.*same settings"):
-        Forest.load(tmp_path / "state", settings.but({"coreset.reduction": other}))
-
-
-def merged(seq: int, **parts: Features) -> Features:
-    """One message of several objects, by name."""
-    objects = {name: message.objects[""] for name, message in parts.items()}
-    return Features(seq, seq - 1, (seq - 1) / 25, objects)
+    store.save(forest)
+    (reduction,) = REDUCTIONS.keys() - {settings.coreset.reduction}
+    with pytest.raises(SettingsError, match=message):
+        store.load(settings.but({f"coreset.{other}": {"size": 16, "reduction": reduction}[other]}))
+    assert not store.trouble
 
 
 def test_an_object_of_several_is_learned_as_alone(settings, messages):
-    """Only the numbers of its samples differ: all objects share one count."""
+    """Only the numbers of its samples and its name differ: all objects share one count."""
     several, anna, ben = Forest(settings), Forest(settings), Forest(settings)
     found: dict[str, list[Sample]] = {"anna": [], "ben": []}
     alone: dict[str, list[Sample]] = {"anna": [], "ben": []}
@@ -322,7 +288,7 @@ def test_an_object_of_several_is_learned_as_alone(settings, messages):
     assert versions[-1] == several.version == several.counters()["version"]
     for name in found:
         for sample, other in zip(found[name], alone[name], strict=True):
-            assert_same(dataclasses.replace(sample, version=other.version), other)
+            assert_same(dataclasses.replace(sample, version=other.version, object=""), other)
 
 
 def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, messages):
@@ -336,26 +302,14 @@ def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, m
     assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3, "those of one frame"
 
 
-def test_rows_of_another_length_of_one_object_leave_the_others_unchanged(settings, messages):
+@pytest.mark.parametrize("other", [{}, {"anna"}], ids=["alone", "of two"])
+def test_rows_of_another_length_are_rejected_and_nothing_of_any_object_is_stored(settings, messages, other):
     forest = Forest(settings)
-    forest.take(merged(1, anna=next(messages), ben=next(messages)))
+    first, second = ({name: next(messages) for name in (*other, "ben")} for _ in range(2))
+    forest.take(merged(1, **first))
     before = forest.object_counters()
-    bad = changed(next(messages), training={EXTENT: TrainingRows.labelled(np.ones((3, WIDTH - 1)), 1)})
+    bad = changed(second["ben"], training={EXTENT: TrainingRows.labelled(np.ones((3, WIDTH - 1)), 1)})
     with pytest.raises(ProtocolError, match="same settings"):
-        forest.take(merged(2, anna=next(messages), ben=bad))
-    assert forest.object_counters() == before
-    assert forest.seq == 1
-
-
-def test_a_saved_forest_of_several_objects_continues_bit_for_bit(settings, messages, tmp_path):
-    forest = Forest(settings)
-    for seq in range(1, 38):
-        forest.take(merged(seq, anna=next(messages), ben=next(messages)))
-    forest.save(tmp_path / "state")
-    loaded = Forest.load(tmp_path / "state", settings)
-    assert list(loaded.compressors) == ["anna", "ben"]
-    for seq in range(38, 70):
-        message = merged(seq, anna=next(messages), ben=next(messages))
-        for sample, again in zip(forest.take(message), loaded.take(message), strict=True):
-            assert_same(sample, again)
-            assert sample.object == again.object
+        forest.take(merged(2, **second | {"ben": bad}))
+    assert (forest.object_counters(), forest.seq) == (before, 1)
+    forest.take(merged(2, **second))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from catstream.compression.reduce import energy, shrink
 from catstream.compression.tree import CoresetTree, FrequentDirections
@@ -22,26 +22,18 @@ from catstream.errors import ProtocolError
 SIZE = 16
 ROUNDING = 1e-5  # of float32, relative to ||A||^2
 
-counts = st.integers(0, 90)
-seeds = st.integers(0, 2**32 - 1)
 
-
-def sketched(rows: np.ndarray, size: int = SIZE) -> FrequentDirections:
-    sketch = FrequentDirections(size)
+def sketched(rows: np.ndarray) -> FrequentDirections:
+    sketch = FrequentDirections(SIZE)
     sketch.insert(rows)
     return sketch
 
 
-def in_memory(sketch: FrequentDirections) -> np.ndarray:
-    """All rows in memory, C."""
-    return np.vstack([*(node.rows for node in sketch.nodes), sketch.pending])
-
-
 def assert_within_the_bound(sketch: FrequentDirections, rows: np.ndarray) -> None:
-    kept, slack = in_memory(sketch).astype(np.float64), ROUNDING * energy(rows)
+    kept, slack = np.vstack([*(node.rows for node in sketch.nodes), sketch.pending]), ROUNDING * energy(rows)
     exact = rows.astype(np.float64)
     _, lengths, basis = np.linalg.svd(exact, full_matrices=False)
-    kept = kept @ basis.T  # in the span of A, which has all rows of C
+    kept = kept.astype(np.float64) @ basis.T  # in the span of A, which has all rows of C
     errors = np.linalg.eigvalsh(np.diag(lengths**2) - kept.T @ kept)  # the least and the largest are of unit vectors y
     assert -slack <= errors[0]
     assert errors[-1] <= sketch.dropped_energy / (SIZE + 1) + slack
@@ -67,41 +59,12 @@ def test_a_rank_below_n_loses_nothing(rng):
     assert_allclose(sketched(rows).dropped_energy, 0, atol=ROUNDING * energy(rows))
 
 
-@given(counts, seeds)
-def test_sums_counts_and_leaves_are_exact(count, seed):
-    rows = np.random.default_rng(seed).integers(-9, 10, (count, 6)).astype(np.float32)
-    sketch = sketched(rows, size=4)
-    assert (sketch.rows_seen, sketch.leaves) == (count, count // 4)
-    assert_array_equal(sketch.sum, rows.sum(axis=0, dtype=np.float64) if count else 0)
-
-
 def test_memory_does_not_grow_with_the_rows(rng):
     sketch, sizes = FrequentDirections(4), set()
     for _ in range(300):
         sketch.insert(rng.normal(size=(4, 7)))
         sizes.add(sketch.nbytes)
     assert len(sizes) == 1
-
-
-@given(st.lists(st.integers(0, 20), max_size=12), seeds)
-def test_same_rows_same_bits_however_they_are_cut(cuts, seed):
-    rows = np.random.default_rng(seed).normal(size=(sum(cuts), 33)).astype(np.float32)
-    sketch = FrequentDirections(4)
-    for part in np.split(rows, np.cumsum(cuts)):
-        sketch.insert(part)
-    assert_array_equal(in_memory(sketch), in_memory(sketched(rows, size=4)))
-
-
-@pytest.mark.parametrize("count", [0, 3, 64, 103])
-def test_a_saved_sketch_continues_bit_for_bit_as_a_sketch(stream, count, tmp_path):
-    sketch = sketched(stream[:count])
-    sketch.save(tmp_path / "sketch")
-    loaded = CoresetTree.load(tmp_path / "sketch")
-    assert type(loaded) is FrequentDirections
-    for each in (sketch, loaded):
-        each.insert(stream[count:])
-    assert_array_equal(in_memory(loaded), in_memory(sketch))
-    assert (loaded.rows_seen, loaded.dropped_energy) == (sketch.rows_seen, sketch.dropped_energy)
 
 
 def test_a_count_that_is_not_that_of_its_level_is_rejected(stream):
@@ -118,7 +81,7 @@ def test_a_sketch_and_a_tree_are_not_merged(stream):
         tree.merge(sketched(stream))
 
 
-@given(seeds, st.integers(1, 7))
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7))
 def test_shrinking_takes_the_same_energy_from_each_direction(seed, size):
     rows = np.random.default_rng(seed).normal(size=(8, 12)).astype(np.float32)
     squares = np.linalg.svd(rows.astype(np.float64), compute_uv=False) ** 2

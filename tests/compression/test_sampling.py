@@ -81,10 +81,6 @@ def test_means_and_counts_are_those_of_all_rows_pending_ones_too(stream):
     assert summary.levels == (3, 2)
 
 
-def test_same_rows_same_bits(stream):
-    assert_array_equal(grown(stream).sample().rows, grown(stream.copy()).sample().rows)
-
-
 @given(st.lists(st.integers(0, 40), max_size=12), st.integers(0, 2**32 - 1))
 def test_a_sample_after_many_others_is_that_of_a_tree_that_made_none(cuts, seed):
     rows = np.random.default_rng(seed).normal(size=(sum(cuts), 9)).astype(np.float32)

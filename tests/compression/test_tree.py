@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from catstream.compression.reduce import energy
-from catstream.compression.tree import CoresetTree
+from catstream.compression.tree import REDUCTIONS, CoresetTree
 from catstream.errors import ProtocolError
 
 SIZE = 16
@@ -28,10 +28,11 @@ ROUNDING = 1e-5  # of float32, relative to ||A||^2
 
 counts = st.integers(0, 90)
 seeds = st.integers(0, 2**32 - 1)
+KINDS = pytest.mark.parametrize("kind", REDUCTIONS.values(), ids=REDUCTIONS)
 
 
-def grown(rows: np.ndarray, size: int = SIZE) -> CoresetTree:
-    tree = CoresetTree(size)
+def grown(rows: np.ndarray, size: int = SIZE, kind: type[CoresetTree] = CoresetTree) -> CoresetTree:
+    tree = kind(size)
     tree.insert(rows)
     return tree
 
@@ -52,12 +53,15 @@ def bits(tree: CoresetTree) -> dict[str, bytes]:
 
 
 def assert_within_the_bound(tree, rows, subspaces, squared_distance):
+    """Distances are within the bound; kept and dropped energy add up to all of it."""
     levels, dropped, slack = tree.nodes[0].level, tree.dropped_energy, ROUNDING * energy(rows)
     for basis in subspaces:
         k = basis.shape[1]
         truth, approximation = squared_distance(rows, basis), squared_distance(summary(tree), basis)
         assert truth - dropped - slack <= approximation <= truth + slack
         assert truth - slack <= approximation + dropped <= (1 + levels * k / (SIZE - k + 1)) * truth + slack
+    assert tree.rows_seen == len(rows)
+    assert_allclose(energy(summary(tree)) + dropped, energy(rows), rtol=1e-12)
 
 
 # --- what it keeps ---------------------------------------------------------------------------------
@@ -65,11 +69,6 @@ def assert_within_the_bound(tree, rows, subspaces, squared_distance):
 
 def test_distances_to_subspaces_stay_within_the_bound(stream, subspaces, squared_distance):
     assert_within_the_bound(grown(stream), stream, subspaces, squared_distance)
-
-
-def test_kept_and_dropped_energy_add_up_to_all_of_it(stream):
-    tree = grown(stream)
-    assert_allclose(energy(summary(tree)) + tree.dropped_energy, energy(stream), rtol=1e-12)
 
 
 def test_a_stream_that_stands_still_loses_nothing(rng):
@@ -80,11 +79,12 @@ def test_a_stream_that_stands_still_loses_nothing(rng):
     assert_allclose(tree.nodes[0].rows[0], np.sqrt(len(rows)) * rows[0], rtol=ROUNDING)
 
 
+@KINDS
 @given(counts, seeds)
-def test_sums_and_counts_are_exact(count, seed):
+def test_sums_counts_and_leaves_are_exact(kind, count, seed):
     rows = whole_numbers(count, seed)
-    tree = grown(rows, size=4)
-    assert tree.rows_seen == count
+    tree = grown(rows, 4, kind)
+    assert (tree.rows_seen, tree.leaves) == (count, count // 4)
     assert_array_equal(tree.sum, rows.sum(axis=0, dtype=np.float64) if count else 0)
 
 
@@ -120,13 +120,14 @@ def test_memory_grows_with_the_logarithm_of_the_rows(rng):
 # --- the same, however it comes ------------------------------------------------------------------------
 
 
+@KINDS
 @given(st.lists(st.integers(0, 20), max_size=12), seeds)
-def test_same_rows_same_bits_however_they_are_cut(cuts, seed):
+def test_same_rows_same_bits_however_they_are_cut(kind, cuts, seed):
     rows = np.random.default_rng(seed).normal(size=(sum(cuts), 33)).astype(np.float32)
-    tree = CoresetTree(4)
+    tree = kind(4)
     for part in np.split(rows, np.cumsum(cuts)):
         tree.insert(part)
-    assert bits(tree) == bits(grown(rows, size=4))
+    assert bits(tree) == bits(grown(rows, 4, kind))
 
 
 def test_a_tree_keeps_no_reference_to_inserted_rows(stream):
@@ -136,11 +137,11 @@ def test_a_tree_keeps_no_reference_to_inserted_rows(stream):
     assert bits(tree) == bits(other)
 
 
-def test_two_trees_merged_are_one_tree_within_the_bound(stream, subspaces, squared_distance):
-    tree, other = grown(stream[:75]), grown(stream[75:])
-    tree.merge(other)
-    assert tree.rows_seen == len(stream)
-    assert_allclose(energy(summary(tree)) + tree.dropped_energy, energy(stream), rtol=1e-12)
+@pytest.mark.parametrize(("merged", "end"), [(75, 208), (50, 90)], ids=["the rest", "a part"])
+def test_two_trees_merged_are_one_tree_within_the_bound(stream, subspaces, squared_distance, merged, end):
+    tree = grown(stream[:merged])
+    tree.merge(grown(stream[merged:end]))
+    tree.insert(stream[end:])
     assert_within_the_bound(tree, stream, subspaces, squared_distance)
 
 
@@ -156,24 +157,18 @@ def test_merging_keeps_the_form_of_a_tree(count, other_count, seed):
     assert bits(other) == before
 
 
-def test_a_merged_tree_continues(stream):
-    tree = grown(stream[:50])
-    tree.merge(grown(stream[50:90]))
-    tree.insert(stream[90:])
-    assert tree.rows_seen == len(stream)
-    assert_allclose(energy(summary(tree)) + tree.dropped_energy, energy(stream), rtol=1e-12)
-
-
 # --- on disk --------------------------------------------------------------------------------------------
 
 
+@KINDS
 @pytest.mark.parametrize("count", [0, 3, 64, 103])
-def test_a_saved_tree_continues_bit_for_bit(stream, count, tmp_path):
-    tree = grown(stream[:count])
+def test_a_saved_tree_continues_bit_for_bit(stream, count, kind, tmp_path):
+    tree = grown(stream[:count], kind=kind)
     tree.save(tmp_path / "tree")
     loaded = CoresetTree.load(tmp_path / "tree")
-    tree.insert(stream[count:])
-    loaded.insert(stream[count:])
+    assert type(loaded) is kind
+    for each in (tree, loaded):
+        each.insert(stream[count:])
     assert bits(loaded) == bits(tree)
 
 
@@ -181,31 +176,6 @@ def test_the_same_tree_makes_the_same_file(stream, tmp_path):
     for name in ("one", "two"):
         grown(stream).save(tmp_path / name)
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
-
-
-@pytest.mark.parametrize("share", [0, 0.01, 0.3, 0.99])
-def test_an_incomplete_file_is_an_error(stream, share, tmp_path):
-    path = tmp_path / "tree"
-    grown(stream).save(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ProtocolError, match="use an older copy"):
-        CoresetTree.load(path)
-
-
-@given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4))
-def test_a_damaged_file_is_rejected_unless_the_tree_in_it_is_intact(tmp_path_factory, damage):
-    path, tree = tmp_path_factory.mktemp("damaged") / "tree", grown(whole_numbers(14, seed=0), size=4)
-    tree.save(path)
-    content = bytearray(path.read_bytes())
-    for place, byte in damage:
-        content[int(place * len(content))] = byte
-    path.write_bytes(content)
-    try:
-        loaded = CoresetTree.load(path)
-    except ProtocolError:
-        return
-    assert bits(loaded) == bits(tree)
 
 
 def test_a_damaged_size_takes_no_memory(stream):

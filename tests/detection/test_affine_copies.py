@@ -12,11 +12,6 @@ from catstream.features.pyramid import Pyramid
 WINDOW = Window(64, 48, 64, 64)
 
 
-@pytest.fixture
-def image(rng):
-    return rng.integers(0, 256, (200, 240, 3), np.uint8)
-
-
 def copies(image, window, count, seed=0, **how):
     return affine_copies(Pyramid.of(image), window, count, np.random.default_rng(seed), **how)
 

@@ -9,7 +9,7 @@ from catstream.detection import extent, teacher
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW as WINDOW_CELLS
 from catstream.features.pyramid import Pyramid
-from catstream.messages.heads import ASPECT, EXTENT, GROUPS, HEADS, SIZE
+from catstream.messages.heads import ASPECT, EXTENT, HEADS, SIZE
 from catstream.numerics import ridge
 from catstream.settings import ExtentSettings, Settings
 from catstream.tracker import Tracker
@@ -48,16 +48,6 @@ def test_in_a_frame_that_does_not_change_the_box_keeps_its_size(draw):
     for _ in range(8):
         _, box = tracker.update(image)
     assert box.area == pytest.approx(truth.area, rel=0.04)
-
-
-@pytest.mark.parametrize("moved", [0.0, 0.9])
-def test_the_first_frame_fills_a_leaf_of_each_tree(draw, moved):
-    image, box = draw(60, 60)
-    settings = Settings(teaching={"other_backgrounds": moved})
-    window = Window.around(box, settings.search.context)
-    _, training = teacher.first_training(Pyramid.of(image), window, np.random.default_rng(0), settings)
-    assert set(training) == set(GROUPS)
-    assert min(map(len, training.values())) >= settings.coreset.size
 
 
 @pytest.mark.parametrize("steps", [-2, -1, 1, 2])

@@ -16,11 +16,6 @@ from catstream.messages.kinds import Model
 from catstream.settings import ExtentSettings
 
 
-@pytest.fixture
-def image(rng):
-    return rng.integers(0, 256, (200, 240, 3), np.uint8)
-
-
 def test_cells_around_a_window_are_those_of_the_frame(image):
     scores, frames = ScoreMap.around(Pyramid(image), Window(64, 48, 64, 64), 12, None), Cells.of(image)
     np.testing.assert_array_equal(scores.cells.grid, frames.grid[4:16, 6:18])

@@ -11,11 +11,6 @@ from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region, planes_of
 
 
-@pytest.fixture
-def image(rng):
-    return rng.integers(0, 256, (200, 240, 3), np.uint8)
-
-
 @pytest.mark.parametrize(("scale", "wide"), [(0.3, 1), (1.99, 1), (2.0, 2), (3.9, 2), (4.0, 4), (9.0, 8)])
 def test_a_pixel_is_as_wide_as_may_be_and_no_wider(rng, scale, wide):
     image, step = Pyramid(rng.integers(0, 256, (64, 96, 3), np.uint8)).near(scale)

@@ -15,26 +15,6 @@ from catstream.video import demo
 START = Box(60, 50, 48, 40)
 
 
-@pytest.fixture
-def scene(rng):
-    """A function that draws a frame with the object at (x, y), a share of it covered from the left."""
-
-    def texture(height, width, cell):
-        coarse = rng.integers(0, 256, (height // cell + 1, width // cell + 1, 3), np.uint8)
-        return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-
-    background, thing, cover = texture(240, 320, 20), texture(40, 48, 8), texture(40, 48, 4)
-
-    def draw(x, y, covered=0.0):
-        frame = background.copy()
-        frame[y : y + 40, x : x + 48] = thing
-        edge = round(48 * covered)
-        frame[y : y + 40, x : x + edge] = cover[:, :edge]
-        return frame
-
-    return draw
-
-
 def followed(frames, start, seed=0):
     frames = iter(frames)
     model = SparseCollaborativeModel(next(frames), start, np.random.default_rng(seed), particles=100)
@@ -65,32 +45,32 @@ def test_the_demos_object_is_followed():
 
 
 def test_a_half_covered_object_is_tracked(scene):
-    ways = [(60 + 2 * i, 50 + i, 0.4 if 4 <= i < 12 else 0.0) for i in range(16)]
+    ways = [((60 + 2 * i, 50 + i), 0.4 if 4 <= i < 12 else 0.0) for i in range(16)]
     found = followed(itertools.starmap(scene, ways), START)
-    overlaps = [box.overlap(Box(x, y, 48, 40)) for (_, box), (x, y, _) in zip(found, ways[1:], strict=True)]
+    overlaps = [box.overlap(Box(*at, 48, 40)) for (_, box), (at, _) in zip(found, ways[1:], strict=True)]
     assert min(overlaps) > 0.5
 
 
 def test_the_score_falls_if_the_object_is_absent(scene):
-    (there, _), (gone, _) = followed([scene(60, 50), scene(62, 51), scene(250, 180)], START)
+    (there, _), (gone, _) = followed([scene((60, 50)), scene((62, 51)), scene((250, 180))], START)
     assert there > 0.6 > 0.5 > gone
 
 
 def test_a_covered_object_teaches_nothing(scene, rng):
-    model = SparseCollaborativeModel(scene(60, 50), START, rng)._generative
+    model = SparseCollaborativeModel(scene((60, 50)), START, rng)._generative
     before = model.histogram
     model.update(rng.integers(0, 256, (32, 32), np.uint8))
     assert model.histogram is before
 
 
 def test_grey_frames_are_followed_as_those_in_colour(scene):
-    frames = [scene(60 + 3 * i, 50 + 2 * i) for i in range(7)]
+    frames = [scene((60 + 3 * i, 50 + 2 * i)) for i in range(7)]
     grey = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
     assert followed(grey, START) == followed(frames, START)
 
 
 def test_the_same_seed_gives_the_same_boxes_and_another_others(scene):
-    frames = [scene(60 + 3 * i, 50 + 2 * i) for i in range(7)]
+    frames = [scene((60 + 3 * i, 50 + 2 * i)) for i in range(7)]
     assert followed(frames, START, seed=1) == followed(frames, START, seed=1) != followed(frames, START, seed=2)
 
 
@@ -100,5 +80,5 @@ def test_a_frame_without_any_contrast_is_survived():
 
 
 def test_an_object_that_leaves_stays_a_box_in_the_frame(scene):
-    frames = [np.roll(scene(60, 50), -8 * i, axis=1)[:, :160] for i in range(12)]
+    frames = [np.roll(scene((60, 50)), -8 * i, axis=1)[:, :160] for i in range(12)]
     assert all(0 <= box.centre[0] < 160 for _, box in followed(frames, START))

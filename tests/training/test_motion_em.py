@@ -32,22 +32,13 @@ def oracle(centres: np.ndarray, motion: motion_em.Motion | None = None) -> pykal
     )
 
 
-def agree(centres: np.ndarray, iterations: int = 10) -> None:
-    learned = learn_motion(centres, iterations)
-    expected = oracle(centres).em(np.ma.masked_invalid(centres), n_iter=iterations)
-    assert learned is not None
+@pytest.mark.parametrize("missing", [0, 20])
+def test_the_motion_model_agrees_with_pykalman_also_if_centres_are_missing(rng, missing):
+    centres = walk(rng)
+    centres[rng.permutation(62)[:missing] + 1] = np.nan
+    learned, expected = learn_motion(centres, 10), oracle(centres).em(np.ma.masked_invalid(centres), n_iter=10)
     assert_allclose(learned.process, expected.transition_covariance, rtol=1e-6, atol=1e-6)
     assert_allclose(learned.observation, expected.observation_covariance, rtol=1e-6, atol=1e-6)
-
-
-def test_agrees_with_pykalman(rng):
-    agree(walk(rng))
-
-
-def test_the_motion_model_agrees_with_pykalman_if_centres_are_missing(rng):
-    centres = walk(rng)
-    centres[rng.permutation(62)[:20] + 1] = np.nan
-    agree(centres)
 
 
 def test_frames_before_the_first_and_after_the_last_centre_change_nothing(rng):
@@ -97,12 +88,8 @@ def test_twice_the_scale_gives_four_times_the_covariances(rng):
     assert_allclose(doubled.observation, 4 * motion.observation, rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize("count", [0, 1, FEWEST - 1])
-def test_too_few_centres_give_nothing(rng, count):
-    centres = np.full((64, 2), np.nan)
+@pytest.mark.parametrize(("frames", "count"), [(0, 0), (64, 0), (64, 1), (64, FEWEST - 1)])
+def test_too_few_centres_give_nothing(rng, frames, count):
+    centres = np.full((frames, 2), np.nan)
     centres[3 : 3 + count] = rng.normal(size=(count, 2))
     assert learn_motion(centres) is None
-
-
-def test_no_frames_give_nothing():
-    assert learn_motion(np.empty((0, 2))) is None

@@ -23,6 +23,18 @@ def sample():
     return Compressor(settings).take(0, features, 1)
 
 
+def with_tree(sample, name, summary):
+    return dataclasses.replace(sample, trees=sample.trees | {name: summary})
+
+
+@pytest.fixture
+def cuts(sample, rng):
+    """Random rows of cuts with random labels of extent, size and aspect: rows, labels, and the sample with them."""
+    x, labels = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=(40, 3))
+    rows = np.column_stack([x, np.ones(40), labels]).astype(np.float32)
+    return x, labels, with_tree(sample, "extent", Summary(rows, rows.mean(axis=0), 40, (0,)))
+
+
 @pytest.mark.parametrize("classifier", ["joint", "least-squares", "one-class"])
 def test_the_score_is_0_at_the_backgrounds_mean_and_1_at_the_objects(sample, classifier):
     model = Trainer(Settings(teaching={"classifier": classifier})).train(sample)
@@ -39,9 +51,7 @@ def test_the_same_sample_gives_the_same_bits(sample):
 
 def test_a_model_does_not_depend_on_the_samples_before_it(sample, rng):
     rows = rng.normal(size=sample.trees["extent"].rows.shape).astype(np.float32)
-    other = dataclasses.replace(
-        sample, trees=sample.trees | {"extent": dataclasses.replace(sample.trees["extent"], rows=rows)}
-    )
+    other = with_tree(sample, "extent", dataclasses.replace(sample.trees["extent"], rows=rows))
     trainer = Trainer(Settings())
     for each in (sample, other, dataclasses.replace(other, object="anna"), other, sample):
         model, alone = trainer.train(each), Trainer(Settings()).train(each)
@@ -57,38 +67,29 @@ def test_centres_give_a_motion(sample):
     assert Trainer(Settings()).train(sample).motion is None
 
 
-def test_the_sum_of_score_and_extent_predicts_how_well_a_cut_fits(sample, rng):
-    x, fits = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=40)
-    rows = np.column_stack([x, np.ones(40), fits, np.full((40, 2), 0.5)]).astype(np.float32)
-    cuts = Summary(rows, rows.mean(axis=0), 40, (0,))
-    model = Trainer(Settings()).train(dataclasses.replace(sample, trees=sample.trees | {"extent": cuts}))
-    together = x @ (model.weights + model.heads["extent"])
+def test_the_sum_of_score_and_extent_predicts_how_well_a_cut_fits(cuts):
+    x, labels, sample = cuts
+    model = Trainer(Settings()).train(sample)
+    together, fits = x @ (model.weights + model.heads["extent"]), labels[:, 0]
     np.testing.assert_allclose(together - together.mean(), fits - fits.mean(), atol=1e-2)
 
 
-@pytest.mark.parametrize("name", ["size", "aspect"])
-def test_the_heads_of_size_and_aspect_predict_their_label(sample, rng, name):
-    x, labels = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=(40, 3))
-    rows = np.column_stack([x, np.ones(40), labels]).astype(np.float32)
-    model = Trainer(Settings()).train(
-        dataclasses.replace(sample, trees=sample.trees | {"extent": Summary(rows, rows.mean(axis=0), 40, (0,))})
-    )
-    label = labels[:, ["extent", "size", "aspect"].index(name)]
-    np.testing.assert_allclose(x @ model.heads[name] + model.biases[name], label, atol=1e-2)
+def test_the_heads_of_size_and_aspect_predict_their_label(cuts):
+    x, labels, sample = cuts
+    model = Trainer(Settings()).train(sample)
+    for name, label in (("size", labels[:, 1]), ("aspect", labels[:, 2])):
+        np.testing.assert_allclose(x @ model.heads[name] + model.biases[name], label, atol=1e-2)
 
 
 def test_an_object_like_the_background_is_rejected(sample):
-    same = dataclasses.replace(sample, trees=sample.trees | {"object": sample.trees["background"]})
     with pytest.raises(ProtocolError, match="give another box"):
-        Trainer(Settings()).train(same)
+        Trainer(Settings()).train(with_tree(sample, "object", sample.trees["background"]))
 
 
 def test_a_direction_in_which_the_object_scores_lower_gives_way_to_the_one_between_the_means(sample):
     """The rows of a tiny coreset may lie beyond the background, seen from the mean of all they stand for."""
-    mirrored = dataclasses.replace(
-        sample.trees["object"], rows=2 * sample.trees["background"].mean - sample.trees["object"].rows
-    )
-    few = dataclasses.replace(sample, trees=sample.trees | {"object": mirrored})
+    there, background = sample.trees["object"], sample.trees["background"].mean
+    few = with_tree(sample, "object", dataclasses.replace(there, rows=2 * background - there.rows))
     model = Trainer(Settings(teaching={"classifier": "one-class"})).train(few)
     between = Trainer(Settings(teaching={"classifier": "least-squares"})).train(few)
     np.testing.assert_allclose(model.weights, between.weights, atol=1e-6)  # BLAS need not round the same twice
