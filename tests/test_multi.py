@@ -41,10 +41,21 @@ def frames():
     return [drawn(number) for number in range(14)]
 
 
-def followed(frames, names):
-    tracker = MultiTracker()
+def started(frames, names=("anna",), settings=None):
+    tracker = MultiTracker(settings)
     tracker.init(frames[0], {name: box_of(name, 0) for name in names})
+    return tracker
+
+
+def followed(frames, names):
+    tracker = started(frames, names)
     return [tracker.update(frame) for frame in frames[1:]]
+
+
+@pytest.fixture(scope="module")
+def together(frames):
+    """The tracks of all three."""
+    return followed(frames, STEPS)
 
 
 def without_version(track):
@@ -52,16 +63,15 @@ def without_version(track):
     return replace(track, model_version=0)
 
 
-def test_every_object_is_followed(frames):
-    for number, tracks in enumerate(followed(frames, STEPS), start=1):
+def test_every_object_is_followed(together):
+    for number, tracks in enumerate(together, start=1):
         assert list(tracks) == list(STEPS)
         for name, track in tracks.items():
             assert (track.object, track.seq, track.frame) == (name, number + 1, number)
             assert track.box.overlap(box_of(name, number)) > 0.6
 
 
-def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames):
-    together = followed(frames, STEPS)
+def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames, together):
     for name in STEPS:
         alone = followed(frames, [name])
         assert [without_version(tracks[name]) for tracks in together] == [
@@ -69,12 +79,11 @@ def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames):
         ]
 
 
-def test_the_tracks_do_not_depend_on_the_number_of_cores(frames, monkeypatch):
-    found = followed(frames, STEPS)
+def test_the_tracks_do_not_depend_on_the_number_of_cores(frames, together, monkeypatch):
     for cores in (1, 4):
         monkeypatch.setattr(parallel, "_cores", lambda cores=cores: cores)
         parallel._pool.cache_clear()
-        assert followed(frames, STEPS) == found
+        assert followed(frames, STEPS) == together
     parallel._pool.cache_clear()
 
 
@@ -95,8 +104,7 @@ _LIFE = st.tuples(st.integers(1, 12), st.none() | st.integers(1, 12)).map(
 
 def lived(frames, lives):
     """The tracks of objects that begin and are forgotten in frames after the first."""
-    tracker, found = MultiTracker(), []
-    tracker.init(frames[0], {"anna": box_of("anna", 0)})
+    tracker, found = started(frames), []
     for number, frame in enumerate(frames[1:], start=1):
         for name, (_, end) in lives.items():
             if number == end:
@@ -131,17 +139,14 @@ def test_objects_that_come_and_go_do_not_affect_one_another(frames, lives):
     ids=["outside", "an old one and an empty one", "a bad name", "too many"],
 )
 def test_if_one_box_of_several_is_refused_nothing_changes(frames, begin, error):
-    tracker, other = MultiTracker({"run.objects_most": 4}), MultiTracker()
-    for each in (tracker, other):
-        each.init(frames[0], {"anna": box_of("anna", 0)})
+    tracker, other = started(frames, settings={"run.objects_most": 4}), started(frames)
     with pytest.raises(error):
         tracker.update(frames[1], begin=begin)
     assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
 
 
 def test_an_invalid_init_keeps_the_objects_before(frames):
-    tracker = MultiTracker()
-    tracker.init(frames[0], {"anna": box_of("anna", 0)})
+    tracker = started(frames)
     for boxes, error in (({}, ObjectError), ({"ben": (1, 1, 0, 0)}, BoxError), ({"anna": "x"}, BoxError)):
         with pytest.raises(error):
             tracker.init(frames[1], boxes)
@@ -151,10 +156,9 @@ def test_an_invalid_init_keeps_the_objects_before(frames):
 
 
 def test_forget_drops_one_object_and_an_unknown_one_is_an_error(frames):
-    tracker = MultiTracker()
     with pytest.raises(BoxError, match="call init"):
-        tracker.forget("anna")
-    tracker.init(frames[0], {name: box_of(name, 0) for name in STEPS})
+        MultiTracker().forget("anna")
+    tracker = started(frames, STEPS)
     tracker.forget("ben")
     with pytest.raises(ObjectError, match="there is no object 'ben'"):
         tracker.forget("ben")
@@ -168,17 +172,14 @@ def test_forget_drops_one_object_and_an_unknown_one_is_an_error(frames):
 @pytest.fixture(scope="module")
 def cleo(frames):
     """A saved model of cleo."""
-    tracker = MultiTracker({"coreset.size": 8})
-    tracker.init(frames[0], {"cleo": box_of("cleo", 0)})
+    tracker = started(frames, ["cleo"], {"coreset.size": 8})
     for frame in frames[1:]:
         tracker.update(frame)
     return tracker.learned("cleo")
 
 
 def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not_affect(frames, cleo, tmp_path):
-    tracker, other = MultiTracker({"coreset.size": 8}), MultiTracker({"coreset.size": 8})
-    for each in (tracker, other):
-        each.init(frames[0], {"anna": box_of("anna", 0)})
+    tracker, other = (started(frames, settings={"coreset.size": 8}) for _ in range(2))
     for number, frame in enumerate(frames[1:], start=1):
         tracks = tracker.update(frame, search={"cleo": cleo} if number == 2 else None)
         assert without_version(tracks["anna"]) == without_version(other.update(frame)["anna"])
@@ -192,9 +193,7 @@ def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not
 
 
 def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
-    tracker, other = MultiTracker({"run.objects_most": 2, "coreset.size": 8}), MultiTracker({"coreset.size": 8})
-    for each in (tracker, other):
-        each.init(frames[0], {"anna": box_of("anna", 0)})
+    tracker, other = (started(frames, settings={"run.objects_most": most, "coreset.size": 8}) for most in (2, 8))
     for search, error, why in [
         ({"ben": cleo, "cleo": cleo}, ObjectError, "3 objects are more than 2"),
         ({"no name": cleo}, ObjectError, "is not a name"),
@@ -209,8 +208,7 @@ def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
 
 @pytest.mark.parametrize("after", [1, 6, 11], ids="after {} frames".format)
 def test_saved_objects_continue_bit_for_bit(frames, after, tmp_path):
-    tracker = MultiTracker()
-    tracker.init(frames[0], {name: box_of(name, 0) for name in ("anna", "ben")})
+    tracker = started(frames, ["anna", "ben"])
     for number in range(1, after):
         tracker.update(frames[number], begin={"cleo": box_of("cleo", number)} if number == 3 else {})
     tracker.save(tmp_path / "kept")
@@ -222,17 +220,13 @@ def test_saved_objects_continue_bit_for_bit(frames, after, tmp_path):
 
 
 def test_saved_objects_with_names_are_not_loaded_as_one(frames, tmp_path):
-    tracker = MultiTracker()
-    tracker.init(frames[0], {"anna": box_of("anna", 0)})
-    tracker.save(tmp_path / "kept")
+    started(frames).save(tmp_path / "kept")
     with pytest.raises(ObjectError, match=r"MultiTracker\.load"):
         Tracker.load(tmp_path / "kept")
 
 
 def test_a_damaged_list_of_objects_is_rejected_with_one_line(frames, tmp_path):
-    tracker = MultiTracker()
-    tracker.init(frames[0], {"anna": box_of("anna", 0)})
-    tracker.save(tmp_path / "kept")
+    started(frames).save(tmp_path / "kept")
     arrays, metadata = storage.read(tmp_path / "kept")
     for objects in ([{"name": "ben"}], [{**metadata["objects"][0], "name": "ben"}], 3):
         storage.write(tmp_path / "kept", arrays, metadata | {"objects": objects})

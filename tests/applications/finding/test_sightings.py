@@ -15,15 +15,6 @@ def sighting(time, x=0.0, size=40.0, name="anna", score=0.8):
     return Sighting(name, "walk.mp4", round(25 * time), time, Box(x, 50.0, size, size), score)
 
 
-def test_an_object_that_moves_is_one_interval():
-    linker = Linker()
-    for step in range(20):
-        linker.add([sighting(0.2 * step, x=15.0 * step, score=0.5 + step % 7 / 10)])
-    (interval,) = linker.intervals
-    assert (interval.first.time, interval.last.time, interval.count) == (0, 0.2 * 19, 20)
-    assert interval.best.score == 1.1
-
-
 def test_a_jump_and_a_change_of_size_continue_an_interval_and_a_gap_begins_one():
     linker = Linker()
     linker.add([sighting(0.0)])

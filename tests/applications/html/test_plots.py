@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from catstream.applications.html.plots import COLOURS, DASHES, SHARES, Axis, plot
+from catstream.applications.html.plots import DASHES, SHARES, Axis, plot
 
 
 def parsed(svg):
@@ -52,26 +52,3 @@ def test_no_two_curves_look_alike():
     )
     assert len(set(drawn)) == len(curves)
     assert legend == drawn
-
-
-#: Linear RGB as people see it who lack the cones for red, or for green (Machado, Oliveira and Fernandes 2009).
-_SEEN = {
-    "all cones": np.eye(3),
-    "without red": [[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.0520]],
-    "without green": [[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9690]],
-}
-_OKLAB = (
-    [[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]],
-    [[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]],
-)
-
-
-@pytest.mark.parametrize("seen", _SEEN.values(), ids=_SEEN)
-def test_the_colours_of_curves_are_distinguishable_by_the_colour_blind(seen):
-    """In OKLab, where a difference of 0.02 is just seen side by side."""
-    values = np.array([[int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5)] for colour in COLOURS])
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    first, second = map(np.array, _OKLAB)
-    places = np.cbrt((linear @ np.array(seen).T).clip(0, 1) @ first.T) @ second.T
-    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-    assert apart[np.triu_indices(len(COLOURS), k=1)].min() > 0.1
