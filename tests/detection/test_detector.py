@@ -265,21 +265,28 @@ def learned(scene):
 @pytest.fixture
 def likeness(scene):
     """To the object of `learned`."""
-    detector = Follower()
-    training = detector.start(scene((60, 50)), START)[1].training[APPEARANCE]
+    training = Follower().start(scene((60, 50)), START)[1].training[APPEARANCE]
     own, other = training.rows[training.labels == 1], training.rows[training.labels == 0]
     return Likeness.of(own, float((own**2).sum()), own.sum(axis=0), len(own), other.mean(axis=0))
 
 
-def sought(model, likeness, frames):
-    """The tracks of an object, as large as START when it was learned, that is searched for in these frames."""
-    detector = Follower()
+def sought(model, likeness, frames, settings=()):
+    """Tracks and features of an object, as large as START when it was learned, that is searched for in these frames."""
+    detector = Follower(settings)
     detector.seek(model, START, likeness)
-    return [detector.step(frame)[0] for frame in frames]
+    return zip(*[detector.step(frame) for frame in frames], strict=True)
+
+
+@pytest.fixture
+def two(scene):
+    """A frame with two objects that look alike."""
+    frame = scene((90, 60))
+    frame[150:190, 200:248] = frame[60:100, 90:138]
+    return frame
 
 
 def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned, likeness):
-    tracks = sought(learned, likeness, [scene(), *[scene((90, 60))] * 3])
+    tracks, _ = sought(learned, likeness, [scene(), *[scene((90, 60))] * 3])
     assert [track.state for track in tracks] == ["absent"] * 3 + ["present"]
     assert {track.model_version for track in tracks} == {7}
     assert tracks[-1].box.overlap(Box(90, 60, 48, 40)) > 0.6
@@ -290,61 +297,51 @@ def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned, li
 def test_the_first_box_of_an_object_that_is_found_has_its_size(scene, learned, likeness, factor, before):
     frame = cv2.resize(scene((90, 60)), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     empty = cv2.resize(scene(), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    tracks = sought(learned, likeness, [empty] * before + [frame] * 5)
+    tracks, _ = sought(learned, likeness, [empty] * before + [frame] * 5)
     box = next(track.box for track in tracks if track.box is not None)
     assert np.sqrt(box.area / (48 * 40)) == pytest.approx(factor, rel=0.15)
 
 
-def test_a_window_that_does_not_lead_its_frame_is_not_the_object(scene, learned, likeness):
-    frame = scene((90, 60))
-    frame[150:190, 200:248] = frame[60:100, 90:138]
-    tracks = sought(learned, likeness, [frame] * 10)
+def test_a_window_that_does_not_lead_its_frame_is_not_the_object(two, learned, likeness):
+    tracks, _ = sought(learned, likeness, [two] * 10)
     assert {track.state for track in tracks} == {"absent"}
     assert tracks[-1].score > Settings().belief.confident_score
 
 
 def test_a_window_that_does_not_look_like_the_object_is_not_the_object(scene, learned, likeness):
     frames = [scene((90, 60))] * 5
-    assert sought(learned, likeness, frames)[-1].state == "present"
     stranger = dataclasses.replace(likeness, basis=np.roll(likeness.basis, 1, axis=1))
-    assert {track.state for track in sought(learned, stranger, frames)} == {"absent"}
+    (own, _), (other, _) = (sought(learned, each, frames) for each in (likeness, stranger))
+    assert own[-1].state == "present"
+    assert {track.state for track in other} == {"absent"}
 
 
-def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(scene, learned, likeness):
-    frame = scene((90, 60))
-    frame[150:190, 200:248] = frame[60:100, 90:138]  # two objects that look alike: neither is found
-    detector = Follower({"belief.weak_score": 0.1})
-    detector.seek(learned, START, likeness)
-    taught = [detector.step(frame)[1].training for _ in range(4)]
-    rows = [rows for training in taught for rows in training.values()]
+def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(two, learned, likeness):
+    _, features = sought(learned, likeness, [two] * 4, {"belief.weak_score": 0.1})  # neither of the two is found
+    rows = [rows for each in features for rows in each.training.values()]
     assert rows
     assert all(not each.labels.any() for each in rows)
     assert all(likeness(row) < Settings().belief.sighting_likeness for each in rows for row in each.rows)
 
 
 def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned, likeness):
-    tracks = sought(learned, likeness, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
+    tracks, _ = sought(learned, likeness, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
     assert {track.state for track in tracks} == {"absent"}
 
 
 def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned, likeness):
-    detector = Follower()
-    detector.seek(learned, START, likeness)
-    taught = [detector.step(scene((90, 60)))[1].training.get("appearance") for _ in range(5)]
+    _, features = sought(learned, likeness, [scene((90, 60))] * 5)
+    taught = [each.training.get(APPEARANCE) for each in features]
     assert not any(rows is not None and rows.labels.any() for rows in taught[:2])
     assert any(rows is not None and rows.labels.any() for rows in taught[2:])
 
 
 def test_a_resumed_search_continues_bit_for_bit(scene, learned, likeness):
-    frame = scene((90, 60))
-    tracks = sought(learned, likeness, [frame] * 5)
-    other, before = Follower(), Follower()
-    before.seek(learned, START, likeness)
-    detector = [before.step(frame)[1].detector for _ in range(2)][-1]
-    assert detector.sightings == 2
-    other.go_on(2, detector, learned)
+    (tracks, features), other = sought(learned, likeness, [scene((90, 60))] * 5), Follower()
+    assert features[1].detector.sightings == 2
+    other.go_on(2, features[1].detector, learned)
     other.likeness = likeness
-    assert [other.step(frame)[0] for _ in range(3)] == tracks[2:]
+    assert tuple(other.step(scene((90, 60)))[0] for _ in range(3)) == tracks[2:]
 
 
 def test_a_model_of_other_features_is_rejected(likeness):

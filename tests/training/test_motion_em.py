@@ -58,12 +58,6 @@ def test_likelihood_never_falls(rng, still):
     assert np.all(np.diff(likelihoods) > -1e-9)
 
 
-def test_finds_the_covariances_that_made_the_centres(rng):
-    motion = learn_motion(walk(rng, frames=1500), iterations=40)
-    assert_allclose(np.diag(motion.observation), 1.5**2, rtol=0.15)
-    assert_allclose(np.diag(motion.process)[2:], 0.5**2, rtol=0.3)
-
-
 @pytest.mark.parametrize(
     "centres",
     [np.full((64, 2), 80.0), np.outer(np.arange(64.0), [3, -2])],
