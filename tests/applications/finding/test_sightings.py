@@ -45,7 +45,8 @@ def test_every_sighting_is_in_one_interval_of_its_object(data, moments):
         (interval,) = linker.add([made[-1]])
         assert interval.last is made[-1]
         assert interval.first.object == name
-        assert interval.best.score >= made[-1].score
+        since = [each for each in made if each.object == name and each.time >= interval.first.time]
+        assert interval.best.score == max(each.score for each in since)
     assert sum(interval.count for interval in linker.intervals) == len(made)
     assert all(interval.first.time <= interval.best.time <= interval.last.time for interval in linker.intervals)
     for name in ("anna", "ben"):
