@@ -19,7 +19,8 @@ ROOT = Path(__file__).parents[1]
 LEVELS = [
     {"errors", "numerics"},
     {"box", "settings"},
-    {"messages", "features"},
+    {"messages"},
+    {"features"},
     {"paper"},
     {"detection", "compression", "training", "wire", "video"},
     {"run"},

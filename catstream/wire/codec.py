@@ -136,6 +136,7 @@ def opening(kind: type, about: str | None = None) -> bytes:
 def topic_of(data: bytes | memoryview) -> bytes:
     """The topic of a message: the bytes before its fields; the first bytes of the data if it is not a message.
 
+    >>> from catstream.messages.kinds import End
     >>> topic_of(encode(End(1, "over"))) == opening(End, "")
     True
     """

@@ -163,10 +163,10 @@ def test_a_program_that_resumes_a_run_gives_only_the_changed_settings(video, tmp
     begun = {"settings": Settings(run={"unstored_frames": 8, "lockstep": True}), "state": tmp_path / "kept"}
     with Pipeline(source, [float(side) for side in box.split(",")], **begun):
         pass
-    for given in (Settings(run={"unstored_frames": 4}), {"run.unstored_frames": 4}):
-        assert Pipeline(resume=tmp_path / "kept", settings=given).settings == Settings(
-            run={"unstored_frames": 4, "lockstep": True}
-        )
+    given = {"run.unstored_frames": 4}
+    assert Pipeline(resume=tmp_path / "kept", settings=given).settings == Settings(
+        run={"unstored_frames": 4, "lockstep": True}
+    )
     resumed = Pipeline(resume=tmp_path / "kept", settings={"run.unstored_frames": 256})
     assert resumed.settings == Settings(run={"lockstep": True})
 
