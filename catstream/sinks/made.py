@@ -60,7 +60,7 @@ def _sqlite(source: Path, path: Path) -> None:
     columns = ", ".join(f"{name} {kind}" for name, kind in _COLUMNS.items())
     with closing(sqlite3.connect(path)) as database, database:
         database.execute(f"CREATE TABLE tracks ({columns}, PRIMARY KEY (frame, object)) STRICT")
-        database.executemany(f"INSERT INTO tracks VALUES ({', '.join('?' * len(_COLUMNS))})", _rows(source))
+        database.executemany("INSERT INTO tracks VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", _rows(source))
 
 
 def _parquet(source: Path, path: Path) -> None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -118,9 +117,8 @@ class Broadcast:
         """Send a stream to one receiver until it disconnects."""
         import av
 
-        clock = Fraction(1, _TICKS_PER_SECOND)
-        gone = suppress(OSError, av.FFmpegError)  # the second one, if PyAV ends the file
-        with gone, av.open(file, "w", format="nut", options={"flush_packets": "1"}) as container:
+        clock, pipe = Fraction(1, _TICKS_PER_SECOND), _WriteOnlyFile(file)
+        with av.open(pipe, "w", format="nut", options={"flush_packets": "1"}) as container:
             track: Any = container.add_stream("mjpeg", rate=Fraction(_STILL_RATE))
             track.width, track.height, track.pix_fmt, track.time_base = *self._size, "yuvj420p", clock
             for moment, picture in self._frames(stream):
@@ -128,6 +126,8 @@ class Broadcast:
                 packet.stream, packet.time_base, packet.is_keyframe = track, clock, True
                 packet.pts = packet.dts = round(moment * _TICKS_PER_SECOND)
                 container.mux(packet)
+                if pipe.broken:
+                    break
 
     def close(self) -> None:
         """Close all connections and the server."""
@@ -180,3 +180,21 @@ class _ConnectionHandler(BaseHTTPRequestHandler):
 
     def log_message(self, *_: object) -> None:
         pass
+
+
+class _WriteOnlyFile:
+    """A write-only file for PyAV. Errors are recorded: one raised inside PyAV is raised again when it ends the file.
+
+    broken  whether the receiver has disconnected
+    """
+
+    def __init__(self, file: BufferedIOBase) -> None:
+        self._file, self.broken = file, False
+
+    def write(self, data: bytes) -> int:
+        if not self.broken:
+            try:
+                self._file.write(data)
+            except OSError:
+                self.broken = True
+        return len(data)
