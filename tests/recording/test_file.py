@@ -216,6 +216,15 @@ def test_features_that_a_restarted_compressor_receives_again_replace_the_earlier
     assert recording.missing[Features] == 0
 
 
+def test_the_end_of_a_run_that_was_stopped_is_not_the_end_of_its_continuation(written):
+    path = written([features(1), track(1), End(2, "it was stopped")])
+    written([features(2), track(2), features(3), track(3)], resume=True)
+    recording = Recording(path)
+    assert recording.end is None
+    assert recording.missing == {Features: 0, Track: 0}
+    assert str(recording).endswith("none missing; it ends before the run did")
+
+
 def test_a_model_that_was_made_once_more_counts_once(written):
     path = written([features(1), model(1, 0), features(2), features(3), model(2, 1)])
     written([model(2, 1), features(3, 0.75)], resume=True)

@@ -291,6 +291,8 @@ class Recording:
         if kind is Features:
             if not self._features:  # an earlier protocol is rejected before anything is played or learned
                 _decode(self.files[number], entry, Features)
+            if self.end is not None and entry.sequence >= self.end.seq:  # that run was stopped, and was resumed
+                self.end = None
             for places in (self._features, *self._models.values()):
                 _drop_from(places, entry.sequence)
             self._features.append((entry.sequence, place))
