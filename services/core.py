@@ -130,8 +130,8 @@ class Positions(_Event, frozen=True):
 
         An object that was forgotten after that message continues too, until the message after which it was forgotten.
         If nothing was learned of any object yet, the start is before the first frame of the first of them. If nothing
-        was learned of one of several objects, which takes long with the paper's first tracker only, it begins anew
-        where it was last. An object of a saved model, of which the compressor has no trees, begins anew too.
+        was learned of one of several objects, which takes long with the paper's first tracker only, it begins again
+        where it was last. An object of a saved model, of which the compressor has no trees, begins again too.
         """
         desired, learned = state.desired, self.places[0].objects
         receiver, last = min(enumerate(self.places), key=lambda each: each[1].seq)

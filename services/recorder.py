@@ -19,7 +19,7 @@ __all__ = ["Recorder"]
 class Recorder:
     """Subscribes to a pipeline and writes each message once; a context manager.
 
-    If the disk is full, no more is written but the `End`, by which a reader knows how many messages are missing.
+    If the disk is full, only the `End` is written from then on, by which a reader knows how many messages are missing.
 
     Parameters
     ----------

@@ -72,21 +72,16 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
-def diagram() -> str:
-    """The table of a stream's life in the language of Mermaid."""
-    lines = ["stateDiagram-v2", "    [*] --> absent"]
-    for (state, what), (after, action) in life.TABLE.items():
-        lines.append(f"    {state} --> {after} : {what}{f' / {action}' if action else ''}")
-    return "\n".join(lines)
-
-
 def life_of_a_stream() -> str:
-    """The tables and the diagram of the life of a stream, as `docs/how-to/fleet.md` shows them."""
+    """The tables of the life of a stream, as `docs/how-to/fleet.md` shows them."""
     lines = ["", "| state | an actor in it |", "| --- | --- |"]
     lines += [f"| `{state}` | {what} |" for state, what in life.STATES.items()]
     lines += ["", "| event | what has happened |", "| --- | --- |"]
     lines += [f"| `{event}` | {what} |" for event, what in life.EVENTS.items()]
-    return "\n".join([*lines, "", "```mermaid", diagram(), "```", ""])
+    lines += ["", "| state | event | action | next state |", "| --- | --- | --- | --- |"]
+    for (state, what), (after, action) in life.TABLE.items():
+        lines.append(f"| `{state}` | `{what}` | {action} | `{after}` |")
+    return "\n".join([*lines, ""]) + "\n"
 
 
 def test_the_life_of_a_stream_is_shown_as_its_table_says():

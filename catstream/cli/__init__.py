@@ -26,7 +26,7 @@ COMMANDS = {
     "evaluate": "Measure accuracy on annotated sequences, also of other trackers.",
     "loadtest": "Run pipelines under load, and measure latency and losses.",
     "watch": "Print the messages of a running pipeline.",
-    "view": "Watch and steer a running pipeline in a browser.",
+    "view": "Watch and control a running pipeline in a browser.",
     "sink": "Write the tracks of a running pipeline to files.",
     "record": "Record the messages of a running pipeline in one file.",
     "replay": "Replay a recording to subscribers, or train on it again.",
@@ -46,7 +46,7 @@ COMMANDS = {
 }
 
 #: Module of the commands that share a module.
-_MODULES = dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "steer")
+_MODULES = dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "control")
 
 
 def load_command(name: str) -> click.Command:

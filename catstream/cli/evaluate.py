@@ -28,7 +28,7 @@ __all__ = ["evaluate"]
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
-@click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see below.")
+@click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see above.")
 @click.option("--starts", type=click.IntRange(min=1), help="Run from N frames of each sequence (TRE).")
 @click.option("--shifts", is_flag=True, help="Run from 12 shifted or scaled first boxes (SRE).")
 @click.option("--jitter", type=click.IntRange(min=1), help="Run from K first boxes that differ by at most 2 %.")

@@ -57,7 +57,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option("--chaos", is_flag=True, help="Kill a random process every few seconds.")
 @click.option("--find-limit", is_flag=True, help="Search for the highest rate that meets the limits.")
 @click.option(
-    "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see below."
+    "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see above."
 )
 @click.option("--json", "json_file", type=PATH, help="File for all figures.")
 @click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and .hgrm.")

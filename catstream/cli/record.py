@@ -34,7 +34,7 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
     """Write the messages of a running pipeline to a file, until it ends or Ctrl-C.
 
     Features, models, tracks and health are written when they arrive, with the
-    settings of the pipeline; about 0.4 MB for each frame. The file is MCAP. After
+    settings of the pipeline; about 0.3 MB for each frame. The file is MCAP. After
     a crash it can be read up to the last whole message. After 100 000 messages,
     the recording continues in a second file, walk-2.mcap.
 

@@ -81,7 +81,7 @@ def with_token(prefix: str = "") -> Decorator:
             f"--no-{prefix}token",
             "no_token",
             is_flag=True,
-            help="Serve the page without a token: every user of this machine can watch the pictures and steer.",
+            help="Serve the page without a token: every user of this machine can watch the pictures and control it.",
         ),
     )
 

@@ -66,7 +66,7 @@ def summary(
     frames are chosen that taught the tracker most of the object: those whose rows
     have most energy outside the span of the coreset before. They are spread over
     time. A video with --box and the folder of a run are tracked again for this,
-    with 0.4 MB for each frame in a temporary folder. A recording has the features;
+    with 0.3 MB for each frame in a temporary folder. A recording has the features;
     only the pictures are read from its video. The settings are those of the run;
     --settings, --preset and --set apply to a video with --box.
 

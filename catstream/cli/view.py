@@ -28,7 +28,7 @@ __all__ = ["fleet_view", "view"]
 )
 @with_token()
 def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> None:
-    """Watch and steer a running pipeline in a browser.
+    """Watch and control a running pipeline in a browser.
 
     The page shows the picture with the box of each object, the score, frames
     per second, the coreset trees, and the most surprising frames. If you draw
@@ -36,9 +36,9 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
     the page waits for the next one. Ctrl-C ends the server; the pipeline
     continues.
 
-    Only users with the token can watch and steer: open the printed link, which
-    ends with it. Each start makes a new token; give one of your own to keep
-    it, for example for Prometheus. The connection is not encrypted: from
+    Only users with the token can watch and control: open the printed link,
+    which ends with it. Each start makes a new token; give one of your own to
+    keep it, for example for Prometheus. The connection is not encrypted: from
     other machines, use an ssh tunnel, or a proxy with TLS.
 
     \b

@@ -76,7 +76,7 @@ class Place:
         return self.status.endpoint, self.status.server, self.status.token
 
     def continues_as(self, later: Place) -> bool:
-        """Whether the numbers of the frames go on at a later place of the stream."""
+        """Whether the numbers of the frames continue at a later place of the stream."""
         return (self.status.source, self.status.began) == (later.status.source, later.status.began)
 
 
@@ -247,7 +247,7 @@ class FollowedStream:
     status : StreamStatus
         Its newest state.
     end : End or None
-        The reason why the stream has ended; None while it goes on.
+        The reason why the stream has ended; None while it continues.
 
     Raises
     ------

@@ -6,7 +6,7 @@
         fleet.up()
         print(fleet.status().streams["cam-7"].state)
 
-A fleet runs on a cluster of Ray that its users have started, and goes on after the program. Without one, it runs on
+A fleet runs on a cluster of Ray that its users have started, and continues after the program. Without one, it runs on
 this machine as long as the program, or until `down`. Programs that only watch need neither Ray nor its token: see
 `catstream.subscribe`.
 """
@@ -216,7 +216,7 @@ class Fleet:
             self._local.stop()
 
     def close(self) -> None:
-        """Disconnect. A fleet on a cluster goes on, and a detached one; another one of this program ends."""
+        """Disconnect. A fleet on a cluster, or a detached one, continues; any other ends with this program."""
         if self.is_owner:
             self.down()
         self._controller = None

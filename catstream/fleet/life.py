@@ -50,7 +50,7 @@ EVENTS: dict[Event, str] = {
     "unwanted": "the stream was removed or changed, or has to leave its node",
     "superseded": "another process has claimed the stream",
     "ended": "its source has ended, and its last state is stored",
-    "gone": "Ray has no such actor any more",
+    "gone": "the actor has ended",
 }
 
 #: The next state and the action, by state and event; for an event that is not here, nothing changes.
@@ -106,7 +106,7 @@ class Node:
 class Wanted:
     """A stream that should run.
 
-    digest  `StreamSpec.digest`: a stream whose digest changes is started anew
+    digest  `StreamSpec.digest`: a stream whose digest changes is started again
     cores   that Ray reserves for it
     labels  that its node must have
     pinned  id of the node that it was moved to; "" for any

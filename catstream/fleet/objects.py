@@ -161,7 +161,7 @@ def _local() -> Any:
 
 
 def _s3() -> Any:
-    """The file system of S3. It repeats nothing: the caller goes on, and writes a newer state later."""
+    """The file system of S3. It repeats nothing: the caller continues, and writes a newer state later."""
     require_extra("fleet")
     require_extra("s3")
     import fsspec

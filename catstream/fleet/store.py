@@ -15,9 +15,9 @@ Below each of these folders, only the newest holder decides what comes next:
             this holder was superseded, and has to stop
     read    take the newest undamaged state of the highest token that has one
 
-A holder that was paused or cut off may go on writing under its own token: as soon as the newer holder has written one
-state, nobody reads the older ones any more. Before that, its states continue the one that the newer holder began from,
-and are as good as any. What can fail besides:
+A holder that was paused or cut off may continue to write under its own token: as soon as the newer holder has written
+one state, nobody reads the older ones any more. Before that, its states continue the one that the newer holder began
+from, and are as good as any. What can fail besides:
 
     the answer to a claim is lost   The caller claims again, and gets the next token; a claim without states is passed.
     the answer to a write is lost   The caller writes the next state, under the next number.
@@ -222,7 +222,7 @@ class Claim:
         FencedError
             If another process has claimed the stream. Every later call raises it too.
         StoreError
-            If the store cannot be reached or is full. The caller goes on, and writes a newer state later.
+            If the store cannot be reached or is full. The caller continues, and writes a newer state later.
         """
         if self._fenced is not None:
             raise self._fenced
@@ -296,7 +296,7 @@ class Store:
         return self._states(_streams(stream)).newest()
 
     def remove(self, stream: str) -> None:
-        """Remove the states of a stream. A process that still holds it can write no more."""
+        """Remove the states of a stream. A process that still holds it can no longer write."""
         self._states(_streams(stream)).clear(_this_process())
 
     def put_fleet(self, data: bytes) -> None:

@@ -242,7 +242,7 @@ class Stream:
                 with self._lock:
                     self._status = replace(self._status, state="ended", frame=int(claim.state.facts["frame"]))
                 return
-            claim.state = None  # it was changed since: it begins anew
+            claim.state = None  # it was changed since: it begins again
         with ExitStack() as stack:
             pipeline = stack.enter_context(self._made(claim))
             facts = claim.state.facts if claim.state is not None else {}
@@ -333,12 +333,12 @@ class Stream:
         """Begin the objects that the spec has now and had not when the state was made, and forget the others."""
         before = set(facts["objects"]) if facts else set(self._spec.boxes)
         now = self._spec.boxes.keys() | self._spec.models.keys()
-        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as steering:
+        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
             for name in sorted(self._spec.boxes.keys() - before):
-                steering.set_box(self._spec.boxes[name], name)
+                controlled.set_box(self._spec.boxes[name], name)
             for name in sorted(before - now):
                 with suppress(CommandRejectedError):  # it was forgotten already
-                    steering.forget(name)
+                    controlled.forget(name)
         for name in sorted(self._spec.models.keys() - before):
             if (model := self._store.get_model(given_model(self._spec.name, name))) is None:
                 raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
@@ -347,8 +347,8 @@ class Stream:
     def _search(self, pipeline: Pipeline, model: Generation, name: str) -> None:
         """Search for an object by a saved model in the store."""
         learned = Learned.from_bytes(model.files["model"], f"the model of {name!r} in the store")
-        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as steering:
-            steering.search(learned, name)
+        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
+            controlled.search(learned, name)
 
     def _search_merged(self, pipeline: Pipeline, known: dict[str, int]) -> None:
         """Search for each followed object that is not present by a merged model that is newer than the known one."""

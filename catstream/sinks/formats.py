@@ -57,7 +57,7 @@ class StdoutSink(NdjsonSink):
         except OSError as error:
             # The interpreter flushes standard output again when it exits: that must not fail a second time.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self._file.fileno())
-            if isinstance(error, BrokenPipeError):  # its reader wants no more, as `head` does: no error of ours
+            if isinstance(error, BrokenPipeError):  # its reader has ended, as `head` does: not an error of catstream
                 raise
             raise VideoError(f"cannot write to standard output any more: {error.strerror}") from None
 

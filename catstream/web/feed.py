@@ -57,7 +57,7 @@ class Feed(ABC):
         self.viewers.closed = True
 
     async def run(self) -> None:
-        """Feed the dashboard until cancelled; each error is shown on the page, and then it goes on."""
+        """Feed the dashboard until cancelled; each error is shown on the page, and then it continues."""
         while True:
             try:
                 await self._feed()

@@ -63,8 +63,8 @@ class Server:
     def __init__(self, site: Site, *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None) -> None:
         if token is None and not is_loopback(host):
             raise ServiceError(
-                f"{host} can be reached from other machines, and anyone who opens the page may steer: serve it with a "
-                "token (without --no-token), or listen on 127.0.0.1"
+                f"{host} can be reached from other machines, and anyone who opens the page may control the pipeline: "
+                "serve it with a token (without --no-token), or listen on 127.0.0.1"
             )
         connections = Connections(Guard(site.app, token))
         self._socket = _listen(host, port)
