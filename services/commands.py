@@ -192,6 +192,8 @@ def _tracked(state: State, command: Command) -> str:
 
 
 def _after(state: State) -> str:
+    if state.is_repeating:
+        return "after the last frame that was tracked before the restart"
     return f"after frame {state.seq - 1}" if state.seq else "before the first frame"
 
 

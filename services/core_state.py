@@ -164,8 +164,14 @@ class State(msgspec.Struct, frozen=True):
 
     @property
     def end_reason(self) -> str:
-        """Reason for which no more frames are tracked, also if it is a signal; empty while frames are tracked."""
-        return "it was stopped" if self.stopping >= 0 else self.ending
+        """Reason for which no more frames are tracked, also if it is a signal; empty while frames are tracked.
+
+        The frames of an earlier detector are repeated before a stream is stopped: its end has to follow the last
+        message that any receiver has.
+        """
+        if self.stopping >= 0:
+            return "it was stopped"
+        return "" if self.is_repeating else self.ending
 
     @property
     def is_repeating(self) -> bool:

@@ -321,7 +321,7 @@ class Anything(RuleBasedStateMachine):
         self.signalled = True
         self.world.tell(core.Stopping(max(seconds, self.world.state.stopping)))
 
-    @precondition(lambda self: self.world.state.phase is Phase.FRAME)
+    @precondition(lambda self: self.world.state.phase is Phase.FRAME and (not self.repeats or self.signalled))
     @rule(failed=st.booleans())
     def end(self, failed):
         self.ended = True
@@ -364,6 +364,8 @@ class Anything(RuleBasedStateMachine):
         for _ in range(99):
             if world.state.phase is Phase.HELD:  # no object is left
                 world.command("set-box", "", BOX)
+            if world.state.phase is Phase.FRAME and self.repeats and not world.state.end_reason:
+                world.frame(self.live)  # the source has all frames that were tracked
             if world.state.phase is Phase.FRAME:
                 world.tell(core.Ended("the source has ended"))
             world.receive_all()
@@ -496,30 +498,55 @@ def test_once_the_last_object_was_forgotten_a_paused_run_waits_for_a_box(two):
     assert not two.state.desired.holds
 
 
-def test_commands_for_objects_wait_until_all_frames_of_an_earlier_detector_are_repeated():
-    world = World(desired=ANNA)
-    for _ in range(2):
+@pytest.fixture
+def repeating():
+    """A restarted detector whose compressor has stored one message, and whose owner has all three."""
+    world = World(replace(RULES, owned=True), ANNA)
+    for _ in range(3):
         world.frame()
+        world.receivers["results"].receive()
         world.receivers["features"].receive()
-        world.receivers["features"].acknowledged = 1
         world.learn("anna")
         world.model("anna")
         world.progress()
-    world.receivers["features"].taken = 1  # the second message is not stored
-    owner = core.Place(2, {"anna": core.PlaceOfObject(2, BOX, True)})
-    world.history = History(State.at_start(replace(RULES, resumes=True, owned=True), ANNA, {}))
-    world.detectors = {}
-    world.tell(core.Subscribed(False, True, 0.0))
-    world.tell(core.ModelArrived("anna", 2))
-    world.tell(core.Positions((core.Place(1, owner.objects), owner)))
-    assert world.command("forget", "anna") is None
-    assert world.command("pause").reason == "paused after frame 0"
-    world.progress()
-    world.frame()  # is repeated, though the run is paused
-    assert next(answer.reason for answer in world.answers.values()) == (
-        "anna is no longer tracked after frame 1: no object is left, so the run waits for a box"
+    world.receivers["features"].taken, world.receivers["results"].acknowledged = 1, 3
+    world.samples = world.samples[:1]
+    world.kill()
+    assert (world.state.phase, world.state.seq, world.state.is_repeating) == (Phase.FRAME, 1, True)
+    return world
+
+
+def test_commands_for_objects_wait_until_all_frames_of_an_earlier_detector_are_repeated(repeating):
+    assert repeating.command("forget", "anna") is None
+    assert repeating.command("pause").reason == "paused after the last frame that was tracked before the restart"
+    for _ in range(2):  # are repeated, though the run is paused
+        repeating.frame()
+        repeating.receive_all()
+    assert next(answer.reason for answer in repeating.answers.values()) == (
+        "anna is no longer tracked after frame 2: no object is left, so the run waits for a box"
     )
-    assert world.state.desired.past == (PastObject("anna", DesiredObject(FIRST, 1), 2),)
+    assert repeating.state.desired.past == (PastObject("anna", DesiredObject(FIRST, 1), 3),)
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_stop_takes_effect_once_all_frames_of_an_earlier_detector_are_repeated(repeating, killed):
+    assert repeating.command("stop").reason == (
+        "the stream ends after the last frame that was tracked before the restart"
+    )
+    if killed:
+        repeating.kill()
+    for seq in (2, 3):
+        assert not repeating.state.end_reason
+        repeating.frame()
+        repeating.receive_all()
+        assert repeating.state.seq == seq
+    assert repeating.state.end_reason == STOPPED
+    repeating.tell(core.Ended("the source has ended"))
+    for _ in repeating.receivers:  # the end is sent to one after the other
+        repeating.receive_all()
+    assert repeating.finished
+    for receiver in repeating.receivers.values():
+        assert (receiver.taken, receiver.ended) == (4, True), "the end follows the last message that a receiver has"
 
 
 def test_a_repeated_frame_reports_an_object_as_absent_that_was_forgotten_later_and_of_which_nothing_is_known():
