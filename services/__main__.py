@@ -20,6 +20,7 @@ from catstream.errors import CatstreamError
 from catstream.run.job import Job
 from catstream.services.loop import Parent, log_as, run, run_child
 from catstream.services.options import PATH, with_model, with_object, with_part, with_settings
+from catstream.services.start_server import NAMES
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
@@ -90,7 +91,7 @@ def supervisor(**options: Any) -> None:
 
 
 @main.command(hidden=True)
-@click.argument("name", type=click.Choice(["detector", "compressor", "trainer"]))
+@click.argument("name", type=click.Choice(NAMES))
 @click.argument("file", type=PATH)
 @click.option("--parent", type=int, required=True, help="Process id of the parent; this process ends with it.")
 @click.option("--watchdog", type=int, help="File descriptor of the watchdog's shared memory.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import time
 from collections import deque
@@ -12,15 +11,10 @@ from pathlib import Path
 from catstream.services.loop import SOURCE_FAILED
 from catstream.services.process_log import ProcessLog
 from catstream.services.start_server import Request, StartedProcess, start_server
+from catstream.services.timing import LOOK_SECONDS, STEP_SECONDS, STOPPED_SECONDS
 from catstream.services.watchdog import Watchdog
 
 __all__ = ["Child"]
-
-_STEP_SECONDS = (
-    0.5  # the most that counts between two calls of `count_turns`, as the parent itself may have been suspended
-)
-_TURN_SECONDS = 0.01  # from one turn of the parent to the next, while it waits for the end of the process
-_STOPPED_SECONDS = 2.0  # a process that SIGSTOP has stopped for so long counts as hung
 
 
 class Child:
@@ -96,32 +90,31 @@ class Child:
         if (turns := self._watchdog.turns) != self._turns:
             self._turns, self.silent, self._stopped = turns, 0.0, 0.0
             return
-        seconds = min(seconds, _STEP_SECONDS)
+        seconds = min(seconds, STEP_SECONDS)
         self.silent += seconds
-        self._stopped = self._stopped + seconds if self.silent > _STEP_SECONDS and self._is_stopped() else 0.0
+        self._stopped = self._stopped + seconds if self.silent > STEP_SECONDS and self._is_suspended else 0.0
 
     @property
     def hangs(self) -> bool:
         """Whether the loop of the process has been stuck for too long."""
-        return self.silent > self._watchdog.patience or self._stopped > _STOPPED_SECONDS
+        return self.silent > self._watchdog.patience or self._stopped > STOPPED_SECONDS
 
-    def _is_stopped(self) -> bool:
-        with contextlib.suppress(OSError):  # the process has ended
-            return Path(f"/proc/{self.pid}/stat").read_text().rpartition(") ")[2][:1] == "T"
-        return False
+    @property
+    def _is_suspended(self) -> bool:
+        return self._process is not None and self._process.is_suspended
 
     def terminate(self, seconds: float, turn: Callable[[], object]) -> None:
         """Ask the process to end, and wait at most `seconds` for it; `turn` is called again and again meanwhile."""
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
             deadline = time.monotonic() + seconds
-            while not self._process.wait(_TURN_SECONDS) and time.monotonic() < deadline:
+            while not self._process.wait(LOOK_SECONDS) and time.monotonic() < deadline:
                 turn()
 
     def kill(self) -> None:
-        """Kill the process, if it runs."""
+        """Kill the process, if it runs; also its start server if a signal has stopped that."""
         if self._process is not None:
-            self._process.send_signal(signal.SIGKILL)
+            self._process.kill()
 
     def close(self) -> None:
         """Kill the process if it runs, and close the log and the watchdog."""

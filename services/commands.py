@@ -28,7 +28,8 @@ def carried_out(state: State, request: Request) -> tuple[State, list[Answer]]:
     """Carry out a command, or let it wait; the answer to a box follows with the next frame.
 
     While frames of an earlier detector are repeated, commands for objects wait: their objects begin or end with a
-    message that nobody has received yet. At the end of the stream, every command except `save` is rejected.
+    message that nobody has received yet. `pause` and `stop` are answered at once, and hold after these frames. At the
+    end of the stream, every command except `save` is rejected.
     """
     command = request.command
     if state.ending and command.verb != "save":

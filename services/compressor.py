@@ -17,18 +17,21 @@ from catstream.services.loop import Process
 from catstream.services.progress import Progress
 from catstream.services.recorder import Recorder
 from catstream.services.saved_models import SavedModels
+from catstream.services.timing import (
+    LOCK_SECONDS,
+    MESSAGE_SECONDS,
+    MODEL_SECONDS,
+    SENDER_SECONDS,
+    STORE_SECONDS,
+    TRACKS_END_SECONDS,
+    TURN_SECONDS,
+)
 from catstream.sinks.recording.file import RecordingWriter
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import FEATURES, SAMPLES
 from catstream.wire.newest import Publisher
 
 __all__ = ["main", "prepare"]
-
-_SENDER_SECONDS = 5.0  # limit for the detector to send the end, once all processes were asked to end
-_END_SECONDS = 5.0  # limit for the end of the tracks, after that of the features
-_STORE_SECONDS = 60.0  # limit for a slow disk
-_MODEL_SECONDS = 60.0  # limit for reading a saved model and training from it
-_LOCK_SECONDS = 10.0  # limit for an earlier compressor to end
 
 
 def prepare() -> None:
@@ -82,11 +85,11 @@ class CompressorLoop:
     @property
     def must_stop(self) -> bool:
         """Whether the process was asked to end, and a connected detector did not send its end in time."""
-        return self._process.stop_requested_for(_SENDER_SECONDS if self._features.has_sender else 0)
+        return self._process.stop_requested_for(SENDER_SECONDS if self._features.has_sender else 0)
 
     def receive(self) -> Features | End | None:
         """The next message, None if none arrives in a tenth of a second."""
-        message = self._features.receive(0.1)
+        message = self._features.receive(MESSAGE_SECONDS)
         if self._recorder is not None:
             self._recorder.receive()
         return message
@@ -97,7 +100,7 @@ class CompressorLoop:
             self._recorder.write(features)
         before = self._forest.compressors.keys()
         if any(part.model for part in features.objects.values()):
-            self._process.allow(_MODEL_SECONDS)
+            self._process.allow(MODEL_SECONDS)
         for sample in self._forest.take(features, begun(features, self._process.settings)):
             self._samples.send(sample)
         if self._forest.compressors.keys() != before:
@@ -118,7 +121,7 @@ class CompressorLoop:
 
     def _store(self, urgent: bool) -> None:
         """Write a checkpoint, or count all messages as stored if there are none (started by hand without --state)."""
-        self._process.allow(_STORE_SECONDS)
+        self._process.allow(STORE_SECONDS)
         began = time.monotonic()
         saved = self._checkpoints is None or self._checkpoints.save(self._forest)
         now = time.monotonic()
@@ -137,9 +140,9 @@ class CompressorLoop:
     def end(self, end: End) -> None:
         """Send the end of the stream, and wait for the end of the tracks if they are recorded."""
         self._samples.send(end)
-        deadline = time.monotonic() + _END_SECONDS
+        deadline = time.monotonic() + TRACKS_END_SECONDS
         while self._recorder is not None and self._recorder.end is None and time.monotonic() < deadline:
-            self._features.receive(0.02)  # a detector that did not receive the last acknowledgement asks again
+            self._features.receive(TURN_SECONDS)  # a detector that did not receive the last acknowledgement asks again
             self._recorder.receive()
             self._process.beat(self._counters, self._forest.object_counters)
 
@@ -164,4 +167,4 @@ class CompressorLoop:
 
 def _checkpoints(job: Job, stack: ExitStack) -> CheckpointStore | None:
     """The checkpoints of a run, locked for this process; None if the run has no state folder."""
-    return None if job.state is None else CheckpointStore(stack.enter_context(locked(job.state / TREES, _LOCK_SECONDS)))
+    return None if job.state is None else CheckpointStore(stack.enter_context(locked(job.state / TREES, LOCK_SECONDS)))

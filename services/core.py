@@ -30,11 +30,13 @@ from catstream.services import actions, commands
 from catstream.services.actions import Action
 from catstream.services.core_state import Known, Phase, Progress, Request, State
 from catstream.services.desired import DesiredObject, DesiredState
+from catstream.services.timing import FEATURES_END_SECONDS, RESULTS_END_SECONDS
 from catstream.wire.timing import EARLY_SECONDS
 
 __all__ = ["Event", "History", "handle"]
 
-_PATIENCE_SECONDS = {"features": 10.0, "results": 0.5}  # for the end to be stored, once the process was asked to end
+#: For the end to be stored, once the process was asked to end.
+_END_SECONDS = {"features": FEATURES_END_SECONDS, "results": RESULTS_END_SECONDS}
 _EVENTS = 1000  # that are kept
 
 #: A state, and the actions that belong to it.
@@ -297,7 +299,7 @@ def _sent(state: State, phase: Phase, message: actions.Send) -> Moved | None:
         return replace(state, phase=phase), []
     if message.seq - acknowledged <= state.rules.window:
         return replace(state, phase=phase), [message]
-    if state.stopping >= (_PATIENCE_SECONDS[channel] if message.end else 0.0):
+    if state.stopping >= (_END_SECONDS[channel] if message.end else 0.0):
         state = replace(state, phase=phase, given_up=(*state.given_up, channel))
         return state, [actions.GiveUp(channel, message.seq)]
     return None
@@ -406,7 +408,7 @@ def _end_features(state: State) -> Moved | None:
 
 def _end_stored(state: State) -> Moved | None:
     waits = "features" not in state.given_up and state.progress.acknowledged <= state.seq
-    if waits and state.stopping < _PATIENCE_SECONDS["features"]:
+    if waits and state.stopping < FEATURES_END_SECONDS:
         return None
     return replace(state, phase=Phase.END_RESULTS), []
 
@@ -421,7 +423,7 @@ def _end_owner(state: State) -> Moved | None:
     """Clear the command `stop` at the end of the run, so that a resumed detector does not stop at once."""
     awaited = state.rules.owned and "results" not in state.given_up
     waits = awaited and state.progress.owner_acknowledged <= state.seq
-    if waits and state.stopping < _PATIENCE_SECONDS["results"]:
+    if waits and state.stopping < RESULTS_END_SECONDS:
         return None
     state = replace(state, phase=Phase.ENDED, desired=with_fields(state.desired, stopped=False))
     return state, [*commands.concluded(state, []), actions.Finish()]

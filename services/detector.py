@@ -37,6 +37,7 @@ from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.loop import RECORDER, Process
 from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import Outputs
+from catstream.services.timing import MODEL_SECONDS, OPEN_SECONDS, SKIP_SECONDS, TURN_SECONDS
 from catstream.video import source
 from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password
@@ -49,10 +50,6 @@ __all__ = ["main", "opening_seconds", "prepare"]
 
 _FILE = "desired_state.json"  # in the folder of the state
 _EVENTS_FILE = "detector_events.ndjson"  # the same, after a crash
-_OPEN_SECONDS = 60.0  # limit for opening the source, for the first frame, and for an object that begins
-_SKIP_SECONDS = 0.1  # limit for decoding a skipped frame
-_TURN_SECONDS = 0.02  # from one turn of a waiting loop to the next
-_MODEL_SECONDS = 60.0  # limit for reading saved models, and for writing them to a slow disk
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
 #: The channel whose acknowledgements are waited for in a phase.
@@ -68,6 +65,7 @@ _CHANNELS = {
     Phase.END_OWNER: "results",
 }
 
+_GIVEN_UP = "message %d of %s was not sent: its receiver did not answer in time"
 _log = logging.getLogger(__name__)
 
 
@@ -140,13 +138,13 @@ class DetectorLoop:
             actions.Continue: self._continue,
             actions.Resume: self._resume,
             actions.SetBox: self._set_box,
-            actions.Forget: self._forget,
+            actions.Forget: lambda order: self._detectors.forget(order.name),
             actions.Begin: self._begin,
             actions.Seek: self._seek,
             actions.Miss: self._miss,
             actions.Step: self._step,
             actions.Send: self._send,
-            actions.GiveUp: self._give_up,
+            actions.GiveUp: lambda order: _log.warning(_GIVEN_UP, order.seq, order.channel),
             actions.Show: self._show,
             actions.Conclude: self._conclude,
             actions.Finish: self._finish,
@@ -182,9 +180,9 @@ class DetectorLoop:
         else:
             self._outputs.poll(_CHANNELS.get(phase))
         if phase not in (Phase.SUBSCRIBERS, Phase.POSITIONS):  # before, they belong to no detector yet
-            self._receive_models(_TURN_SECONDS if phase is Phase.MODEL else 0.0)
+            self._receive_models(TURN_SECONDS if phase is Phase.MODEL else 0.0)
         if phase is Phase.HELD:
-            time.sleep(_TURN_SECONDS)
+            time.sleep(TURN_SECONDS)
         self._outputs.serve_late_joiners()
         commands = self._control.receive_all()
         for command in commands:
@@ -250,7 +248,7 @@ class DetectorLoop:
         """A command without the saved model, which is kept here."""
         if (data := command.model) is None:
             return Request(command)
-        self._process.allow(_MODEL_SECONDS)
+        self._process.allow(MODEL_SECONDS)
         command = replace(command, model=b"")
         try:
             learned = Learned.from_bytes(data, "the file")
@@ -271,7 +269,7 @@ class DetectorLoop:
         self.tell(core.Positions(tuple(_place(self._positions[name]) for name in senders)))
         if self.state.phase is Phase.POSITIONS:  # they do not agree yet
             self._positions.clear()
-            self._receive_models(_TURN_SECONDS)
+            self._receive_models(TURN_SECONDS)
 
     def _receive_models(self, seconds: float) -> None:
         """Receive models, waiting at most this long for the first; the detectors adopt those of their objects."""
@@ -315,7 +313,7 @@ class DetectorLoop:
         return core.Resumed(self._known())
 
     def _set_box(self, order: actions.SetBox) -> Event:
-        self._process.allow(_OPEN_SECONDS)
+        self._process.allow(OPEN_SECONDS)
         detectors, time_ = self._detectors, self._present.time
         act = detectors.correct if order.keep else detectors.begin
         try:
@@ -324,15 +322,12 @@ class DetectorLoop:
             return core.Begun(error=str(error))
         return core.Begun(_known(detectors.detectors[order.name]))
 
-    def _forget(self, order: actions.Forget) -> None:
-        self._detectors.forget(order.name)
-
     def _begin(self, order: actions.Begin) -> None:
-        self._process.allow(_OPEN_SECONDS)
+        self._process.allow(OPEN_SECONDS)
         self._given[order.name] = self._detectors.begin(order.name, self._pyramid, order.box, self._present.time)
 
     def _seek(self, order: actions.Seek) -> None:
-        self._process.allow(_OPEN_SECONDS)
+        self._process.allow(OPEN_SECONDS)
         learned, name = self._models_of_job.get(order.model), order.name
         if learned is None:  # its file cannot be read
             if name in self._detectors.detectors:
@@ -370,9 +365,6 @@ class DetectorLoop:
         if results is not None:
             results.send(self._end if order.end else self._tracks)
         return None
-
-    def _give_up(self, order: actions.GiveUp) -> None:
-        _log.warning("message %d of %s was not sent: its receiver did not answer in time", order.seq, order.channel)
 
     def _show(self, order: actions.Show) -> None:
         wanted = self.state.desired.objects if order.held else self._tracks.tracks
@@ -479,7 +471,7 @@ def _place(position: Position) -> core.Place:
 def opening_seconds(part: slice, first: int) -> tuple[float, float]:
     """Time limits: for opening a source at frame `first` of a part, and the additional time for each frame."""
     step = part.step or 1
-    return _OPEN_SECONDS + ((part.start or 0) + first * step) * _SKIP_SECONDS, (step - 1) * _SKIP_SECONDS
+    return OPEN_SECONDS + ((part.start or 0) + first * step) * SKIP_SECONDS, (step - 1) * SKIP_SECONDS
 
 
 def _desired(process: Process, models: ModelFiles) -> DesiredState:

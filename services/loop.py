@@ -18,7 +18,8 @@ from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.messages.kinds import Health, Run
 from catstream.run.job import Job
 from catstream.services.process_title import set_process_title
-from catstream.services.watchdog import PATIENCE, Watchdog
+from catstream.services.timing import CLOSE_SECONDS, HEALTH_SECONDS, STUCK_SECONDS
+from catstream.services.watchdog import Watchdog
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
@@ -45,8 +46,6 @@ SOURCE_FAILED = 3
 #: Name of the compressor's subscription to the tracks if it records: the detector waits for it before the first frame.
 RECORDER = "recorder"
 
-_HEALTH_SECONDS = 1.0
-_CLOSE_SECONDS = 30.0  # limit for closing all sockets after the last turn
 _QUICK_SIZE = 128  # coreset size up to which one turn of compressor and trainer is short on any machine
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 _log = logging.getLogger(__name__)
@@ -83,7 +82,7 @@ class Process:
         self.source_failed = False
         # One turn of the compressor or the trainer takes a time that grows with the coreset size.
         factor = 1.0 if name == "detector" else max(1.0, (job.settings.coreset.size / _QUICK_SIZE) ** 2)
-        self._watchdog = Watchdog(watchdog, PATIENCE * factor)
+        self._watchdog = Watchdog(watchdog, STUCK_SECONDS * factor)
         self._stop_moment = float("inf")  # at which a signal asked the process to end
         self._health = Publisher(HEALTH, self.endpoint, sender=name)
         self._reported = 0.0
@@ -123,8 +122,8 @@ class Process:
         """
         self._watchdog.beat()
         if now:  # this may be the last turn, and closing the sockets may take long
-            self._watchdog.allow(_CLOSE_SECONDS)
-        if now or time.monotonic() - self._reported >= _HEALTH_SECONDS:
+            self._watchdog.allow(CLOSE_SECONDS)
+        if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
             own = counters() | rejects()
             self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects()))

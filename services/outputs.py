@@ -11,6 +11,7 @@ import numpy as np
 from catstream.messages.kinds import End, Features, Track, Tracks
 from catstream.services.loop import RECORDER, Process
 from catstream.services.previews import Previews
+from catstream.services.timing import TURN_SECONDS
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES, RESULTS, TRACKS, TRAINING
 from catstream.wire.newest import Publisher
@@ -19,8 +20,6 @@ __all__ = ["DataSender", "Outputs"]
 
 #: Sends one of the two streams that are received without a loss.
 DataSender = Sender[Features | End] | Sender[Tracks | End]
-
-_TURN_SECONDS = 0.02  # the longest wait for an acknowledgement in one turn of a loop
 
 
 class Outputs:
@@ -57,7 +56,7 @@ class Outputs:
     def poll(self, awaited: str | None = None) -> None:
         """Process acknowledgements; wait a short time for one on the channel `awaited`."""
         for name, sender in self.senders.items():
-            sender.poll(_TURN_SECONDS if name == awaited else 0)
+            sender.poll(TURN_SECONDS if name == awaited else 0)
 
     def serve_late_joiners(self) -> None:
         """Send the first message or the newest preview to new subscribers."""

@@ -8,14 +8,13 @@ import numpy as np
 
 from catstream.box import Box
 from catstream.messages.kinds import Preview
+from catstream.services.timing import PREVIEW_SECONDS
 from catstream.video.preview import jpeg
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
 __all__ = ["Previews"]
-
-_PERIOD = 0.1  # shortest time between two pictures, in seconds
 
 
 class Previews(Publisher[Preview]):
@@ -41,7 +40,7 @@ class Previews(Publisher[Preview]):
     def turn(self) -> None:
         """Send a preview if one is due; call it in every turn, even if no frame arrives, as subscribers may join."""
         self.serve_late_joiners()
-        if self._waiting is None or not self.has_subscribers or monotonic() - self._shown < _PERIOD:
+        if self._waiting is None or not self.has_subscribers or monotonic() - self._shown < PREVIEW_SECONDS:
             return
         (frame, image, boxes), self._waiting, self._shown = self._waiting, None, monotonic()
         height, width = image.shape[:2]

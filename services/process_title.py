@@ -1,15 +1,35 @@
-"""The title of a process: what `ps`, `top` and `pgrep` show in place of its command."""
+"""The title of a process, which `ps`, `top` and `pgrep` show in place of its command; and its state in the kernel."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["set_process_title"]
+__all__ = ["is_suspended", "process_fields", "set_process_title"]
 
 _SET_NAME = 15  # PR_SET_NAME
-_ARGUMENTS = slice(47, 49)  # fields of /proc/self/stat: the first and the last address of the command's arguments
+_STATE, _ARGUMENTS = 3, slice(48, 50)  # fields of /proc/PID/stat: the state; the addresses of the command's arguments
+
+
+def process_fields(pid: int) -> list[str]:
+    """The fields of /proc/PID/stat by their numbers in `man proc`; those before the state are empty.
+
+    Raises
+    ------
+    OSError
+        If the process has ended.
+    """
+    # The second field is the name of the program, which may contain spaces.
+    return ["", "", "", *Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()]
+
+
+def is_suspended(pid: int) -> bool:
+    """Whether a signal such as SIGSTOP has stopped a process."""
+    with suppress(OSError):  # it has ended
+        return process_fields(pid)[_STATE] == "T"
+    return False
 
 
 def set_process_title(name: str) -> None:
@@ -20,9 +40,7 @@ def set_process_title(name: str) -> None:
     """
     ctypes.CDLL(None).prctl(_SET_NAME, name.encode(), 0, 0, 0)
     with suppress(OSError, ValueError):
-        # The second field is the name of the program, which may contain spaces.
-        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        begin, end = (int(field) for field in fields[_ARGUMENTS.start - 2 : _ARGUMENTS.stop - 2])
+        begin, end = map(int, process_fields(os.getpid())[_ARGUMENTS])
         title = f"catstream {name}".encode()[: max(end - begin - 2, 0)]
         # If the last byte is not 0, the kernel takes the memory for a title, and shows it up to the first 0.
         ctypes.memmove(begin, title.ljust(end - begin - 1, b"\0") + b".", end - begin)

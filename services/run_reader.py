@@ -16,6 +16,7 @@ from catstream.messages.kinds import End, Health, ObjectPosition, Position, Trac
 from catstream.run.job import Job
 from catstream.services.start_server import start_server_lines
 from catstream.services.supervisor import Supervisor
+from catstream.services.timing import EXIT_SECONDS, LOOK_SECONDS, TURN_SECONDS
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import HEALTH, RESULTS
 from catstream.wire.endpoint import Endpoint
@@ -24,9 +25,6 @@ from catstream.wire.readable import Wait
 
 __all__ = ["RunReader"]
 
-_CHECK_SECONDS = 0.02  # from one look at the processes to the next
-_EXIT_SECONDS = 12.0  # time for the detector to exit after the end of the stream was received
-_TURN_SECONDS = 0.01  # from one turn to the next meanwhile
 
 _log = logging.getLogger(__name__)
 
@@ -100,7 +98,7 @@ class RunReader:
         deadline = monotonic() + seconds
         while self.end is None:
             tracks = self._receive()
-            if (now := monotonic()) - self._checked > _CHECK_SECONDS:
+            if (now := monotonic()) - self._checked > TURN_SECONDS:
                 self._checked = now
                 self._check_processes()
             if tracks is not None:
@@ -108,7 +106,7 @@ class RunReader:
             if now >= deadline:
                 return {}
             if not self._incoming.pending():
-                yield Wait([self._incoming], min(_CHECK_SECONDS, deadline - now))
+                yield Wait([self._incoming], min(TURN_SECONDS, deadline - now))
         yield from self._exit()
         if self.end.failed:
             raise VideoError(self.end.reason)
@@ -170,9 +168,9 @@ class RunReader:
 
     def _exit(self) -> Generator[Wait, None, None]:
         """Wait until the detector has exited; it does so once its last message is acknowledged."""
-        deadline = monotonic() + _EXIT_SECONDS
+        deadline = monotonic() + EXIT_SECONDS
         while not self.supervisor.finished and monotonic() < deadline:
-            yield Wait([], _TURN_SECONDS)
+            yield Wait([], LOOK_SECONDS)
             self._incoming.receive(0)
             self.receive_health()
             self.supervisor.check_children()

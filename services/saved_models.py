@@ -9,14 +9,13 @@ from catstream.compression.compressor import Compressor
 from catstream.errors import ServiceError
 from catstream.messages.kinds import SavedModel
 from catstream.run.learned import Learned
+from catstream.services.timing import SAVED_MODEL_SECONDS
 from catstream.settings import Settings
 from catstream.wire.channels import SAVED_MODELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
 __all__ = ["SavedModels"]
-
-_PERIOD = 1.0  # shortest time between two files of one object, in seconds
 
 
 class SavedModels(Publisher[SavedModel]):
@@ -37,7 +36,7 @@ class SavedModels(Publisher[SavedModel]):
             return
         for name, compressor in compressors.items():
             version, moment = self._sent.get(name, (0, 0.0))
-            if compressor.version > version and (not version or monotonic() - moment >= _PERIOD):
+            if compressor.version > version and (not version or monotonic() - moment >= SAVED_MODEL_SECONDS):
                 self._send(name, compressor)
 
     def _send(self, name: str, compressor: Compressor) -> None:

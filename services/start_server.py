@@ -16,7 +16,8 @@ The server has one thread: a fork copies only the thread that calls it, and a lo
 locked in the copy. If a library has started a thread, the server starts each process without forking, and logs that.
 
 The kernel kills these processes when the server ends, and the server ends with its program, however that ended. If the
-server is killed, its processes are restarted like any that died, by a new server.
+server is killed, its processes are restarted like any that died, by a new server. A server of one program that a signal
+has stopped is killed as soon as one of its processes stands still or waits for its start.
 
 Several programs can share a server, such as the streams of a fleet on one node (`share_start_server`). It ends with a
 process that outlives them; if one of the programs ends, the server kills the processes of that one. A program finds the
@@ -51,8 +52,9 @@ from weakref import WeakSet
 from catstream.errors import ServiceError
 from catstream.numerics.threads import limit_process
 from catstream.services.process_log import ProcessLog
-from catstream.services.process_title import set_process_title
+from catstream.services.process_title import is_suspended, process_fields, set_process_title
 from catstream.services.start import environment, import_path, python_command, service_command
+from catstream.services.timing import KILLED_SECONDS, LOOK_SECONDS, SHARED_SECONDS, STOPPED_SECONDS
 
 __all__ = [
     "NAMES",
@@ -71,10 +73,8 @@ NAMES = ("detector", "compressor", "trainer")
 _ANSWER = struct.Struct("=i")  # the process id, 0 if it could not be started; the exit code, or minus the signal
 #: Beginnings of the environment variables that libraries read when they are imported.
 _READ_BY_IMPORTS = ("LD_", "MKL_", "NPY_", "NUMBA_", "OMP_", "OPENBLAS_", "OPENCV_", "PYTHON", "XDG_CACHE_HOME")
+_BEGAN = 22  # field of a process: the moment at which it began
 _CREDENTIALS = struct.Struct("=iii")  # process, user and group of the other end of a Unix socket
-_END_SECONDS = 5.0  # limit for the end of a process that was killed
-_SHARED_SECONDS = 2.0  # limit to connect to a shared server, which another program may be starting
-_PAUSE_SECONDS = 0.01  # between two attempts
 _log = logging.getLogger(__name__)
 
 
@@ -111,10 +111,11 @@ class StartedProcess:
     Parameters
     ----------
     answers : socket on which the server sends the process id, and later the exit code
+    server : process id of the server; 0 if it is not known
     """
 
-    def __init__(self, answers: socket.socket) -> None:
-        self._answers = answers
+    def __init__(self, answers: socket.socket, server: int) -> None:
+        self._answers, self._server = answers, server
         self._pid: int | None = None
         self._code: int | None = None
 
@@ -122,7 +123,8 @@ class StartedProcess:
     def pid(self) -> int:
         """Process id; waits until the server has started the process. 0 if it could not be started."""
         while self._pid is None and self._code is None:
-            self._receive(None)
+            if not self._receive(STOPPED_SECONDS) and self.is_suspended:
+                self.kill()
         return self._pid or 0
 
     def poll(self) -> int | None:
@@ -137,6 +139,18 @@ class StartedProcess:
             pass
         return self._code is not None
 
+    @property
+    def is_suspended(self) -> bool:
+        """Whether a signal such as SIGSTOP has stopped the process, or its server, which then reports no end of it."""
+        return any(map(is_suspended, filter(None, (self._pid, self._server))))
+
+    def kill(self) -> None:
+        """Kill the process if it runs; its server too, with all processes, if a signal has stopped that."""
+        if self.poll() is None and self._server and is_suspended(self._server):
+            with suppress(ProcessLookupError):
+                os.kill(self._server, signal.SIGKILL)
+        self.send_signal(signal.SIGKILL)
+
     def send_signal(self, number: int) -> None:
         """Send a signal to the process, unless it has ended. One that was not started yet is not started any more."""
         if self.poll() is not None:
@@ -150,11 +164,11 @@ class StartedProcess:
 
     def close(self) -> None:
         """Kill the process if it runs, and wait until it has ended."""
-        self.send_signal(signal.SIGKILL)
-        self.wait(_END_SECONDS)
+        self.kill()
+        self.wait(KILLED_SECONDS)
         self._answers.close()
 
-    def _receive(self, seconds: float | None) -> bool:
+    def _receive(self, seconds: float) -> bool:
         """Receive the next answer; returns whether one arrived in time."""
         self._answers.settimeout(seconds)
         try:
@@ -248,7 +262,7 @@ class StartServer:
             except OSError:
                 ours.close()
                 raise
-        process = StartedProcess(ours)
+        process = StartedProcess(ours, self.pid)
         self._processes.add(process)
         return process
 
@@ -285,10 +299,10 @@ def _start(requests: socket.socket, program: int, log: int | None, first: str = 
 def _connected(program: int) -> socket.socket:
     """A connection to the server that ends with a program and has imported what this process would; it may be new."""
     os.close(os.pidfd_open(program))  # it lives, and the server will see its end
-    began = Path(f"/proc/{program}/stat").read_text().rpartition(") ")[2].split()[19]
+    began = process_fields(program)[_BEGAN]
     key = json.dumps([os.getuid(), program, began, _imports()], sort_keys=True)  # variables have no order
     name = f"\0catstream-start-{hashlib.sha256(key.encode()).hexdigest()}"  # the kernel removes it with the server
-    deadline = time.monotonic() + _SHARED_SECONDS
+    deadline = time.monotonic() + SHARED_SECONDS
     while True:
         requests = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
@@ -307,7 +321,7 @@ def _connected(program: int) -> socket.socket:
             try:
                 listener.bind(name)
             except OSError:  # another program has bound it, and will listen
-                time.sleep(_PAUSE_SECONDS)
+                time.sleep(LOOK_SECONDS)
                 continue
             listener.listen()
             # The server is no child of this process, whose end may be that of all its children.

@@ -17,16 +17,19 @@ from catstream.run.job import Job
 from catstream.services.child import Child
 from catstream.services.loop import PERMANENT_FAILURE, SOURCE_FAILED
 from catstream.services.start_server import NAMES
+from catstream.services.timing import (
+    APART_SECONDS,
+    RECENT_SECONDS,
+    RESTART_SECONDS,
+    RESTARTS,
+    SHUTDOWN_SECONDS,
+    TURN_SECONDS,
+)
 from catstream.video.frames import without_password
 from catstream.video.source import is_live
 from catstream.wire.endpoint import meeting_place, private_folder
 
 __all__ = ["Supervisor", "main"]
-
-_RESTARTS, _PER_SECONDS = 5, 60.0
-_PAUSE_SECONDS = 0.1  # before the second restart in a minute; doubled for each further one
-_SHUTDOWN_SECONDS = 12.0  # time for all children to end before they are killed
-_APART_SECONDS = 3.0  # the most between the end of another process and that of the detector, if both end well
 
 _log = logging.getLogger(__name__)
 
@@ -98,7 +101,7 @@ class Supervisor:
                 self._check_hanging(child, self._checked - before)
             elif child.finished:
                 # Only this child was asked to end, or the detector died after it sent its end and has to repeat it.
-                if now - child.seen > _APART_SECONDS:
+                if now - child.seen > APART_SECONDS:
                     child.start()
             else:
                 self._restart(child, child.code, now)
@@ -116,8 +119,8 @@ class Supervisor:
         if code == PERMANENT_FAILURE:
             raise ServiceError(child.log.last_line())
         child.restarts.append(now)
-        recent = sum(now - moment < _PER_SECONDS for moment in child.restarts)
-        if recent > _RESTARTS:
+        recent = sum(now - moment < RECENT_SECONDS for moment in child.restarts)
+        if recent > RESTARTS:
             raise ServiceError(
                 f"the {child.name} died {recent} times in a minute, the last time with {_ending(code)}: "
                 f"{child.log.last_line()}"
@@ -126,7 +129,7 @@ class Supervisor:
         if recent == 1:
             child.start()
         else:
-            child.schedule(now + _PAUSE_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1))
+            child.schedule(now + RESTART_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1))
 
     def stop(self, turn: Callable[[], object] = lambda: None) -> None:
         """End all children: each is asked to end, and killed if it does not.
@@ -135,7 +138,7 @@ class Supervisor:
         ----------
         turn : called while it waits; receives what the children still send
         """
-        deadline = time.monotonic() + _SHUTDOWN_SECONDS
+        deadline = time.monotonic() + SHUTDOWN_SECONDS
         try:
             for child in self._children.values():  # the detector first: its last messages need the others
                 child.terminate(max(0.1, deadline - time.monotonic()), turn)
@@ -157,7 +160,7 @@ def main(job: Job) -> int:
     with private_folder() as folder, meeting_place(settings.run.endpoint, folder, settings.run.keys, shown) as endpoint:
         supervisor = Supervisor(replace(job, endpoint=str(endpoint)), folder)
         try:
-            while not supervisor.finished and not ended.wait(0.05):
+            while not supervisor.finished and not ended.wait(TURN_SECONDS):
                 supervisor.check_children()
             if failure := supervisor.failure:
                 _log.error("%s", failure)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from catstream.messages.kinds import End
 from catstream.numerics import ridge
 from catstream.services.loop import Process
+from catstream.services.timing import MESSAGE_SECONDS, TRAIN_SECONDS
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.newest import Publisher, Subscriber
@@ -12,7 +13,6 @@ from catstream.wire.newest import Publisher, Subscriber
 __all__ = ["main", "prepare"]
 
 _NONE = {"version": 0.0, "trained": 0.0}
-_TRAIN_SECONDS = 60.0  # limit for training a model
 
 
 def prepare() -> None:
@@ -26,14 +26,14 @@ def main(process: Process) -> None:
     trained: dict[str, dict[str, float]] = {}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:
         while not process.stop_requested:
-            message = samples.receive(0.1)  # of the object that has waited longest
+            message = samples.receive(MESSAGE_SECONDS)  # of the object that has waited longest
             if isinstance(message, End):
                 process.source_failed = message.failed
                 process.beat(lambda: _totals(trained), lambda: trained, now=True)
                 return
             # An older version comes from a restarted compressor that lost the newer one; a detector may need its model.
             if message is not None and message.version != trained.get(message.object, _NONE)["version"]:
-                process.allow(_TRAIN_SECONDS)
+                process.allow(TRAIN_SECONDS)
                 models.send(trainer.train(message))
                 count = trained.pop(message.object, _NONE)["trained"] + 1
                 trained[message.object] = {"version": float(message.version), "trained": count}

@@ -10,14 +10,11 @@ import mmap
 import os
 import time
 
-__all__ = ["PATIENCE", "Watchdog"]
+from catstream.services.timing import LONGEST_STUCK_SECONDS, START_SECONDS, STUCK_SECONDS
 
-#: Seconds without a turn after which a loop with short turns counts as stuck.
-PATIENCE = 2.5
+__all__ = ["Watchdog"]
 
 _SIZE = 16  # two float64: turns, and patience
-_START_SECONDS = 120.0  # for imports and compiling kernels
-_LONGEST_SECONDS = 60.0  # upper limit of the patience that follows from slow turns
 _TURNS_LONG = 5.0  # patience as a multiple of the slowest recent turn
 _FADES = 0.99  # factor by which the slowest recent turn is forgotten with each turn
 
@@ -31,7 +28,7 @@ class Watchdog:
     least : seconds that any turn may take
     """
 
-    def __init__(self, handle: int | None = None, least: float = PATIENCE) -> None:
+    def __init__(self, handle: int | None = None, least: float = STUCK_SECONDS) -> None:
         made = handle is None
         self.handle = os.memfd_create("watchdog") if handle is None else handle
         if made:
@@ -40,7 +37,7 @@ class Watchdog:
         self._least, self._slowest, self._last = least, 0.0, time.monotonic()
         self._allowed = True  # the first turn is the start
         if made:
-            self._cells[1] = _START_SECONDS
+            self._cells[1] = START_SECONDS
 
     @property
     def turns(self) -> float:
@@ -58,7 +55,7 @@ class Watchdog:
         if not self._allowed:
             self._slowest = max(now - self._last, _FADES * self._slowest)
         self._last, self._allowed = now, False
-        self._cells[1] = max(self._least, min(_TURNS_LONG * self._slowest, _LONGEST_SECONDS))
+        self._cells[1] = max(self._least, min(_TURNS_LONG * self._slowest, LONGEST_STUCK_SECONDS))
         self._cells[0] += 1
 
     def allow(self, seconds: float) -> None:

@@ -43,7 +43,7 @@ def test_a_detector_that_has_ended_with_the_stream_is_no_failure(pipeline, monke
         check(supervisor)
 
     monkeypatch.setattr(Supervisor, "check_children", check_late)
-    monkeypatch.setattr(run_reader, "_CHECK_SECONDS", 0)
+    monkeypatch.setattr(run_reader, "TURN_SECONDS", 0)
     assert [track.frame for track in pipeline] == list(range(20))
 
 

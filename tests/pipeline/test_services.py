@@ -18,7 +18,7 @@ from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
 from catstream.run.job import Job
 from catstream.run.state import TREES
-from catstream.services.start_server import NAMES
+from catstream.services.start_server import NAMES, start_server
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.sinks.recording.file import Recording
@@ -198,6 +198,22 @@ def check_for_a_minute(supervisor, turn=lambda: None):
         turn()
         supervisor.check_children()
         time.sleep(0.01)
+
+
+def test_a_start_server_that_a_signal_has_stopped_is_replaced_once_a_process_has_to_be_restarted(video):
+    path, boxes = video
+    tracks = []
+    with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16})) as pipeline:
+        for track in pipeline:
+            tracks.append(track.frame)
+            if track.frame == 5:
+                stopped = start_server().pid
+                os.kill(stopped, signal.SIGSTOP)
+                os.kill(pipeline.pids["detector"], signal.SIGKILL)
+        assert start_server().pid != stopped
+        assert not psutil.pid_exists(stopped)
+        assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(boxes), len(boxes))
+    assert tracks == list(range(len(boxes)))
 
 
 def test_processes_that_hang_are_detected_and_replaced(video):

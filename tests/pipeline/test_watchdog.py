@@ -7,7 +7,8 @@ import time
 import pytest
 
 from catstream.services.detector import opening_seconds
-from catstream.services.watchdog import PATIENCE, Watchdog
+from catstream.services.timing import STUCK_SECONDS
+from catstream.services.watchdog import Watchdog
 
 
 @pytest.fixture
@@ -22,11 +23,11 @@ def test_a_watchdog_counts_each_iteration(watchdog):
     for turn in range(1, 4):
         loop.beat()
         assert watchdog.turns == turn
-    assert watchdog.patience == PATIENCE
+    assert watchdog.patience == STUCK_SECONDS
 
 
 def test_a_starting_process_has_a_longer_time_limit_than_a_running_one(watchdog):
-    assert watchdog.patience > 20 * PATIENCE
+    assert watchdog.patience > 20 * STUCK_SECONDS
 
 
 def test_only_the_announced_long_step_extends_the_time_limit(watchdog):
@@ -34,7 +35,7 @@ def test_only_the_announced_long_step_extends_the_time_limit(watchdog):
     watchdog.allow(60)
     assert watchdog.patience == 60
     watchdog.beat()
-    assert watchdog.patience == PATIENCE
+    assert watchdog.patience == STUCK_SECONDS
 
 
 def test_the_time_limit_follows_the_duration_of_recent_iterations(watchdog, monkeypatch):
@@ -46,14 +47,14 @@ def test_the_time_limit_follows_the_duration_of_recent_iterations(watchdog, monk
     assert watchdog.patience == pytest.approx(20, rel=0.1)
     for _ in range(500):
         watchdog.beat()
-    assert watchdog.patience == PATIENCE
+    assert watchdog.patience == STUCK_SECONDS
 
 
 def test_a_longer_time_limit_applies_to_each_iteration(watchdog):
     watchdog.allow_each(6)
     for _ in range(3):
         watchdog.beat()
-        assert watchdog.patience == PATIENCE + 6
+        assert watchdog.patience == STUCK_SECONDS + 6
     watchdog.allow(60)
     assert watchdog.patience == 60
 

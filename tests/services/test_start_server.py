@@ -123,6 +123,14 @@ def test_a_process_that_is_ended_before_it_was_started_does_not_run(server, star
     assert watchdog.turns == 0
 
 
+def test_a_server_that_a_signal_has_stopped_is_killed_if_a_process_waits_for_its_start(server, start):
+    os.kill(server.pid, signal.SIGSTOP)
+    process, _, _ = start()
+    assert process.pid == 0
+    assert process.poll() == -signal.SIGKILL
+    assert psutil.Process(start()[0].pid).ppid() == start_server().pid != server.pid
+
+
 def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_path):
     (tmp_path / "job").write_text("not a job")
     process, _, log = start(tmp_path / "job")
