@@ -282,16 +282,22 @@ def _imports() -> tuple[list[str], dict[str, str]]:
 
 def _start(requests: socket.socket, program: int, log: int | None, first: str = "") -> subprocess.Popen[bytes]:
     """Start the process of a server, which runs the statement `first` before anything else."""
+    main = f"{first}from catstream.services.start_server import main; main({requests.fileno()}, {program})"
+    return _run(python_command(main), requests.fileno(), log, "/", environment())
+
+
+def _run(
+    command: list[str], passed: int, log: int | None, folder: str, variables: dict[str, str]
+) -> subprocess.Popen[bytes]:
+    """Run a command that inherits one descriptor and the log."""
     return subprocess.Popen(
-        python_command(
-            f"{first}from catstream.services.start_server import main; main({requests.fileno()}, {program})"
-        ),
-        env=environment(),
-        cwd="/",
+        command,
+        env=variables,
+        cwd=folder,
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,  # a reader of the program's output would wait for the server's end
+        stdout=subprocess.DEVNULL,  # a reader of the program's output would wait for the end of the command
         stderr=log,
-        pass_fds=[requests.fileno()],
+        pass_fds=[passed],
         start_new_session=True,  # Ctrl-C is for the program, which then ends its processes in order
     )
 
@@ -548,15 +554,8 @@ def _import(name: str) -> None:
 def _spawn(request: Request, log: int, watchdog: int) -> int:
     """Start a process without forking; returns its process id."""
     command = service_command("child", request.name, request.job, "--parent", str(os.getpid()))
-    process = subprocess.Popen(
-        [*command, "--watchdog", str(watchdog), *["--restarted"] * request.restarted],
-        env=request.environment,
-        cwd=request.folder,
-        stdin=subprocess.DEVNULL,
-        stderr=log,
-        pass_fds=[watchdog],
-        start_new_session=True,
-    )
+    command += ["--watchdog", str(watchdog), *["--restarted"] * request.restarted]
+    process = _run(command, watchdog, log, request.folder, request.environment)
     process.returncode = 0  # the server waits for its end as for that of the others
     return process.pid
 
