@@ -10,7 +10,6 @@ from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
 from catstream.messages import storage
 from catstream.messages.kinds import End, Features
-from catstream.run.job import Job
 from catstream.run.learned import begun
 from catstream.run.state import TREES, locked
 from catstream.services.loop import Process
@@ -66,7 +65,9 @@ class CompressorLoop:
     def __init__(self, process: Process, stack: ExitStack) -> None:
         job, settings, endpoint = process.job, process.settings, process.endpoint
         self._process = process
-        self._checkpoints = _checkpoints(job, stack)
+        self._checkpoints: CheckpointStore | None = None
+        if job.state is not None:
+            self._checkpoints = CheckpointStore(stack.enter_context(locked(job.state / TREES, LOCK_SECONDS)))
         self._forest = self._checkpoints.load(settings) if self._checkpoints is not None else Forest(settings)
         position = self._forest.position
         self._progress = Progress(position, position.seq, time.monotonic())
@@ -85,7 +86,7 @@ class CompressorLoop:
     @property
     def must_stop(self) -> bool:
         """Whether the process was asked to end, and a connected detector did not send its end in time."""
-        return self._process.stop_requested_for(SENDER_SECONDS if self._features.has_sender else 0)
+        return self._process.seconds_since_stop >= (SENDER_SECONDS if self._features.has_sender else 0)
 
     def receive(self) -> Features | End | None:
         """The next message, None if none arrives in a tenth of a second."""
@@ -163,8 +164,3 @@ class CompressorLoop:
         if self._recorder is not None:
             own |= {"recorded": self._recorder.written, "unrecorded": float(self._recorder.failed != "")}
         return self._forest.counters() | own
-
-
-def _checkpoints(job: Job, stack: ExitStack) -> CheckpointStore | None:
-    """The checkpoints of a run, locked for this process; None if the run has no state folder."""
-    return None if job.state is None else CheckpointStore(stack.enter_context(locked(job.state / TREES, LOCK_SECONDS)))

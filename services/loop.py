@@ -104,10 +104,6 @@ class Process:
         """The settings of the pipeline, which a recording needs to repeat the learning."""
         return Run.from_settings(self.settings.portable())
 
-    def stop_requested_for(self, seconds: float) -> bool:
-        """Whether a signal asked the process to end at least `seconds` ago."""
-        return self.seconds_since_stop >= seconds
-
     def beat(
         self,
         counters: Callable[[], dict[str, float]],
