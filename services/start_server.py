@@ -416,7 +416,7 @@ class _Server:
             self._poll.register(program_end, select.POLLIN)
         except OSError:  # a kernel before 5.3: then only the end of the socket shows the end of the program
             if self._is_shared:  # it has ended meanwhile
-                raise
+                raise SystemExit(0) from None
         self._logged = False
 
     def serve(self) -> tuple[Request, int] | None:
