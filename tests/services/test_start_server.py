@@ -311,7 +311,7 @@ def test_a_shared_server_whose_process_has_ended_before_it_started_ends_too():
         listener.bind("")  # any free name
         listener.listen()
         server = module._start(listener, node.pid, subprocess.DEVNULL)
-    assert server.wait(60) != 0
+    assert server.wait(60) == 0
 
 
 def test_a_start_server_of_another_user_is_not_used(monkeypatch):
