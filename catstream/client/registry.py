@@ -216,7 +216,10 @@ class Registry:
         if fleet or not known:
             which = f"no fleet {fleet!r} of yours" if fleet else "no fleet of yours"
             listed = f"; there is {', '.join(sorted(known))}" if known else ""
-            raise ServiceError(f"{which} is running: start it (catstream fleet up), or give HOST:PORT of one{listed}")
+            raise ServiceError(
+                f"{which} is running: start it (catstream fleet up), wait some seconds if a node of it has just died, or "
+                f"give HOST:PORT of one{listed}"
+            )
         names = ", ".join(sorted(known))
         raise ServiceError(
             f"{len(known)} fleets are running: say which (--fleet NAME, or fleet://NAME/STREAM): {names}"
