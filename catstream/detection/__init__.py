@@ -1,1 +1,1 @@
-"""Finds the object in a frame with the newest model."""
+"""Finds the objects in a frame with their newest models, and chooses the training rows."""

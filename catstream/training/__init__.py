@@ -1,0 +1,1 @@
+"""Trains a model from a sample of the coreset trees, and estimates the motion of the object by EM."""

@@ -1,1 +1,1 @@
-"""Reads frames from sources, and writes results files and annotated videos."""
+"""Reads frames from files, cameras and streams; writes and draws on videos; renders the test videos."""

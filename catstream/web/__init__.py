@@ -1,4 +1,4 @@
-"""The web page of a running pipeline: live view, control and metrics."""
+"""The web page of a pipeline or of a fleet: live view, control and metrics."""
 
 from catstream.errors import require_extra
 

@@ -1,1 +1,1 @@
-"""Recordings: the messages of a run in one file, to be played to subscribers or to be trained from again."""
+"""Recordings: the messages of a run in MCAP files, to be played to subscribers or to be trained from again."""
