@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -145,15 +144,13 @@ def test_the_address_of_a_camera_is_used_unchanged():
 
 
 @PROCESSES
-def test_the_health_check_receives_from_its_process_and_detects_silence(name):
+def test_the_health_check_receives_from_its_process_and_detects_silence(name, tcp):
     *command, script, address = SERVICES[name]["healthcheck"]["test"]
     assert command == ["CMD", "python", "-P", "-c"]
     compose = Endpoint.parse(settings(name).run.endpoint)
     assert address == compose.address(CHANNELS["health"], name)
 
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        first = min(probe.getsockname()[1], 65000)
-    endpoint = Endpoint.parse(f"tcp://127.0.0.1:{first}")
+    endpoint = Endpoint.parse(tcp)
     check = [sys.executable, "-c", script, endpoint.address(CHANNELS["health"], name)]
     assert subprocess.run([*check[:2], script.replace("5000", "300"), check[3]]).returncode == 1
     with Publisher(HEALTH, endpoint, name) as health, subprocess.Popen(check) as hearing:
