@@ -1,1 +1,1 @@
-"""What is built on the tracker: evaluation, finding, summaries and load tests, and the HTML of their reports."""
+"""Applications of the tracker: evaluation, finding, summaries and load tests, and the HTML of their reports."""

@@ -1,4 +1,4 @@
-"""What the compiler of kernels and their calls have in common: parameters, names and the processor."""
+"""Parameters, names and the processor of kernels, shared by their compiler and their calls."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def parameters(signature: str) -> list[Parameter]:
 
 
 def globals_of(function: FunctionType) -> dict[str, Any]:
-    """What a function reads from its module, by name."""
+    """The values that a function reads from its module, by name."""
     return dict(inspect.getclosurevars(function).globals)
 
 

@@ -71,7 +71,7 @@ class StreamActor(Stream):
 
 @dataclass(slots=True)
 class _Known:
-    """What the controller knows of a stream.
+    """The controller's knowledge of a stream.
 
     seen      its actor
     handle    of Ray, if there is an actor
