@@ -112,10 +112,12 @@ def forks(record: Record) -> Iterator[Table]:
 
 
 def robustness(record: Record) -> Iterator[Table]:
-    """Select the means of all trackers and starts, and the AUC of each tracker by attribute."""
+    """Select the means of all trackers and starts, the AUC of each tracker by attribute, and the losses."""
     yield from select(0)(record)
     columns = record["tables"][1]["columns"]
     yield from select(1, columns=[*columns[:6], *(column for column in columns[6:] if column.endswith(" AUC"))])(record)
+    if len(record["tables"]) > 2:  # the parts of which losses are counted were run
+        yield from select(2)(record)
 
 
 def load(record: Record) -> Iterator[Table]:

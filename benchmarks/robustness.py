@@ -5,7 +5,9 @@
     sre     spatial robustness: 12 first boxes, shifted or scaled
     jitter  several first boxes that differ by at most 2 %
 
-The standard error is over the sequences; runs over one sequence are alike, and count as one.
+A run is lost if fewer than half of the frames in its last quarter have an overlap above 0.5: such losses are counted
+over the runs of `tre` and `jitter`. The standard error is over the sequences; runs over one sequence are alike, and
+count as one.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from catstream.settings import Settings
 PARTS = ("ope", "tre", "sre", "jitter")
 ATTRIBUTES = Path(__file__).with_name("attributes.json")
 COLUMNS = ("tracker", "starts", "group", "sequences", "AUC", "AUC ±", "success", "success ±", "F", "F ±", "flip")
+LOSSES = ("tracker", "group", "sequences", "runs", "lost", "mean", "±")
 
 #: The rows of each tracker and part.
 Found = Mapping[tuple[str, str], list[Row]]
@@ -48,10 +51,13 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         for part in own:
             starts = {sequence.name: set(chosen[part](sequence)) for sequence in sequences}
             found[tracker, part] = rows_of(run for run in runs if run.start in starts[run.sequence.name])
-    yield overview(found, described(options), groups_of(sequences))
+    groups = groups_of(sequences)
+    yield overview(found, described(options), groups)
     attributes = {"any": [sequence.name for sequence in sequences]}
     attributes |= attributes_of(sequences, seen)
     yield by_attribute(found, attributes)
+    if lost := list(losses(found, groups)):
+        yield Table("Losses", LOSSES, lost, "mean: of the share of the runs of a sequence; ±: its standard error")
 
 
 def starts_by_part(options: argparse.Namespace) -> dict[str, Starts]:
@@ -115,6 +121,18 @@ def summarised(rows: list[Row]) -> Iterator[float | None]:
     """Return the mean and the standard error of AUC, success and F-score."""
     for measure in ("auc", "success", "f_score"):
         yield from mean_and_error([getattr(row, measure) for row in rows])
+
+
+def losses(found: Found, groups: Mapping[str, set[str]]) -> Iterator[list[Cell]]:
+    """Yield the lost runs of each tracker and group, over the runs from several frames and from several first boxes."""
+    for tracker in dict.fromkeys(tracker for tracker, _ in found):
+        measured = [row for part in ("tre", "jitter") for row in found.get((tracker, part), [])]
+        for group, names in groups.items():
+            runs = {name: [row.runs for row in measured if row.name == name] for name in sorted(names)}
+            lost = {name: [row.lost * row.runs for row in measured if row.name == name] for name in runs}
+            if total := sum(map(sum, runs.values())):
+                shares = [sum(lost[name]) / sum(runs[name]) for name in runs]
+                yield [tracker, group, len(runs), total, round(sum(map(sum, lost.values()))), *mean_and_error(shares)]
 
 
 def flips(rows: list[Row], part: str) -> int | None:

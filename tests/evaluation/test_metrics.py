@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 from catstream.applications.evaluation.metrics import (
     PIXELS,
     distances,
+    is_lost,
     long_term,
     overlaps,
     precision_plot,
@@ -126,6 +127,34 @@ def test_a_tracker_without_boxes_scores_zero():
     assert (result.auc, result.success, result.precision, result.normalised_precision) == (0, 0, 0, 0)
     assert result.long_term is not None
     assert result.long_term.f_score == 0
+
+
+@pytest.mark.parametrize(
+    ("followed", "lost"),
+    [
+        ([True] * 8, False),
+        ([False] * 6 + [True, True], False),
+        ([True] * 6 + [True, False], False),  # half of the last quarter
+        ([True] * 6 + [False, False], True),
+        ([True] * 3 + [False] * 2, True),  # the last quarter of five frames is two
+        ([True] * 5 + [False, True, True, True], False),
+    ],
+)
+def test_a_run_is_lost_if_less_than_half_of_its_last_quarter_is_followed(followed, lost):
+    truth = np.tile([10.0, 10, 20, 20], (len(followed), 1))
+    boxes = np.where(np.array(followed)[:, None], truth, truth + 15)
+    assert is_lost(boxes, truth) == score(boxes, truth).lost == lost
+
+
+def test_frames_without_the_object_count_for_no_loss():
+    truth = np.tile([10.0, 10, 20, 20], (16, 1))
+    boxes = truth.copy()
+    truth[13:] = np.nan
+    assert not is_lost(boxes, truth)
+    boxes[12] = np.nan
+    assert is_lost(boxes, truth)
+    truth[12] = np.nan
+    assert not is_lost(boxes, truth)
 
 
 def test_plots_are_monotonic():

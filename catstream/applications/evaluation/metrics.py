@@ -7,6 +7,7 @@ frame, NaN if there is no box:
     success       its value at 0.5
     precision     share of frames whose centre is at most 20 pixels off
     normalised precision  mean of that share over 51 thresholds 0 ... 0.5, distances as parts of the object's size
+    lost          whether fewer than half of the frames in the last quarter have an overlap above 0.5
 
 Frames without the object do not count; frames in which the tracker reports no
 box count as missed. The values agree with the got10k toolkit. If the object is
@@ -16,6 +17,7 @@ tracker reports its absence: see `long_term`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +30,7 @@ __all__ = [
     "LongTerm",
     "Score",
     "distances",
+    "is_lost",
     "long_term",
     "overlaps",
     "precision_plot",
@@ -58,6 +61,7 @@ class Score:
     success: float
     precision: float
     normalised_precision: float
+    lost: bool  # see `is_lost`
     long_term: LongTerm | None
 
 
@@ -91,6 +95,17 @@ def success_plot(boxes: Float64, truth: Float64) -> Float64:
     """Return the share of frames with the object whose overlap exceeds each of `OVERLAPS`, float64 (21,)."""
     shares: Float64 = (overlaps(boxes, truth)[_present(truth), None] > OVERLAPS).mean(axis=0)
     return shares
+
+
+def is_lost(boxes: Float64, truth: Float64) -> bool:
+    """Return whether a run has lost the object in the end.
+
+    It has if fewer than half of the frames with the object in the last quarter of the run have an overlap above 0.5;
+    not if that quarter has no frame with the object.
+    """
+    last = slice(-math.ceil(len(truth) / 4), None)
+    followed = overlaps(boxes[last], truth[last])[_present(truth[last])] > 0.5
+    return bool(len(followed)) and bool(followed.mean() < 0.5)
 
 
 def precision_plot(boxes: Float64, truth: Float64) -> Float64:
@@ -150,6 +165,7 @@ def score(boxes: Float64, truth: Float64, confidence: Float64 | None = None) -> 
         success=float(success[10]),
         precision=float(precision_plot(boxes, truth)[20]),
         normalised_precision=float((off[:, None] <= _SHARES).mean()),
+        lost=is_lost(boxes, truth),
         long_term=None
         if present.all()
         else long_term(boxes, truth, np.ones(len(boxes)) if confidence is None else confidence),

@@ -43,9 +43,10 @@ class Row:
     """The measures of one tracker on one sequence: means over its runs.
 
     `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and `normalised_precision` are those of `metrics.py`,
-    from 0 to 1. `f_score` and its two components are None if the object is never absent. The spreads are standard
-    deviations over the runs. `flips` is None unless the runs have different first boxes; it is true if their smallest
-    and largest success differ by more than 0.25: then chance decides.
+    from 0 to 1. `lost` is the share of the runs that have lost the object in the end. `f_score` and its two components
+    are None if the object is never absent. The spreads are standard deviations over the runs. `flips` is None unless
+    the runs have different first boxes; it is true if their smallest and largest success differ by more than 0.25: then
+    chance decides.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Row:
     success_spread: float
     precision: float
     normalised_precision: float
+    lost: float
     f_score: float | None
     long_term_precision: float | None
     long_term_recall: float | None
@@ -158,6 +160,7 @@ def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
         success_spread=pstdev(success),
         precision=fmean(score.precision for score in scores),
         normalised_precision=fmean(score.normalised_precision for score in scores),
+        lost=fmean(score.lost for score in scores),
         f_score=_mean(part.f_score for part in long),
         long_term_precision=_mean(part.precision for part in long),
         long_term_recall=_mean(part.recall for part in long),
