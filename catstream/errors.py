@@ -121,6 +121,7 @@ class StoreError(FleetError):
 EXTRAS = {
     "view": ("the web page", ("prometheus_client", "starlette", "uvicorn")),
     "loadtest": ("the load test", ("hdrh", "psutil")),
+    "record": ("a recording", ("mcap",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
     "supervision": ("to_supervision", ("supervision",)),
     "fleet": ("a fleet", ("fsspec", "ray")),

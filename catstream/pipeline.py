@@ -19,7 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Self
 
-from catstream.errors import RecordingError, ServiceError, SettingsError
+from catstream.errors import RecordingError, ServiceError, SettingsError, require_extra
 from catstream.messages.kinds import Health, Position, Track
 from catstream.messages.names import Boxes, check_boxes
 from catstream.run.job import Job, Models, Results, files_by_name
@@ -103,6 +103,8 @@ class Pipeline:
         source cannot be read.
     RecordingError
         From the constructor, if the file to record to exists.
+    MissingExtraError
+        From the constructor, if `record` is given and its extra is not installed.
     SettingsError
         From the constructor, if the settings do not suit the source: a live one in lockstep.
     ServiceError, ProtocolError
@@ -395,5 +397,7 @@ def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
         raise SettingsError("a new run needs a source: give one")
     if job.settings.run.lockstep and is_live(job.source):
         raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
-    if record is not None and record.exists() and is_new:
-        raise RecordingError(f"{record} exists already: give another name, or remove it")
+    if record is not None:
+        require_extra("record")
+        if record.exists() and is_new:
+            raise RecordingError(f"{record} exists already: give another name, or remove it")

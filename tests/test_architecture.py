@@ -92,6 +92,7 @@ IMPORTERS = {
 #: Libraries that take long to import: inside the function that needs them.
 SLOW = {
     "sklearn",
+    "mcap",
     "av",
     "scipy",
     "filterpy",

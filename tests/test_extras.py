@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from catstream.errors import EXTRAS, MissingExtraError, install_command, require_extra
+from catstream.pipeline import Pipeline
+from catstream.sinks.recording.file import Recording
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 OPTIONAL = PROJECT["optional-dependencies"]
@@ -43,6 +45,15 @@ def test_a_missing_extra_is_an_error_with_the_install_command(monkeypatch, packa
         monkeypatch.delitem(sys.modules, name)
     with pytest.raises(MissingExtraError, match=rf'{EXTRAS[extra][0]} needs packages .* "catstream\[{extra}\]"'):
         importlib.import_module(package)
+
+
+def test_a_recording_without_its_extra_is_an_error_with_the_install_command(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    message = r'a recording needs packages .* "catstream\[record\]"'
+    with pytest.raises(MissingExtraError, match=message):
+        Recording(tmp_path / "run.mcap")
+    with pytest.raises(MissingExtraError, match=message):
+        Pipeline("walk.mp4", (10, 10, 32, 32), record=tmp_path / "run.mcap")
 
 
 @pytest.mark.parametrize("extra", EXTRAS)

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.client.registry import locate
-from catstream.errors import RecordingError
+from catstream.errors import RecordingError, require_extra
 from catstream.messages.kinds import End, Features, Run, Track
 from catstream.services.options import PATH
 from catstream.services.recorder import Recorder
@@ -48,6 +48,7 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
       catstream record --output walk.mcap
       catstream record --output walk.mcap --endpoint run
     """
+    require_extra("record")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     place = locate(endpoint, keys)
     with (

@@ -18,19 +18,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import IO, BinaryIO, cast
 
-from mcap import writer
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message
-from mcap.stream_reader import breakup_chunk
-
 __all__ = ["INDEX_SIZE", "MAGIC", "Container", "Entry", "Topic", "end_of_data", "entries", "entry_at"]
 
 #: The first and the last bytes of a file.
-MAGIC = writer.MCAP0_MAGIC
+MAGIC = b"\x89MCAP0\r\n"
 #: Bytes of the message index behind a chunk of one message: opcode and length, channel, length, and one time and place.
 INDEX_SIZE = 9 + 2 + 4 + 16
 
+_CHUNK_OPCODE, _FOOTER_OPCODE = 0x06, 0x02
 _LARGEST = 512 << 20  # bytes of a message with its topics; no message is as large
 _RECORD_SIZE = 9  # bytes of the opcode and the length, in front of each record
 _END_SIZE = _RECORD_SIZE + 4  # of the record between the messages and the index
@@ -101,6 +96,8 @@ class Container:
     """
 
     def __init__(self, path: Path, topics: Sequence[Topic], metadata: dict[str, str]) -> None:
+        from mcap import writer
+
         self.messages = 0
         self._is_whole, self._pending = True, _Pending()
         self._file = path.open("xb", buffering=0)
@@ -169,12 +166,17 @@ def entries(file: BinaryIO) -> Iterator[Entry]:
 
 def entry_at(file: BinaryIO, place: int) -> Entry | None:
     """The message whose chunk is at a place; None if there is no whole chunk with one message."""
+    from mcap.exceptions import McapError
+    from mcap.records import Channel, Chunk, Message
+    from mcap.stream_reader import breakup_chunk
+
     file.seek(place)
     head = file.read(_CHUNK.size)
     if len(head) < _CHUNK.size:
         return None
     opcode, length, start, end, size, check, compression, stored = _CHUNK.unpack(head)
-    if opcode != Opcode.CHUNK or compression or not size == stored == length + _RECORD_SIZE - _CHUNK.size <= _LARGEST:
+    is_single = size == stored == length + _RECORD_SIZE - _CHUNK.size <= _LARGEST
+    if opcode != _CHUNK_OPCODE or compression or not is_single:
         return None
     data = file.read(size)
     if len(data) < size or zlib.crc32(data) != check:
@@ -201,7 +203,7 @@ def end_of_data(file: BinaryIO) -> int | None:
         return None
     opcode, _, summary, *_ = _FOOTER.unpack(footer)
     place: int = summary - _END_SIZE
-    return place if opcode == Opcode.FOOTER and place < size else None
+    return place if opcode == _FOOTER_OPCODE and place < size else None
 
 
 def _next_whole(file: BinaryIO, start: int) -> Entry | None:

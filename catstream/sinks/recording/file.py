@@ -24,7 +24,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import BinaryIO, Self, TypeVar
 
-from catstream.errors import ProtocolError, RecordingError
+from catstream.errors import ProtocolError, RecordingError, require_extra
 from catstream.messages.kinds import End, Features, Health, Model, Run, Track
 from catstream.messages.names import counted
 from catstream.messages.storage import lock
@@ -89,9 +89,12 @@ class RecordingWriter:
     ------
     RecordingError
         If the file exists already, cannot be written, or was recorded with other settings.
+    MissingExtraError
+        If the extra `record` is not installed.
     """
 
     def __init__(self, path: str | os.PathLike[str], run: Run, *, resume: bool = False) -> None:
+        require_extra("record")
         self.path, self.written, self._run = Path(path), 0, run
         self._metadata = {_SERIES: token_hex(8)}
         with ExitStack() as self._stack:
@@ -187,9 +190,12 @@ class Recording:
     ------
     RecordingError
         If a file cannot be read, or is not a recording.
+    MissingExtraError
+        If the extra `record` is not installed.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
+        require_extra("record")
         self.path = Path(path)
         self.run, metadata = _opening(self.path)
         self.files = [self.path, *_further(self.path, metadata)]
