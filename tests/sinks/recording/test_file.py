@@ -138,7 +138,7 @@ def test_another_program_reads_it_by_topic_and_time(written):
 
 
 def test_the_example_of_the_docs_prints_the_boxes(written, monkeypatch, capsys):
-    page = (Path(__file__).parents[2] / "docs" / "how-to" / "record.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "how-to" / "record.md").read_text()
     (example,) = re.findall(r"```python\n(import json.*?)```", page, re.DOTALL)
     path = written([track(1), track(2)])
     path.rename(path.with_name("walk.mcap"))
