@@ -120,7 +120,7 @@ class StoreError(FleetError):
 #: Extra -> the feature that needs it, and the modules that the feature imports.
 EXTRAS = {
     "view": ("the web page", ("prometheus_client", "starlette", "uvicorn")),
-    "loadtest": ("the load test", ("hdrh", "psutil")),
+    "loadtest": ("the load test", ("psutil",)),
     "record": ("a recording", ("mcap",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
     "supervision": ("to_supervision", ("supervision",)),

@@ -81,7 +81,6 @@ IMPORTERS = {
     ],
     "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/provenance.py"],
     "psutil": ["catstream/applications/loadtest/usage.py"],
-    "hdrh": ["catstream/applications/loadtest/latencies.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],
     "uvicorn": ["catstream/web/server.py", "catstream/web/connections.py"],
@@ -240,7 +239,6 @@ def test_each_rule_detects_a_violation(rule, place, source, monkeypatch):
 def test_every_dependency_has_an_entry():
     """The dependencies of pyproject.toml, and no others."""
     distributions = {
-        "hdrhistogram": "hdrh",
         "opencv-python-headless": "cv2",
         "prometheus-client": "prometheus_client",
         "pyzmq": "zmq",

@@ -54,13 +54,12 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option(
     "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
 )
-@click.option("--chaos", is_flag=True, help="Kill a random process every few seconds.")
 @click.option("--find-limit", is_flag=True, help="Search for the highest rate that meets the limits.")
 @click.option(
     "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see above."
 )
 @click.option("--json", "json_file", type=PATH, help="File for all figures.")
-@click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and .hgrm.")
+@click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html.")
 @with_settings
 def loadtest(
     find_limit: bool,
@@ -79,7 +78,7 @@ def loadtest(
     success and latencies are those of the first object.
 
     Slow subscribers read two tracks per second; half of them are frozen
-    instead. Chaos kills processes by SIGKILL; --set run.seed=N repeats it.
+    instead.
 
     \b
     LIMITS, of the worst stream
@@ -87,16 +86,12 @@ def loadtest(
       model-p50 ... model-max   seconds from a frame to the model trained on it, at most
       skipped                   share of frames that were not tracked, at most
       missed                    share of frames whose tracks fast subscribers missed, at most
-      recovery                  seconds from a kill to the next track, at most
       success                   share of frames with an overlap above 0.5, at least
 
     With --find-limit, the search begins with RATE, each rate runs for DURATION,
     and the limits are p99=0.1 and skipped=0.01 if none are given.
 
-    \b
-    Writes
-      OUTPUT/report.html             figures and plots
-      OUTPUT/track.hgrm, model.hgrm  HDR histograms: percentiles of both latencies, in milliseconds
+    With --output, OUTPUT/report.html has all figures and plots.
 
     The exit code is 0; 1 if a limit was not met or a stream failed; 130 after
     Ctrl-C, which ends all processes and prints the measurements so far.
@@ -106,12 +101,12 @@ def loadtest(
       catstream loadtest --rate 30 --limit p99=0.1
       catstream loadtest --objects 8 --limit skipped=0.01
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
-      catstream loadtest --duration 60 --chaos --limit recovery=5
       catstream loadtest --find-limit --size 320x240
     """
     # Imported here so that --help and the other commands start faster.
     from catstream.applications.loadtest.limits import Limit, violations
     from catstream.applications.loadtest.load_test import run_load_test
+    from catstream.applications.loadtest.measures import percentiles
     from catstream.applications.loadtest.plan import Plan
     from catstream.applications.loadtest.report import milliseconds, to_json, write_report
 
@@ -134,7 +129,7 @@ def loadtest(
                 verdict = "; ".join(violations(asked, result)) or "met"
                 console.print(
                     f"{result.plan.rate:g} frames/s due, {result.followed:.1f} tracked, "
-                    f"p99 {milliseconds(result.track['p99'])} ms: {verdict}"
+                    f"p99 {milliseconds(percentiles(result.track)['p99'])} ms: {verdict}"
                 )
 
         load_test = run_load_test(parameters, asked, find=find_limit, report=report, done=done)
@@ -142,8 +137,6 @@ def loadtest(
         _print(console, load_test.result, asked)
         write_json(json_file, to_json(load_test))
         if output is not None:
-            load_test.result.track.write(output / "track.hgrm")
-            load_test.result.model.write(output / "model.hgrm")
             console.print(f"report: {write_report(output / 'report.html', load_test)}", soft_wrap=True)
     if load_test.interrupted:
         console.print(
@@ -177,9 +170,9 @@ def _print(console: Console, result: Result, limits: list[Limit]) -> None:
     )
     for each in tables(result):
         table = Table(box=None, header_style="bold", pad_edge=False)
-        for number, head in enumerate(each.heads):
+        for number, head in enumerate(each.rows[0]):
             table.add_column(head, justify="right" if number else "left")
-        for row in each.rows:
+        for row in each.cells():
             table.add_row(*row)
         console.print(table)
     if result.other_load > _QUIET_CORES:

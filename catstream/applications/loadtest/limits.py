@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from catstream.applications.loadtest.latencies import PERCENTILES
+from catstream.applications.loadtest.measures import PERCENTILES, percentiles
 from catstream.applications.loadtest.run import Result
 from catstream.errors import SettingsError
 
@@ -22,12 +22,7 @@ class _Quantity:
 
 
 def _worst(name: str, kind: str) -> Callable[[Result], float]:
-    return lambda result: max(getattr(stream, kind)[name] for stream in result.streams)
-
-
-def _recovery(result: Result) -> float:
-    never = float("inf")
-    return max((recovery.track or never for recovery in result.recoveries), default=0.0)
+    return lambda result: max(percentiles(getattr(stream, kind))[name] for stream in result.streams)
 
 
 #: All quantities that can have a limit, by name. If there are several streams, the worst one counts.
@@ -42,7 +37,6 @@ KINDS: dict[str, _Quantity] = {
         lambda result: max(stream.skipped_share for stream in result.streams),
     ),
     "missed": _Quantity("share of frames whose tracks fast subscribers missed", lambda result: result.missed_share),
-    "recovery": _Quantity("seconds from a kill to the next track", _recovery),
     "success": _Quantity(
         "share of frames with an overlap above 0.5",
         lambda result: min(stream.success or 0.0 for stream in result.streams),

@@ -12,11 +12,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from catstream.applications.evaluation.metrics import overlaps
-from catstream.applications.loadtest.latencies import Latencies
 from catstream.applications.loadtest.observer import Observations
+from catstream.numerics.arrays import Float64
 from catstream.video.broadcast import Schedule
 
-__all__ = ["Measures", "carried_forward", "latencies_to_answer", "measure"]
+__all__ = ["PERCENTILES", "Measures", "carried_forward", "latencies_to_answer", "measure", "percentiles"]
+
+#: The percentiles of latencies that are reported, by name.
+PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
 _SUCCESS = 0.5  # a frame with a larger overlap with the ground truth is a success
 
@@ -36,10 +39,10 @@ class Measures:
     totals           those of the pipeline at its end; empty if the stream has not ended
     """
 
-    due: np.ndarray
+    due: Float64
     followed: np.ndarray
-    track: Latencies
-    model: Latencies
+    track: Float64
+    model: Float64
     without_track: int
     success: float | None
     success_followed: float | None
@@ -103,8 +106,8 @@ def measure(
     return Measures(
         due=due,
         followed=followed,
-        track=Latencies(to_track),
-        model=Latencies(to_model),
+        track=to_track,
+        model=to_model,
         without_track=without_track,
         success=_success(carried_forward(boxes, followed), true),
         success_followed=_success(boxes[followed], true[followed]),
@@ -117,7 +120,17 @@ def measure(
     )
 
 
-def latencies_to_answer(due: np.ndarray, answers: list[tuple[float, int]], end: float) -> tuple[np.ndarray, int]:
+def percentiles(seconds: Float64) -> dict[str, float]:
+    """Return the `PERCENTILES` of at least one latency; each of them is the latency of a frame.
+
+    >>> percentiles(np.array([0.010] * 98 + [0.5, 2.0]))["p99"]
+    0.5
+    """
+    values = np.percentile(seconds, list(PERCENTILES.values()), method="inverted_cdf")
+    return dict(zip(PERCENTILES, values.tolist(), strict=True))
+
+
+def latencies_to_answer(due: Float64, answers: list[tuple[float, int]], end: float) -> tuple[Float64, int]:
     """Return the seconds from each frame's due time to the first answer for this frame or a newer one.
 
     Parameters

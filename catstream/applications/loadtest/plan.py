@@ -23,8 +23,7 @@ class Plan:
     rate              frames per second of each stream, whether or not the pipeline keeps up
     duration          seconds
     size              (width, height) of a frame in pixels
-    chaos             whether random processes are killed during the run
-    settings          settings of all pipelines; their seed is used for the chaos too
+    settings          settings of all pipelines
 
     Raises
     ------
@@ -41,7 +40,6 @@ class Plan:
     rate: float = 25.0
     duration: float = 10.0
     size: tuple[int, int] = demo.SIZE
-    chaos: bool = False
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:

@@ -14,13 +14,13 @@ import numpy as np
 from catstream.applications.evaluation.provenance import provenance
 from catstream.applications.html.page import table, write_page
 from catstream.applications.html.plots import Axis, plot
-from catstream.applications.loadtest.latencies import PERCENTILES, Latencies
 from catstream.applications.loadtest.limits import violations
 from catstream.applications.loadtest.load_test import LoadTest
-from catstream.applications.loadtest.measures import Measures
+from catstream.applications.loadtest.measures import Measures, percentiles
 from catstream.applications.loadtest.run import Result
 from catstream.applications.loadtest.usage import REST, summary
 from catstream.messages.names import counted
+from catstream.numerics.arrays import Float64
 
 __all__ = ["Table", "milliseconds", "tables", "to_json", "write_report"]
 
@@ -35,41 +35,41 @@ Curves = dict[str, tuple[np.ndarray, np.ndarray]]
 class Table(NamedTuple):
     """A table of text.
 
+    rows   cells by the heads of their columns; the first row has all of them
     note   explanation of the columns
     means  number of rows at the end that summarise the others
     texts  number of columns of words, the first ones
     """
 
     title: str
-    heads: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: list[dict[str, str]]
     note: str = ""
     means: int = 0
     texts: int = 1
 
+    def cells(self) -> list[list[str]]:
+        """Return the cells of each row, empty where a row has none."""
+        return [[row.get(head, "") for head in self.rows[0]] for row in self.rows]
+
 
 def tables(result: Result) -> Iterator[Table]:
-    """Yield the tables of a run: streams, processes and, if there were any, subscribers and kills."""
+    """Yield the tables of a run: streams, processes and, if there were any, subscribers."""
     streams = [
-        (
-            str(number),
-            f"{each.rate(result.plan.rate):.1f}",
-            f"{100 * each.skipped_share:.1f} %",
-            *_latencies(each.track, each.model),
-            str(each.max_lag),
-            "-" if each.not_stored is None else str(each.not_stored),
-            _share(each.success),
-            _share(each.success_followed),
-        )
+        {
+            "stream": str(number),
+            "frames/s": f"{each.rate(result.plan.rate):.1f}",
+            "skipped": f"{100 * each.skipped_share:.1f} %",
+            **_latencies(each.track, each.model),
+            "lag": str(each.max_lag),
+            "not stored": "-" if each.not_stored is None else str(each.not_stored),
+            "success": _share(each.success),
+            "of tracked": _share(each.success_followed),
+        }
         for number, each in enumerate(result.streams)
     ]
-    together = [("all", "", "", *_latencies(result.track, result.model), *[""] * 4)] if len(streams) > 1 else []
+    together = [{"stream": "all", **_latencies(result.track, result.model)}] if len(streams) > 1 else []
     yield Table(
         "Streams",
-        (
-            *("stream", "frames/s", "skipped", *PERCENTILES, *(f"model {name}" for name in _MODEL)),
-            *("lag", "not stored", "success", "of tracked"),
-        ),
         streams + together,
         "Latencies in milliseconds. Lag: maximum number of messages that the compressor had not yet received. Not "
         "stored: features messages that were not in the coreset trees at the end. Success: share of frames with an "
@@ -77,35 +77,24 @@ def tables(result: Result) -> Iterator[Table]:
         "the frames that were not skipped.",
         len(together),
     )
-    used = {name: summary(readings) for name, readings in result.usage.items()}
-    processes = [
-        (
-            name,
-            *(f"{use[key]:.2f}" for key in ("cores", "cores_most")),
-            *(f"{use[key] / 1e6:.0f}" for key in ("memory", "memory_most")),
-        )
-        for name, use in used.items()
-    ]
-    yield Table("Processes", ("process", "cores", "most", "MB", "most"), processes)
+    processes = [{"process": name, **_use(summary(readings))} for name, readings in result.usage.items()]
+    if processes:
+        yield Table("Processes", processes)
     if plan := result.plan.subscribers and result.plan:
+        subscribers = {
+            "of each stream": plan.subscribers,
+            "slow": plan.slow_subscribers - plan.frozen,
+            "frozen": plan.frozen,
+            "for s": round(result.frozen),
+            "received, least": min(result.received, default=0),
+            "received, most": max(result.received, default=0),
+            "missed": sum(result.missed),
+            "missed, most": max(result.missed, default=0),
+        }
         yield Table(
             "Subscribers",
-            ("of each stream", "slow", "frozen", "for s", "received, least", "most", "missed", "most"),
-            [
-                (
-                    *map(str, (plan.subscribers, plan.slow_subscribers - plan.frozen, plan.frozen)),
-                    f"{result.frozen:.0f}",
-                    *(str(pick(result.received, default=0)) for pick in (min, max)),
-                    *(str(value) for value in (sum(result.missed), max(result.missed, default=0))),
-                )
-            ],
+            [{head: str(number) for head, number in subscribers.items()}],
             "Frames whose tracks each of the fast subscribers received, and frames that they missed in total.",
-        )
-    if result.plan.chaos:
-        yield Table(
-            f"Chaos: {len(result.recoveries)} processes killed, {result.restarts} restarted",
-            ("killed", "s to the next track", "s to the next model"),
-            [(str(each.kill), _seconds(each.track), _seconds(each.model)) for each in result.recoveries],
         )
 
 
@@ -114,12 +103,18 @@ def milliseconds(seconds: float) -> str:
     return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
 
 
-def _latencies(track: Latencies, model: Latencies) -> tuple[str, ...]:
-    return *(milliseconds(track[name]) for name in PERCENTILES), *(milliseconds(model[name]) for name in _MODEL)
+def _latencies(track: Float64, model: Float64) -> dict[str, str]:
+    of_model = percentiles(model)
+    shown = percentiles(track) | {f"model {name}": of_model[name] for name in _MODEL}
+    return {name: milliseconds(seconds) for name, seconds in shown.items()}
 
 
-def _seconds(seconds: float | None) -> str:
-    return "none" if seconds is None else f"{seconds:.3f}"
+def _use(use: dict[str, float]) -> dict[str, str]:
+    cores = {"cores": use["cores"], "cores, most": use["cores_most"]}
+    memory = {"MB": use["memory"], "MB, most": use["memory_most"]}
+    return {head: f"{value:.2f}" for head, value in cores.items()} | {
+        head: f"{value / 1e6:.0f}" for head, value in memory.items()
+    }
 
 
 def _share(value: float | None) -> str:
@@ -138,7 +133,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
         "plan": plan,
         "seconds": result.seconds,
         "interrupted": load_test.interrupted,
-        "latency": {"track": result.track.figures(), "model": result.model.figures()},
+        "latency": {"track": percentiles(result.track), "model": percentiles(result.model)},
         "streams": [_stream(measures, result.plan.rate) for measures in result.streams],
         "processes": {name: summary(readings) for name, readings in result.usage.items()},
         "subscribers": {
@@ -147,16 +142,6 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
             "missed": result.missed,
             "frozen_seconds": round(result.frozen, 3),
         },
-        "chaos": [
-            {
-                "stream": recovery.kill.stream,
-                "process": recovery.kill.process,
-                "to_track": recovery.track,
-                "to_model": recovery.model,
-            }
-            for recovery in result.recoveries
-        ],
-        "restarts": result.restarts,
         "camera_late": round(result.camera_late, 6),
         "limits": {limit.name: {"value": limit.value, "met": limit.is_met(result)} for limit in load_test.limits},
         "violations": load_test.violations,
@@ -165,7 +150,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
             {
                 "rate": step.plan.rate,
                 "followed": step.followed,
-                "track": step.track.figures(),
+                "track": percentiles(step.track),
                 "violations": violations(load_test.limits, step),
             }
             for step in load_test.results
@@ -179,11 +164,12 @@ def _stream(measures: Measures, rate: float) -> dict[str, object]:
         "frames_per_second": measures.rate(rate),
         "skipped": measures.skipped,
         "without_track": measures.without_track,
-        "track": measures.track.figures(),
-        "model": measures.model.figures(),
+        "track": percentiles(measures.track),
+        "model": percentiles(measures.model),
         "lag": measures.max_lag,
         "sent": measures.totals.get("sent"),
         "stored": measures.totals.get("stored"),
+        "restarts": measures.totals.get("restarts"),
         "success": measures.success,
         "success_followed": measures.success_followed,
     }
@@ -227,9 +213,9 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
 
 
 def _html(shown: Table) -> str:
-    rows = [[escape(cell) for cell in row] for row in shown.rows]
+    rows = [map(escape, cells) for cells in shown.cells()]
     note = f'<p class="about">{shown.note}</p>' if shown.note else ""
-    return f"<h2>{shown.title}</h2>{table(shown.heads, rows, texts=shown.texts, means=shown.means)}{note}"
+    return f"<h2>{shown.title}</h2>{table(shown.rows[0], rows, texts=shown.texts, means=shown.means)}{note}"
 
 
 def _verdict(result: Result) -> str:
@@ -252,16 +238,15 @@ def _steps(load_test: LoadTest) -> Table:
     else:
         title = "Interrupted before a rate was found" if load_test.interrupted else "No rate meets the limits"
     rows = [
-        (
-            f"{step.plan.rate:g} frames/s",
-            "; ".join(violations(load_test.limits, step)) or "met",
-            f"{step.followed:.1f}",
-            *(milliseconds(step.track[name]) for name in PERCENTILES),
-        )
+        {
+            "due": f"{step.plan.rate:g} frames/s",
+            "limits": "; ".join(violations(load_test.limits, step)) or "met",
+            "tracked": f"{step.followed:.1f}",
+            **{f"{name} ms": milliseconds(seconds) for name, seconds in percentiles(step.track).items()},
+        }
         for step in load_test.results
     ]
-    heads = ("due", "limits", "tracked", *(f"{name} ms" for name in PERCENTILES))
-    return Table(title, heads, rows, "The runs, in this order.", texts=2)
+    return Table(title, rows, "The runs, in this order.", texts=2)
 
 
 def _plots(result: Result) -> Iterator[str]:
@@ -270,7 +255,7 @@ def _plots(result: Result) -> Iterator[str]:
     seconds = Axis.upto(result.seconds, "seconds")
     yield _percentiles("From frame to track", {name: measures.track for name, measures in shown.items()})
     yield _percentiles("From frame to the model trained on it", {name: each.model for name, each in shown.items()})
-    latencies = {name: _peaks(each.due - start, 1000 * each.track.seconds) for name, each in shown.items()}
+    latencies = {name: _peaks(each.due - start, 1000 * each.track) for name, each in shown.items()}
     yield _lines("Latency to the track over time", seconds, "ms", latencies)
     rates = {name: _rate(each, each.due - start, result.plan.rate) for name, each in shown.items()}
     yield _lines("Frames tracked", seconds, "frames/s", rates, minimum=result.plan.rate)
@@ -283,16 +268,15 @@ def _plots(result: Result) -> Iterator[str]:
     yield _lines("Memory", seconds, "MB", memory)
 
 
-def _percentiles(title: str, streams: Mapping[str, Latencies]) -> str:
+def _percentiles(title: str, streams: Mapping[str, Float64]) -> str:
     """Plot latency by percentile on a logarithmic axis: each tick to the right is a tenth of the remaining frames."""
-    nines = max(
-        1, math.ceil(math.log10(max(map(len, streams.values()))))
-    )  # the highest percentile is that of one frame
+    frames = max(map(len, streams.values()))
+    nines = max(1, math.ceil(math.log10(frames)))  # the highest percentile is that of one frame
     ticks = tuple((float(nine), f"{100 - 100 / 10**nine:g} %") for nine in range(nines + 1))
     curves = {}
-    for name, latencies in streams.items():
-        shares, values = latencies.distribution()
-        curves[name] = -np.log10(np.maximum(1 - shares, 10.0**-nines)), 1000 * values
+    for name, seconds in streams.items():
+        slower = np.unique(np.geomspace(1, len(seconds), _POINTS).astype(int))  # frames that waited at least as long
+        curves[name] = np.log10(len(seconds) / slower), 1000 * np.sort(seconds)[-slower]
     most = max(float(ys.max()) for _, ys in curves.values())
     return plot(title, Axis("share of frames that waited less", nines, ticks), Axis.upto(most, "ms"), curves)
 
@@ -302,13 +286,13 @@ def _lines(title: str, x: Axis, unit: str, curves: Curves, minimum: float = 1.0)
     return plot(title, x, Axis.upto(max(most, minimum), unit), curves)
 
 
-def _peaks(xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _peaks(xs: Float64, ys: Float64) -> tuple[np.ndarray, np.ndarray]:
     """Reduce a curve to the maximum of each of `_POINTS` parts, so that no peak is lost."""
     begins = np.unique(np.linspace(0, len(xs), _POINTS, endpoint=False).astype(int))
     return xs[begins], np.maximum.reduceat(ys, begins)
 
 
-def _rate(measures: Measures, when: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+def _rate(measures: Measures, when: Float64, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the number of tracked frames in each second."""
     seconds = (when - when[0]).astype(int)
     share = np.bincount(seconds, measures.followed) / np.bincount(seconds)

@@ -12,44 +12,27 @@ from time import monotonic
 import numpy as np
 
 from catstream.applications.loadtest.camera import Camera
-from catstream.applications.loadtest.chaos import Chaos, Kill
-from catstream.applications.loadtest.latencies import Latencies
 from catstream.applications.loadtest.measures import Measures, measure
-from catstream.applications.loadtest.observer import Observations, Observer
+from catstream.applications.loadtest.observer import Observations, observed
 from catstream.applications.loadtest.plan import Plan
 from catstream.applications.loadtest.stream import Stream
 from catstream.applications.loadtest.subscribers import Subscribers
 from catstream.applications.loadtest.usage import REST, Usage, UsageReading, summary
 from catstream.errors import ServiceError
+from catstream.numerics.arrays import Float64
 from catstream.video.broadcast import Schedule
 
-__all__ = ["Recovery", "Report", "Result", "run"]
+__all__ = ["Report", "Result", "run"]
 
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
 _LEAD_SECONDS = 0.5  # from the end of the start to the first frame
 _GRACE_SECONDS = 3.0  # to wait for the track of the last frame
-_NO_KILL_SECONDS = 5.0  # no kills this long before the last frame, so that killed processes can recover
 _READING_SECONDS = 0.5  # between two readings of processor and memory use
 _LOOP_SECONDS = 0.05
 
 
 #: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
 Report = Callable[[str, float, str], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Recovery:
-    """Seconds from a kill to the next track of a later frame, and to the next model; None if there was none."""
-
-    kill: Kill
-    track: float | None
-    model: float | None
-
-    @classmethod
-    def of(cls, kill: Kill, seen: Observations) -> Recovery:
-        track = next((moment for moment, track in seen.tracks if (track.pts or 0.0) > kill.moment), None)
-        model = next((moment for moment, _ in seen.models if moment > kill.moment), None)
-        return cls(kill, track and track - kill.moment, model and model - kill.moment)
 
 
 @dataclass(slots=True)
@@ -59,7 +42,6 @@ class Result:
     plan         parameters of the run
     seconds      duration of the measured frames: less than planned if the run was interrupted
     streams      measures of each stream
-    recoveries   recovery of each kill
     usage        readings of each process, and of the load by processes outside the load test
     received     number of frames whose tracks each fast subscriber received; `missed` is the number that it missed
     frozen       seconds for which the frozen subscribers were stopped
@@ -71,7 +53,6 @@ class Result:
     plan: Plan
     seconds: float
     streams: list[Measures]
-    recoveries: list[Recovery]
     usage: dict[str, list[UsageReading]]
     received: list[int]
     missed: list[int]
@@ -86,19 +67,14 @@ class Result:
         return min(stream.rate(self.plan.rate) for stream in self.streams)
 
     @property
-    def track(self) -> Latencies:
+    def track(self) -> Float64:
         """Track latencies of all streams."""
-        return Latencies(np.concatenate([stream.track.seconds for stream in self.streams]))
+        return np.concatenate([stream.track for stream in self.streams])
 
     @property
-    def model(self) -> Latencies:
+    def model(self) -> Float64:
         """Model latencies of all streams."""
-        return Latencies(np.concatenate([stream.model.seconds for stream in self.streams]))
-
-    @property
-    def restarts(self) -> int:
-        """Total number of restarted processes."""
-        return sum(stream.totals.get("restarts", 0) for stream in self.streams)
+        return np.concatenate([stream.model for stream in self.streams])
 
     @property
     def other_load(self) -> float:
@@ -128,20 +104,16 @@ def run(plan: Plan, camera: Camera, report: Report = lambda *_: None) -> Result:
     """
     camera.show_still()
     streams = [Stream(number, url, camera.video.boxes, plan.settings) for number, url in enumerate(camera.urls)]
-    usage, chaos, interrupted = Usage(), Chaos(plan.settings.run.seed), False
+    usage, interrupted, next_reading = Usage(), False, 0.0
     with ExitStack() as stack:
-        observer, groups = _started(plan, streams, next(iter(camera.video.boxes)), stack, report)
-        seen = observer.observations
+        seen, groups = _started(plan, streams, next(iter(camera.video.boxes)), stack, report)
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS, plan.rate, plan.frames))
-        last_kill, next_reading = schedules[-1].due(plan.frames - 1) - _NO_KILL_SECONDS, 0.0
         try:
             for now in _until_the_last_track(plan, streams, seen, schedules):
-                if plan.chaos and now < last_kill:
-                    chaos.step(streams)
                 if now >= next_reading:
                     next_reading = now + _READING_SECONDS
                     usage.read(now, _pids(streams, groups) | {"camera": [camera.pid], "load test": [getpid()]})
-                report(*_progress(plan, seen, now - schedules[0].start, len(chaos.kills)))
+                report(*_progress(plan, seen, now - schedules[0].start))
         except KeyboardInterrupt:
             interrupted = True
         end, late = monotonic(), camera.late
@@ -150,7 +122,6 @@ def run(plan: Plan, camera: Camera, report: Report = lambda *_: None) -> Result:
         _stop(streams)
         for group in groups:
             group.wait()
-        observer.end()
     due = [min(plan.frames, schedule.following(end)) if interrupted else plan.frames for schedule in schedules]
     if not all(number > 0 for number in due):
         raise KeyboardInterrupt
@@ -161,7 +132,6 @@ def run(plan: Plan, camera: Camera, report: Report = lambda *_: None) -> Result:
             measure(each, schedule, number, camera.video.truth, end, stream.totals)
             for each, schedule, number, stream in zip(seen, schedules, due, streams, strict=True)
         ],
-        recoveries=[Recovery.of(kill, seen[kill.stream]) for kill in chaos.kills],
         usage=usage.readings,
         received=[count for group in groups for count in group.received()],
         missed=[count for group in groups for count in group.missed()],
@@ -174,7 +144,7 @@ def run(plan: Plan, camera: Camera, report: Report = lambda *_: None) -> Result:
 
 def _started(
     plan: Plan, streams: list[Stream], name: str, stack: ExitStack, report: Report
-) -> tuple[Observer, list[Subscribers]]:
+) -> tuple[list[Observations], list[Subscribers]]:
     """Start the pipelines, wait for their first models, then connect the subscribers; the stack ends all of them."""
 
     def wait_until(condition: Callable[[], bool], activity: str) -> None:
@@ -196,16 +166,14 @@ def _started(
         stream.start()
     wait_until(lambda: all(stream.ready.is_set() for stream in streams), "starting processes")
     keys = plan.settings.run.keys
-    observer = Observer([stream.endpoint for stream in streams], keys, name)
-    observer.start()
-    stack.callback(observer.end)
-    wait_until(lambda: all(each.warmed_up for each in observer.observations), "learning the first models")
+    seen = stack.enter_context(observed([stream.endpoint for stream in streams], name, keys))
+    wait_until(lambda: all(each.warmed_up for each in seen), "learning the first models")
     counts = {"readers": plan.subscribers, "slow": plan.slow_subscribers - plan.frozen, "frozen": plan.frozen}
     groups = [stack.enter_context(Subscribers(stream.endpoint, keys=keys, **counts)) for stream in streams]
     wait_until(lambda: all(group.connected for group in groups), "attaching subscribers")
     for group in groups:
         group.freeze()
-    return observer, groups
+    return seen, groups
 
 
 def _stop(streams: list[Stream]) -> None:
@@ -236,11 +204,10 @@ def _until_the_last_track(
         time.sleep(_LOOP_SECONDS)
 
 
-def _progress(plan: Plan, seen: list[Observations], passed: float, kills: int) -> tuple[str, float, str]:
+def _progress(plan: Plan, seen: list[Observations], passed: float) -> tuple[str, float, str]:
     latest = max(each.tracks[-1][0] - (each.tracks[-1][1].pts or 0.0) for each in seen)
     received = sum(len(each.tracks) for each in seen)
-    killed = f", {kills} killed" if plan.chaos else ""
-    figures = f"{received} tracks, the last {1000 * latest:.0f} ms after its frame{killed}"
+    figures = f"{received} tracks, the last {1000 * latest:.0f} ms after its frame"
     return f"{plan.frames * len(seen)} frames", min(max(passed / plan.duration, 0.0), 1.0), figures
 
 

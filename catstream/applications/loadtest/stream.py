@@ -35,7 +35,6 @@ class Stream(threading.Thread):
         self.totals: dict[str, int] = {}
         self._url, self._boxes, self._settings = url, boxes, settings
         self._pipeline: Pipeline | None = None
-        self._ends = False
 
     def run(self) -> None:
         try:
@@ -46,8 +45,7 @@ class Stream(threading.Thread):
                     pass
                 self.totals = pipeline.totals
         except CatstreamError as error:
-            # A restarted detector that is stopped while it repeats frames ends without its last message.
-            self.error = None if self._ends else error
+            self.error = error
         finally:
             self._pipeline = None
             self.ready.set()
@@ -61,7 +59,6 @@ class Stream(threading.Thread):
     def stop(self) -> None:
         """End the run as if its source had ended; `join` waits until everything learned is stored."""
         self.ready.wait(_STOP_SECONDS)
-        self._ends = True
         if self.is_alive() and self.endpoint:
             with (
                 suppress(CommandRejectedError, SilenceError),  # it has ended by itself

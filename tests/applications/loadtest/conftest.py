@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from catstream.applications.loadtest.latencies import Latencies
 from catstream.applications.loadtest.measures import Measures
 from catstream.applications.loadtest.plan import Plan
 from catstream.applications.loadtest.run import Result
@@ -48,15 +47,15 @@ def result() -> Callable[..., Result]:
                 Measures(
                     due=100 + frames / 10,
                     followed=frames < followed * len(seconds),
-                    track=Latencies(seconds),
-                    model=Latencies(seconds),
+                    track=np.array(seconds),
+                    model=np.array(seconds),
                     without_track=0,
                     success=success,
                     success_followed=success,
                     lag=[(100.5, 3)],
                 )
             )
-        facts = {"recoveries": [], "usage": {}, "received": [], "missed": [], "frozen": 0.0}
+        facts = {"usage": {}, "received": [], "missed": [], "frozen": 0.0}
         return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, "camera_late": 0.001, **others})
 
     return made

@@ -6,11 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.applications.loadtest.chaos import Kill
 from catstream.applications.loadtest.limits import KINDS, Limit, violations
 from catstream.applications.loadtest.load_test import find_highest_rate
 from catstream.applications.loadtest.plan import Plan
-from catstream.applications.loadtest.run import Recovery
 from catstream.errors import ObjectError, SettingsError
 from catstream.settings import Settings
 
@@ -31,11 +29,6 @@ def test_skipped_and_missed_are_shares(result):
     run = result([0.01] * 10, followed=0.9, received=[99, 99], missed=[1, 1])
     assert violations([Limit("skipped", 0.1), Limit("missed", 0.01)], run) == []
     assert len(violations([Limit("skipped", 0.09), Limit("missed", 0.009)], run)) == 2
-
-
-def test_a_process_that_did_not_recover_violates_every_limit_on_recovery(result):
-    run = result([0.01], recoveries=[Recovery(Kill(100.0, 0, "trainer"), None, None)])
-    assert not Limit("recovery", 1000).is_met(run)
 
 
 def test_a_failed_stream_is_a_violation_without_any_limit(result):
