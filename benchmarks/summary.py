@@ -85,7 +85,7 @@ def selected(rows: np.ndarray, k: int) -> list[int]:
     selection = RowSelection[int](k)
     for number, row in enumerate(rows):
         selection.add(row, number)
-    return selection.selected().keys
+    return selection.result().selected
 
 
 def nearest_to_means(rows: np.ndarray, k: int) -> list[int]:

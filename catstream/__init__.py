@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from catstream.applications.finding.search import find
     from catstream.applications.finding.sightings import Sighting
-    from catstream.applications.summaries.images import ImageSummary, summarize
+    from catstream.applications.summaries.images import summarize
+    from catstream.applications.summaries.selection import Selection
     from catstream.box import Box
     from catstream.client.control import Control, control
     from catstream.client.subscription import Subscription, subscribe
@@ -38,10 +39,10 @@ __all__ = [
     "CatstreamError",
     "Control",
     "Fleet",
-    "ImageSummary",
     "Learned",
     "MultiTracker",
     "Pipeline",
+    "Selection",
     "Settings",
     "Sighting",
     "Subscription",
@@ -63,10 +64,10 @@ _HOMES = {
     "CatstreamError": "errors",
     "Control": "client.control",
     "Fleet": "fleet.fleet",
-    "ImageSummary": "applications.summaries.images",
     "Learned": "run.learned",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
+    "Selection": "applications.summaries.selection",
     "Settings": "settings",
     "Sighting": "applications.finding.sightings",
     "Subscription": "client.subscription",

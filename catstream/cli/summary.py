@@ -158,7 +158,7 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
             )
         for reason in collection.skipped:
             console.print(f"skipped {reason}", style="yellow")
-        return sheet_of_images(path.resolve().name, collection, selection.selected())
+        return sheet_of_images(path.resolve().name, collection, selection.result())
 
 
 def _tracked(job: Job, folder: Path, console: Console) -> Recording:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from catstream.applications.summaries.selection import RowSelection
+from catstream.applications.summaries.selection import RowSelection, Selection
 from catstream.errors import VideoError
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, WINDOW
@@ -22,32 +21,9 @@ from catstream.numerics.threads import one_thread
 from catstream.video.image import as_bgr
 from catstream.video.source import read_image
 
-__all__ = ["ImageSummary", "describe", "summarize"]
+__all__ = ["describe", "summarize"]
 
 _SIDE = WINDOW * CELL
-
-
-@dataclass(frozen=True, slots=True)
-class ImageSummary:
-    """The images that `summarize` selected, the one that keeps most energy first.
-
-    Attributes
-    ----------
-    indices : list of int
-        Their numbers, from 0, in the collection.
-    energies : list of float
-        Share of the collection's energy that each adds to those before it.
-    count : int
-        Number of images of the collection.
-    kept, kept_at_most : float
-        Bounds of the share of the energy that they keep together.
-    """
-
-    indices: list[int]
-    energies: list[float]
-    count: int
-    kept: float
-    kept_at_most: float
 
 
 def describe(image: np.ndarray) -> np.ndarray:
@@ -70,7 +46,7 @@ def describe(image: np.ndarray) -> np.ndarray:
     return Cells.of(cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)).row(0, 0)
 
 
-def summarize(images: Iterable[np.ndarray | str | os.PathLike[str]], k: int) -> ImageSummary:
+def summarize(images: Iterable[np.ndarray | str | os.PathLike[str]], k: int) -> Selection[int]:
     """Select the k images that keep most of the energy of a collection, in one pass and constant memory.
 
     The images are read one after the other and may have different sizes. Each is described by one feature row; A has
@@ -87,8 +63,8 @@ def summarize(images: Iterable[np.ndarray | str | os.PathLike[str]], k: int) -> 
 
     Returns
     -------
-    ImageSummary
-        The numbers of the selected images, and how much energy they keep.
+    Selection
+        The numbers of the selected images, from 0, and how much energy they keep.
 
     Raises
     ------
@@ -103,7 +79,7 @@ def summarize(images: Iterable[np.ndarray | str | os.PathLike[str]], k: int) -> 
     --------
     >>> rng = np.random.default_rng(0)
     >>> red, green = rng.integers(0, 256, (2, 48, 64, 3), np.uint8)
-    >>> sorted(summarize([red, red, green, red], k=2).indices)
+    >>> sorted(summarize([red, red, green, red], k=2).selected)
     [0, 2]
     """
     selection = RowSelection[int](k)
@@ -111,8 +87,7 @@ def summarize(images: Iterable[np.ndarray | str | os.PathLike[str]], k: int) -> 
         with one_thread():
             selection.add(describe(as_bgr(_read(image))), number)
     with one_thread():
-        found = selection.selected()
-    return ImageSummary(found.keys, found.energies, found.count, found.kept, found.kept_at_most)
+        return selection.result()
 
 
 def _read(image: np.ndarray | str | os.PathLike[str]) -> object:

@@ -30,16 +30,22 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, slots=True)
 class Selection(Generic[_Key]):
-    """The selected rows of a stream A, in the order in which they add most energy.
+    """The selected rows (images) of a stream A, in the order in which they add most energy.
 
-    keys          the objects that were given with them
-    energies      share of ||A||^2 that each adds to those before it
-    count         number of rows of the stream
-    kept          share ||A P||^2 / ||A||^2, with P the projection on the span of the selected rows: at least this
-    kept_at_most  and at most this; the difference is the error of the sketch
+    Attributes
+    ----------
+    selected : list
+        Their keys: for `catstream.summarize`, the numbers of the images.
+    energies : list of float
+        Share of ||A||^2 that each adds to those before it.
+    count : int
+        Number of rows of the stream.
+    kept, kept_at_most : float
+        Bounds of the share ||A P||^2 / ||A||^2, with P the projection on the span of the selected rows. Their
+        difference is the error of the sketch.
     """
 
-    keys: list[_Key]
+    selected: list[_Key]
     energies: list[float]
     count: int
     kept: float
@@ -69,7 +75,7 @@ class RowSelection(Generic[_Key]):
     >>> selection = RowSelection(k=2)
     >>> for key, row in zip("abc", ([1, 0, 0], [0, 2, 0], [2, 0.1, 0])):
     ...     selection.add(row, key)
-    >>> selection.selected().keys
+    >>> selection.result().selected
     ['c', 'b']
     """
 
@@ -101,7 +107,7 @@ class RowSelection(Generic[_Key]):
                 chosen, _ = choose(*self._products(), self._size)
                 self._keep(sorted(self._completed(chosen, self._size)))
 
-    def selected(self) -> Selection[_Key]:
+    def result(self) -> Selection[_Key]:
         """The selection among all rows so far; the stream may continue.
 
         Raises

@@ -67,7 +67,7 @@ def json_beside(path: Path) -> Path:
 def sheet_of_images(name: str, collection: Collection, selection: Selection[tuple[Origin, bytes]]) -> Sheet:
     """Return the sheet of the images that were selected from a collection, each with its JPEG, in their order there."""
     places = {each: place for place, each in enumerate(collection.names)}
-    images = [(*key, energy) for key, energy in zip(selection.keys, selection.energies, strict=True)]
+    images = [(*key, energy) for key, energy in zip(selection.selected, selection.energies, strict=True)]
     images.sort(key=lambda image: (places[image[0].file], image[0].frame or 0))
     skipped = f"; {len(collection.skipped)} could not be read" * bool(collection.skipped)
     pictures = []

@@ -14,7 +14,7 @@ from catstream.errors import FrameError, SettingsError, VideoError
 
 def test_images_of_different_sizes_are_summarised(photographs):
     found = summarize(iter(photographs), k=6)
-    assert len(set(found.indices)) == 6
+    assert len(set(found.selected)) == 6
     assert found.count == len(photographs)
     assert 0.5 < found.kept <= found.kept_at_most <= 1
     assert found.kept == pytest.approx(sum(found.energies))
@@ -22,7 +22,7 @@ def test_images_of_different_sizes_are_summarised(photographs):
 
 def test_a_summary_of_copies_of_two_photographs_has_both(photographs):
     copies = [cv2.resize(photographs[number % 2], (60 + number, 90 - number)) for number in range(30)]
-    assert {index % 2 for index in summarize(copies, k=2).indices} == {0, 1}
+    assert {index % 2 for index in summarize(copies, k=2).selected} == {0, 1}
 
 
 def test_the_same_images_give_the_same_summary_as_arrays_and_as_files(photographs, tmp_path):

@@ -30,13 +30,13 @@ def selected(rows: np.ndarray, k: int, size: int | None = None) -> Selection[int
     selection = RowSelection[int](k, size)
     for number, row in enumerate(rows):
         selection.add(row, number)
-    return selection.selected()
+    return selection.result()
 
 
 @pytest.mark.parametrize("k", [1, 4, 10])
 def test_the_energy_kept_lies_within_the_certificate(rows, k):
     selection = selected(rows, k, size=20)  # reduced five times
-    truth = kept(rows, selection.keys)
+    truth = kept(rows, selection.selected)
     assert selection.kept - ROUNDING <= truth <= selection.kept_at_most + ROUNDING
     assert_allclose(sum(selection.energies), selection.kept)
 
@@ -46,7 +46,7 @@ def test_one_pass_keeps_nearly_as_much_as_the_greedy_choice_from_all_rows_and_mo
     gram = rows.astype(np.float64) @ rows.T.astype(np.float64)
     greedy = kept(rows, choose(gram, gram, k)[0])
     random = np.mean([kept(rows, rng.choice(len(rows), k, replace=False).tolist()) for _ in range(10)])
-    ours = kept(rows, selected(rows, k, size=24).keys)
+    ours = kept(rows, selected(rows, k, size=24).selected)
     assert ours > random
     assert ours > greedy - 0.1 * (greedy - random)
 
@@ -57,7 +57,7 @@ def test_memory_does_not_grow_with_the_stream(rng):
         tracemalloc.start()
         for number in range(count):
             selection.add(rng.normal(size=500), number)
-        selection.selected()
+        selection.result()
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak
@@ -70,7 +70,7 @@ def test_a_row_of_each_group_is_selected(rng):
     directions = np.linalg.qr(rng.normal(size=(40, 5)))[0].T
     groups = rng.integers(0, 5, 300)
     rows = directions[groups] + 0.01 * rng.normal(size=(300, 40))
-    assert sorted(groups[selected(rows, 5, size=16).keys]) == [0, 1, 2, 3, 4]
+    assert sorted(groups[selected(rows, 5, size=16).selected]) == [0, 1, 2, 3, 4]
 
 
 def test_energies_fall_and_the_stream_may_continue(rows):
@@ -78,22 +78,22 @@ def test_energies_fall_and_the_stream_may_continue(rows):
     for number, row in enumerate(rows):
         selection.add(row, number)
         if number in (40, 77):
-            early = selection.selected()
+            early = selection.result()
             assert early.count == number + 1
-            assert max(early.keys) <= number
-    energies = selection.selected().energies
+            assert max(early.selected) <= number
+    energies = selection.result().energies
     assert energies == sorted(energies, reverse=True)
-    assert selection.selected() == selection.selected()
+    assert selection.result() == selection.result()
 
 
 def test_equal_rows_complete_the_number_with_no_energy():
     selection = selected(np.ones((40, 6)), 3, size=4)
-    assert len(set(selection.keys)) == 3
+    assert len(set(selection.selected)) == 3
     assert_allclose(selection.energies, [1, 0, 0], atol=ROUNDING)
 
 
 def test_rows_without_energy_can_be_selected():
-    assert len(selected(np.zeros((9, 6)), 2, size=4).keys) == 2
+    assert len(selected(np.zeros((9, 6)), 2, size=4).selected) == 2
 
 
 @given(seeds, st.integers(1, 6))
