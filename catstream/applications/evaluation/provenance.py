@@ -19,12 +19,13 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_info
 
+from catstream import errors
 from catstream.applications.evaluation.peers import OPENCV
 from catstream.settings import Settings
 
 __all__ = ["machine", "provenance"]
 
-_ROOT = Path(__file__).parents[2]
+_ROOT = Path(errors.__file__).parents[1]
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
 
 

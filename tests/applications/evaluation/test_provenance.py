@@ -32,6 +32,10 @@ def test_a_machine_is_described_by_processor_and_libraries_without_its_host_name
     assert platform.node() not in json.dumps(told)
 
 
+def test_the_checkout_is_the_one_of_this_code():
+    assert (module._ROOT / "pyproject.toml").is_file()
+
+
 def test_the_commit_is_that_of_the_checkout_and_dirty_if_the_code_was_changed(tmp_path, monkeypatch):
     def git(*words):
         subprocess.run(["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", *words], check=True)
