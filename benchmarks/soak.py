@@ -177,7 +177,7 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
 
 def wait(sender: Sender, seq: int) -> None:
     """Wait until a message is stored."""
-    while sender.stored < seq:
+    while sender.window.stored < seq:
         sender.poll(0.05)
 
 

@@ -74,7 +74,7 @@ def delivered(endpoint: str, features: Features, messages: int) -> float:
         for seq in range(1, messages + 1):
             while not sender.send(replace(features, seq=seq)):
                 sender.poll(0.01)
-        while sender.stored < messages:
+        while sender.window.stored < messages:
             sender.poll(0.01)
         seconds = perf_counter() - begin
         sender.send(End(messages + 1, "that was all"))

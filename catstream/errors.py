@@ -31,7 +31,6 @@ __all__ = [
     "SilenceError",
     "StoreError",
     "StreamRewoundError",
-    "UnreachableError",
     "VideoError",
     "install_command",
     "require_extra",
@@ -103,10 +102,6 @@ class CommandRejectedError(ServiceError):
 
 class FleetError(ServiceError):
     """A fleet cannot do what was asked for; the message names the stream or the node."""
-
-
-class UnreachableError(FleetError):
-    """The head of a fleet does not answer. It may be starting again, so the call may be repeated later."""
 
 
 class FencedError(FleetError):

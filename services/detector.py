@@ -286,7 +286,8 @@ class DetectorLoop:
     def _progressed(self) -> Event | None:
         """The progress of the receivers, if it is another one than before."""
         senders, due = self._outputs.senders, self.state.due
-        features, results = self._outputs.features, senders.get("results", self._outputs.features)
+        features = self._outputs.features.window
+        results = senders["results"].window if "results" in senders else features
         progress = Progress(
             features.acknowledged, features.taken, results.acknowledged, results.taken, due, features.count_samples(due)
         )
@@ -400,7 +401,7 @@ class DetectorLoop:
     @cached_property
     def _end(self) -> End:
         """The end of the stream, with what a run must not forget."""
-        stored, seq = self._outputs.features.stored, self.state.seq
+        stored, seq = self._outputs.features.window.stored, self.state.seq
         totals = {"sent": float(seq), "stored": float(min(stored, seq))} | self._source_counters()
         totals.pop("lost_seconds", None)  # this one is of the moment
         return End(seq + 1, self.state.ending, self._failed, totals)
@@ -411,7 +412,7 @@ class DetectorLoop:
 
     def _counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
-        features, desired = self._outputs.features, self.state.desired
+        features, desired = self._outputs.features.window, self.state.desired
         own = {
             "sent": features.sent,
             "taken": features.taken,

@@ -9,12 +9,14 @@ import numpy as np
 from catstream.box import Box
 from catstream.messages.kinds import Preview
 from catstream.services.timing import PREVIEW_SECONDS
-from catstream.video.preview import jpeg
+from catstream.video.image import jpeg
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
 __all__ = ["Previews"]
+
+_SIDE = 640  # longest side of a picture, in pixels
 
 
 class Previews(Publisher[Preview]):
@@ -44,4 +46,4 @@ class Previews(Publisher[Preview]):
             return
         (frame, image, boxes), self._waiting, self._shown = self._waiting, None, monotonic()
         height, width = image.shape[:2]
-        self.send(Preview(frame, width, height, boxes, jpeg(image)))
+        self.send(Preview(frame, width, height, boxes, jpeg(image, _SIDE)))

@@ -143,7 +143,7 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
     from catstream.applications.summaries.selection import RowSelection
     from catstream.applications.summaries.sheet import WIDTH, sheet_of_images
     from catstream.numerics.threads import one_thread
-    from catstream.video.preview import jpeg
+    from catstream.video.image import jpeg
 
     collection, selection = Collection(path), RowSelection[tuple[Origin, bytes]](count)
     with _progress("reading", "files", console) as progress, one_thread():

@@ -12,6 +12,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.messages.kinds import Preview, Track
 from catstream.messages.names import UNNAMED
+from catstream.video.image import jpeg
 from catstream.video.palette import Colours, rgb
 
 __all__ = ["draw", "draw_boxes", "draw_preview", "drawn_size", "thumbnail"]
@@ -87,7 +88,7 @@ def draw_preview(preview: Preview, tracks: Sequence[Track], colours: Colours) ->
     else:
         scale = image.shape[1] / preview.width
         image = draw(image, [_scaled(track, scale) for track in tracks], colours)
-    return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
+    return jpeg(image)
 
 
 def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:
@@ -136,7 +137,7 @@ def _small(image: np.ndarray, boxes: Sequence[tuple[np.ndarray, _Colour]], width
         corners = (round(x), round(y)), (round(x + w), round(y + h))
         cv2.rectangle(small, *corners, (0, 0, 0), 3, cv2.LINE_AA)
         cv2.rectangle(small, *corners, colour, 1, cv2.LINE_AA)
-    return cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, 80))[1].tobytes()
+    return jpeg(small)
 
 
 def _scaled(track: Track, scale: float) -> Track:

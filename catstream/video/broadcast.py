@@ -23,12 +23,8 @@ from io import BufferedIOBase
 from time import monotonic
 from typing import Any, Self
 
-import cv2
-import numpy as np
+__all__ = ["Broadcast", "Schedule"]
 
-__all__ = ["Broadcast", "Schedule", "jpeg"]
-
-_JPEG_QUALITY = 90  # as cameras use it
 _TICKS_PER_SECOND = 1_000_000  # time base of the stream
 _STILL_RATE = 25.0  # frames per second of the still image before a schedule is played
 
@@ -70,11 +66,6 @@ class Schedule:
         """
         shown, last = min(max(number, 0), self.frames - 1), pictures - 1
         return last - abs(shown % max(2 * last, 1) - last)
-
-
-def jpeg(image: np.ndarray) -> bytes:
-    """Return an image as JPEG, in the quality of a network camera."""
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
 
 
 class Broadcast:

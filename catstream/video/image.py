@@ -1,13 +1,14 @@
-"""Converts the image arrays of other libraries to the 8-bit BGR arrays that catstream computes with."""
+"""Converts the image arrays of other libraries to the 8-bit BGR arrays that catstream computes with, and to JPEG."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from catstream.errors import FrameError
 from catstream.numerics.arrays import is_finite
 
-__all__ = ["as_bgr"]
+__all__ = ["as_bgr", "jpeg"]
 
 _CHANNELS = (1, 3, 4)
 _HALF_STEP = 0.5 / 255  # interpolation may exceed the range from 0 to 1 by this much
@@ -83,3 +84,20 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
             "frame.astype(np.uint8) if its values are brightness from 0 to 255"
         )
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
+
+
+def jpeg(image: np.ndarray, side: int | None = None, quality: int = 80) -> bytes:
+    """Return an image as JPEG, scaled down if its longer side exceeds `side` pixels.
+
+    Parameters
+    ----------
+    image : uint8 (h, w, 3) BGR, or (h, w) grey
+
+    >>> jpeg(np.zeros((480, 1280, 3), np.uint8), side=640)[:3].hex()
+    'ffd8ff'
+    """
+    height, width = image.shape[:2]
+    if side is not None and (scale := side / max(height, width)) < 1:
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -41,42 +41,17 @@ class Sender(ChannelSocket[Message]):
     Parameters
     ----------
     window : messages that may be sent and not acknowledged
+
+    Attributes
+    ----------
+    window : the messages that were sent, acknowledged and stored
     """
 
     def __init__(self, channel: Channel[Message], endpoint: Endpoint, window: int) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=window + 1)
-        self._window = SendWindow(channel.name, window, monotonic())
+        self.window = SendWindow(channel.name, window, monotonic())
         self._socket.set(zmq.IMMEDIATE, 1)  # nothing is queued before the receiver is connected
         self._connect()
-
-    @property
-    def sent(self) -> int:
-        """Newest seq that was given to `send`."""
-        return self._window.sent
-
-    @property
-    def taken(self) -> int:
-        """Newest seq that the receiver has processed."""
-        return self._window.taken
-
-    @property
-    def acknowledged(self) -> int:
-        """Newest seq that the receiver will not ask for again while it lives."""
-        return self._window.acknowledged
-
-    @property
-    def stored(self) -> int:
-        """Newest seq that survives the receiver's death; below `acknowledged` while its disk cannot be written."""
-        return self._window.stored
-
-    @property
-    def versions(self) -> dict[str, int]:
-        """Version of the newest sample of each object that the receiver has made, by name."""
-        return self._window.versions
-
-    def count_samples(self, seq: int) -> dict[str, int]:
-        """Count the samples that the messages up to `seq` led to: see `SendWindow.count_samples`."""
-        return self._window.count_samples(seq)
 
     def ask_position(self) -> Position | None:
         """Ask once for the receiver's position; None if it does not answer in time."""
@@ -88,14 +63,14 @@ class Sender(ChannelSocket[Message]):
 
     def resume(self, seq: int, position: Position) -> None:
         """Continue after message `seq` of an earlier sender, of which the receiver is at `position`."""
-        self._window.resume(seq, position)
+        self.window.resume(seq, position)
 
     def send(self, message: Message) -> bool:
         """Send the message with the next seq, without waiting; False if the window is full."""
         self.poll(0)
-        if self._window.full:
+        if self.window.full:
             return False
-        self._window.push(message.seq, self._encode(message))
+        self.window.push(message.seq, self._encode(message))
         self._transmit()
         return True
 
@@ -113,23 +88,23 @@ class Sender(ChannelSocket[Message]):
             with contextlib.suppress(zmq.Again):
                 while True:
                     self._process(self._socket.recv(zmq.NOBLOCK))
-        if self._window.must_ask(monotonic()):
+        if self.window.must_ask(monotonic()):
             self._say_hello()
         self._transmit()
 
     def _process(self, data: bytes) -> None:
         answer = self._decode(data, *_REPLIES)
-        if answer is not None and (rejected := self._window.receive(answer, monotonic())) is not None:
+        if answer is not None and (rejected := self.window.receive(answer, monotonic())) is not None:
             self._reject(rejected.reason, rejected.text)
 
     def _transmit(self) -> None:
         with contextlib.suppress(zmq.Again):  # tried again at the next poll
-            while (frame := self._window.next_frame()) is not None:
+            while (frame := self.window.next_frame()) is not None:
                 self._socket.send(frame, zmq.NOBLOCK, copy=False)
-                self._window.transmitted()
+                self.window.transmitted()
 
     def _say_hello(self) -> None:
-        self._window.position_requested(monotonic())
+        self.window.position_requested(monotonic())
         with contextlib.suppress(zmq.Again):  # no receiver is connected yet: it is asked again
             self._socket.send(HELLO, zmq.NOBLOCK)
 
@@ -152,6 +127,10 @@ class Receiver(ChannelSocket[Message]):
     position : where the stream continues; the next message received is the one after `position.seq`
     window : as the sender's
     check : raises ProtocolError if a message does not belong to this stream; it then does not count as received
+
+    Attributes
+    ----------
+    window : the messages that were received and stored
     """
 
     def __init__(
@@ -163,23 +142,18 @@ class Receiver(ChannelSocket[Message]):
         check: Callable[[Message], None] | None = None,
     ) -> None:
         super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=window + 1)
-        self._window, self._check = ReceiveWindow(position, window), check
+        self.window, self._check = ReceiveWindow(position, window), check
         self._bind()
-
-    @property
-    def taken(self) -> int:
-        """Newest seq that was received."""
-        return self._window.taken
 
     @property
     def position_requested(self) -> bool:
         """Whether a sender waits for `answer`."""
-        return self._window.position_requested
+        return self.window.position_requested
 
     @property
     def has_sender(self) -> bool:
         """Whether the sender was connected when `receive` was last called, and has not sent its end."""
-        return self._window.connected and not self._window.ended
+        return self.window.connected and not self.window.ended
 
     def receive(self, seconds: float) -> Message | None:
         """The next message in order, None if none arrived in time."""
@@ -189,32 +163,32 @@ class Receiver(ChannelSocket[Message]):
         if data is None:
             return None
         if not data:
-            self._reply(self._window.hello(peer))
+            self._reply(self.window.hello(peer))
             return None
         message = self._decode(data, *self.channel.messages, check=self._check)
         if message is None:
             return None
-        actions = self._window.receive(peer, message.seq, monotonic(), last=isinstance(message, End))
+        actions = self.window.receive(peer, message.seq, monotonic(), last=isinstance(message, End))
         self._reply(actions)
         return message if Deliver() in actions else None
 
     def acknowledge(self, position: Position) -> None:
         """Acknowledge all that was received; it is stored up to `position.seq`, except the last `position.unsaved`."""
-        self._reply(self._window.acknowledge(position))
+        self._reply(self.window.acknowledge(position))
 
     def answer(self, position: Position) -> None:
         """Send the position, up to which all is stored, to the senders that asked for it."""
-        self._reply(self._window.answer(position))
+        self._reply(self.window.answer(position))
 
     def close(self) -> None:
         """Close, after the sender if it has sent its end: a connection that breaks may cost it the last reply."""
-        if self._window.ended and self._window.connected:
+        if self.window.ended and self.window.connected:
             self._read_events(LINGER_SECONDS, until=Event.DISCONNECTED)
         super().close()
 
     def _disconnected(self) -> None:
         super()._disconnected()
-        self._window.disconnected()
+        self.window.disconnected()
 
     def _reply(self, actions: Sequence[Deliver | Reply | Reject]) -> None:
         for action in actions:

@@ -223,12 +223,14 @@ def test_an_acknowledged_channel_works_with_the_keys_of_the_pipeline(place, unti
     with Receiver(RESULTS, place(), Position(), WINDOW) as receiver, Sender(RESULTS, place(), WINDOW) as sender:
 
         def turn():
-            sender.send(Tracks(seq := sender.sent + 1, seq, {"": track(seq)})) if sender.sent < 50 else sender.poll(0)
+            sender.send(
+                Tracks(seq := sender.window.sent + 1, seq, {"": track(seq)})
+            ) if sender.window.sent < 50 else sender.poll(0)
             if (message := receiver.receive(0.02)) is not None:
                 taken.append(message.seq)
                 receiver.acknowledge(Position(message.seq))
 
-        until(lambda: sender.stored == 50, turn)
+        until(lambda: sender.window.stored == 50, turn)
     assert taken == list(range(1, 51))
 
 

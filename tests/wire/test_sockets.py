@@ -59,7 +59,7 @@ def take(receiver, taken, *, store):
         taken.append(message.seq)
         receiver.acknowledge(Position(message.seq if store else 0))
     if receiver.position_requested:
-        receiver.answer(Position(receiver.taken if store else 0))
+        receiver.answer(Position(receiver.window.taken if store else 0))
 
 
 def first(publisher, endpoint, until):
@@ -89,15 +89,15 @@ def test_an_acknowledged_channel_delivers_every_message_once_in_order(endpoint, 
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
 
         def turn():
-            if sender.sent < 50:
-                sender.send(tracks(sender.sent + 1))
+            if sender.window.sent < 50:
+                sender.send(tracks(sender.window.sent + 1))
             else:
                 sender.poll(0)
             take(receiver, taken, store=True)
 
-        until(lambda: sender.stored == 50, turn)
+        until(lambda: sender.window.stored == 50, turn)
     assert taken == list(range(1, 51))
-    assert sender.taken == 50
+    assert sender.window.taken == 50
 
 
 def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
@@ -111,7 +111,7 @@ def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
                 sender.poll(0.05)
                 take(receiver, taken, store=True)
 
-            until(lambda: sender.stored == 1, turn)
+            until(lambda: sender.window.stored == 1, turn)
     assert taken == [1]
 
 
@@ -128,7 +128,7 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint,
             sender.poll(0.05)  # nobody answers: it asks where the receiver is, and will send all again
         for _ in range(10):
             turn()
-        until(lambda: sender.taken == 1, turn)
+        until(lambda: sender.window.taken == 1, turn)
     assert taken == [1]
 
 
@@ -144,9 +144,9 @@ def test_a_sender_knows_which_sample_its_messages_led_to(endpoint, until):
         led_to = []
         for seq in range(1, 8):
             sender.send(tracks(seq))
-            until(lambda seq=seq: sender.taken == seq, turn)
+            until(lambda seq=seq: sender.window.taken == seq, turn)
         for seq in range(1, 8):
-            led_to.append(sender.count_samples(seq).get("", 0))
+            led_to.append(sender.window.count_samples(seq).get("", 0))
     assert led_to == [0, 1, 1, 2, 2, 3, 3]
 
 
@@ -159,10 +159,10 @@ def test_a_full_window_accepts_no_more_messages(endpoint, until):
             sender.poll(0)
             take(receiver, taken, store=False)
 
-        until(lambda: sender.taken == WINDOW, turn)
+        until(lambda: sender.window.taken == WINDOW, turn)
         assert not sender.send(tracks(WINDOW + 1)), "taken is not yet stored"
         receiver.acknowledge(Position(1))
-        until(lambda: sender.stored == 1, lambda: sender.poll(0.05))
+        until(lambda: sender.window.stored == 1, lambda: sender.poll(0.05))
         assert sender.send(tracks(WINDOW + 1))
 
 
@@ -183,12 +183,12 @@ def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
         with Receiver(RESULTS, endpoint, Position(3), 10) as receiver:
 
             def on():
-                if sender.sent < 20:
-                    sender.send(tracks(sender.sent + 1))
+                if sender.window.sent < 20:
+                    sender.send(tracks(sender.window.sent + 1))
                 sender.poll(0)
                 take(receiver, again, store=True)
 
-            until(lambda: sender.stored == 20, on)
+            until(lambda: sender.window.stored == 20, on)
     assert taken == [1, 2, 3, 4, 5, 6]
     assert again == list(range(4, 21))
 
@@ -217,12 +217,12 @@ def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
             sender.resume(3, found[-1])  # another receiver had less
 
             def on():
-                if sender.sent < 9:
-                    sender.send(tracks(sender.sent + 1))
+                if sender.window.sent < 9:
+                    sender.send(tracks(sender.window.sent + 1))
                 sender.poll(0)
                 take(receiver, taken, store=True)
 
-            until(lambda: sender.stored == 9, on)
+            until(lambda: sender.window.stored == 9, on)
     assert taken == list(range(1, 10))
 
 
@@ -243,11 +243,11 @@ def test_a_restarted_sender_accepts_a_position_that_advanced_after_its_request(e
 
             def on():
                 sender.poll(0)
-                if sender.sent < 9:
-                    sender.send(tracks(sender.sent + 1))
+                if sender.window.sent < 9:
+                    sender.send(tracks(sender.window.sent + 1))
                 take(receiver, taken, store=True)
 
-            until(lambda: sender.stored == 9, on)
+            until(lambda: sender.window.stored == 9, on)
     assert taken == list(range(1, 10))
 
 
@@ -322,7 +322,7 @@ def test_the_bytes_of_a_stranger_are_counted_and_dropped(endpoint, stranger, unt
 
         until(lambda: receiver.rejected == len(JUNK), turn)
         sender.send(tracks(1))
-        until(lambda: sender.stored == 1, turn)
+        until(lambda: sender.window.stored == 1, turn)
     assert taken == [1]
 
 
@@ -366,7 +366,7 @@ def test_a_message_above_the_limit_is_not_even_read(endpoint, stranger, until):
             sender.poll(0)
             take(receiver, taken, store=True)
 
-        until(lambda: sender.stored == 1, turn)
+        until(lambda: sender.window.stored == 1, turn)
         assert not other.poll(0)
     assert taken == [1]
     assert not receiver.rejected
@@ -472,7 +472,7 @@ def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_on
             until(lambda: receiver.receive(0.05), lambda: sender.poll(0))
             receiver.acknowledge(Position(1))
             pool.submit(receiver.close)
-            until(lambda: sender.stored == 1, lambda: sender.poll(0.02))
+            until(lambda: sender.window.stored == 1, lambda: sender.poll(0.02))
 
     for _ in range(10):  # a race, which was lost every other time
         run()

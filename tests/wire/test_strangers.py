@@ -112,16 +112,16 @@ def test_an_invalid_message_is_counted_by_its_reason_and_does_not_affect_the_leg
     ):
 
         def turn():
-            sender.send(features(sender.sent + 1)) if sender.sent < len(taken) + 1 else sender.poll(0.01)
+            sender.send(features(sender.window.sent + 1)) if sender.window.sent < len(taken) + 1 else sender.poll(0.01)
             if (message := receiver.receive(0.01)) is not None:
                 taken.append(message.seq)
                 forest.take(message)
                 receiver.acknowledge(Position(message.seq))
 
-        until(lambda: sender.stored >= 1, turn)
+        until(lambda: sender.window.stored >= 1, turn)
         stranger(zmq.DEALER, "features").send_multipart(WRONG[reason])
         until(lambda: rejected(reason) == before + 1, turn)
-        until(lambda: sender.stored > 5, turn)
+        until(lambda: sender.window.stored > 5, turn)
     assert taken == list(range(1, len(taken) + 1)), "each once, in order"
     assert forest.seq == taken[-1]
     assert rejects()["rejected"] >= 1
@@ -148,7 +148,7 @@ def test_acknowledgements_are_sent_only_to_the_sender_of_the_accepted_message(en
         until(lambda: other.poll(0), turn)
         other.recv()
         receiver.acknowledge(Position(1))  # stored only now
-        until(lambda: sender.stored == 1, lambda: sender.poll(0.01))
+        until(lambda: sender.window.stored == 1, lambda: sender.poll(0.01))
         assert not other.poll(50)
 
 
@@ -170,7 +170,7 @@ def test_a_repeated_acknowledgement_does_not_undo_a_later_one(endpoint, until):
         for answer in (Stored(1, 1), Stored(2, 2), Stored(1, 1)):
             receiver.send_multipart([peer, encode(answer)])
         until(lambda: rejected("acknowledgement") == before + 1, lambda: sender.poll(0.01))
-        assert (sender.stored, sender.taken) == (2, 2)
+        assert (sender.window.stored, sender.window.taken) == (2, 2)
         receiver.send_multipart([peer, encode(Position(9))])
         with pytest.raises(ProtocolError, match="another stream"):
             until(lambda: False, lambda: sender.poll(0.01))
@@ -219,4 +219,4 @@ def test_a_message_above_the_size_limit_closes_its_connection_and_is_counted(end
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
         stranger(zmq.DEALER, "results").send(bytes(CHANNELS["results"].limit + 1))
         until(lambda: rejects().get("disconnected", 0) > before, lambda: receiver.receive(0.05))
-    assert receiver.taken == 0
+    assert receiver.window.taken == 0

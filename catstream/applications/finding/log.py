@@ -17,7 +17,7 @@ from catstream.applications.finding.search import Step
 from catstream.applications.finding.sightings import GAP_SECONDS, Interval, Linker, Sighting
 from catstream.box import Box
 from catstream.errors import ServiceError
-from catstream.video.preview import jpeg
+from catstream.video.image import jpeg
 
 __all__ = ["FileResult", "SearchLog"]
 

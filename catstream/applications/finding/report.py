@@ -11,6 +11,7 @@ from catstream.applications.finding.log import FileResult
 from catstream.applications.finding.sightings import Interval
 from catstream.applications.html.page import figure, table, write_page
 from catstream.applications.html.timeline import Bar, clock, legend, timeline
+from catstream.messages.names import counted
 from catstream.video.palette import Colours
 
 __all__ = ["write_report"]
@@ -52,10 +53,10 @@ def write_report(path: Path, objects: Sequence[str], results: Iterable[FileResul
 
 def _about(objects: Sequence[str], results: list[FileResult]) -> str:
     complete = sum(result.complete for result in results)
-    of = "" if complete == len(results) else f" of {len(results)}"
+    of = "" if complete == len(results) else f"{complete} of "
     return (
-        f'<p class="about">{len(objects)} {_plural(objects, "object")} in {complete}{of} '
-        f"{_plural(results, 'file')}, {clock(sum(result.time for result in results))} of video. "
+        f'<p class="about">{counted(len(objects), "object")} in {of}{counted(len(results), "file")}, '
+        f"{clock(sum(result.time for result in results))} of video. "
         "Each picture is the best sighting of an interval.</p>"
     )
 
@@ -115,7 +116,7 @@ def _empty(results: list[FileResult], names: dict[str, str]) -> list[str]:
     if not empty:
         return []
     return [
-        f"<h2>Nothing found <small>{len(empty)} {_plural(empty, 'file')}</small></h2>",
+        f"<h2>Nothing found <small>{counted(len(empty), 'file')}</small></h2>",
         f'<p class="about file">{escape(", ".join(empty))}</p>',
     ]
 
@@ -132,7 +133,3 @@ def _short_names(files: list[str]) -> dict[str, str]:
     paths = {file: Path(file).absolute() for file in files}
     common = os.path.commonpath([path.parent for path in paths.values()])
     return {file: str(path.relative_to(common)) for file, path in paths.items()}
-
-
-def _plural(several: Sequence[object], noun: str) -> str:
-    return noun if len(several) == 1 else f"{noun}s"

@@ -21,9 +21,12 @@ from catstream.numerics.arrays import Float64
 from catstream.services.loop import die_with
 from catstream.services.start import SPAWN, sigint_blocked
 from catstream.video import crowd, demo
-from catstream.video.broadcast import Broadcast, Schedule, jpeg
+from catstream.video.broadcast import Broadcast, Schedule
+from catstream.video.image import jpeg
 
 __all__ = ["Camera", "Video", "render"]
+
+_QUALITY = 90  # of JPEG, as network cameras use it
 
 
 class Video(NamedTuple):
@@ -50,7 +53,7 @@ def render(plan: Plan, images: int, done: Callable[[int], None] = lambda _: None
     else:
         shown = crowd.render(plan.objects, images, plan.size)
     for image, boxes in shown:
-        files.append(jpeg(image))
+        files.append(jpeg(image, quality=_QUALITY))
         truth.append(boxes)
         done(len(files))
     name, *_ = first = {name: box for name, box in truth[0].items() if box is not None}
