@@ -27,7 +27,7 @@ import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -100,7 +100,7 @@ class _FileSource(Source):
     def __init__(
         self,
         name: str,
-        stream: Iterator[Frame],
+        stream: Generator[Frame],
         total: Callable[[], int | None],
         part: slice,
         start: int,
@@ -137,9 +137,7 @@ class _FileSource(Source):
 
     def close(self) -> None:
         self._first = None
-        close: Callable[[], None] | None = getattr(self._stream, "close", None)
-        if close is not None:
-            close()
+        self._stream.close()
 
 
 def is_live(text: str | Path) -> bool:
@@ -289,7 +287,7 @@ def _open_images(name: str, files: list[Path], *, part: slice, start: int, rate:
     return _FileSource(name, frames, lambda: len(files), part, start, rate)
 
 
-def _read_images(files: list[Path], wanted: range, start: int, rate: float, resize: bool) -> Iterator[Frame]:
+def _read_images(files: list[Path], wanted: range, start: int, rate: float, resize: bool) -> Generator[Frame]:
     def read(number: int) -> np.ndarray:
         image = read_image(files[number])
         if image is None:
@@ -362,7 +360,7 @@ def _count_frames(path: Path, rate: float) -> int | None:
 
 def _read_video(
     path: Path, container: InputContainer, rate: float, wanted: range, start: int, damage: _Damage
-) -> Iterator[Frame]:
+) -> Generator[Frame]:
     stream = container.streams.video[0]
     stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
     number, time, zero, shape, upright = 0, 0.0, None, None, UprightConverter()
