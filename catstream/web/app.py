@@ -26,7 +26,6 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from time import monotonic
 from typing import Annotated, Literal
 
 from starlette.applications import Starlette
@@ -45,16 +44,14 @@ from catstream.video.annotate import draw_preview
 from catstream.web import metrics
 from catstream.web.connections import body_of
 from catstream.web.feed import Feed, PipelineFeed
-from catstream.web.guard import TokenBucket, too_many
 from catstream.web.server import Site
 from catstream.web.streams import FleetFeed
-from catstream.web.viewers import UPDATE_SECONDS
+from catstream.web.timing import UPDATE_SECONDS
 from catstream.wire.codec import decode_json
 
 __all__ = ["fleet_site", "pipeline_site"]
 
 _PAGE = Path(__file__).with_name("page")
-_COMMANDS, _COMMANDS_PER_SECOND = 20, 5
 
 #: Status code of the answer to a request that ends with an error: that of its first class here.
 _CODES = {CommandRejectedError: 409, ProtocolError: 400, SilenceError: 504, CatstreamError: 503}
@@ -75,10 +72,9 @@ def _site(feed: PipelineFeed | FleetFeed) -> Site:
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        running = asyncio.create_task(feed.run())
+        feed.start()
         yield
-        running.cancel()
-        await asyncio.wait([running])
+        await asyncio.wait([feed.stop()])
 
     app = Starlette(lifespan=lifespan, routes=_routes(feed), exception_handlers={CatstreamError: _failed})
     return Site(app, feed.close_viewers)
@@ -114,7 +110,6 @@ class _Pages:
 
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
-        self._commands = TokenBucket(_COMMANDS, _COMMANDS_PER_SECOND)
 
     async def index(self, request: Request) -> Response:
         self._feed_of(request)
@@ -152,9 +147,6 @@ class _Pages:
         # A page of another origin cannot send this content type without a CORS preflight request.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise HTTPException(415, "expected application/json\n")
-        if wait := self._commands.wait(monotonic()):
-            return too_many(wait)
-        self._commands.take(monotonic())
         command = decode_json(await body_of(request), Command)
         if command.object and command.verb not in ("set-box", "forget"):
             raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")

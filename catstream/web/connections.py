@@ -16,14 +16,13 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from catstream.errors import ProtocolError
+from catstream.web.timing import ANSWER_SECONDS, REQUEST_SECONDS
 
 __all__ = ["MAX_CONNECTIONS", "Connections", "body_of"]
 
 #: Maximum number of open connections.
 MAX_CONNECTIONS = 256
 
-_REQUEST_SECONDS = 5.0  # time-out for a client to send a request, and its body
-_ANSWER_SECONDS = 20.0  # time-out for a client that does not read its response
 _MAX_BODY = 4096  # bytes
 
 
@@ -65,7 +64,7 @@ class _Connection(asyncio.Protocol):
         if (timer := self._all.waiting.pop(self, None)) is not None:
             timer.cancel()
         if self._address in self._all.open and (self._paused or not self._answering):
-            seconds = _ANSWER_SECONDS if self._paused else _REQUEST_SECONDS
+            seconds = ANSWER_SECONDS if self._paused else REQUEST_SECONDS
             self._all.waiting[self] = asyncio.get_running_loop().call_later(seconds, self._abort)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
@@ -106,7 +105,7 @@ async def body_of(request: Request) -> bytes:
     """Return the body of a request, of at most 4096 bytes."""
     body = b""
     try:
-        async with asyncio.timeout(_REQUEST_SECONDS):
+        async with asyncio.timeout(REQUEST_SECONDS):
             async for part in request.stream():
                 body += part
                 if len(body) > _MAX_BODY:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import deque
 from itertools import takewhile
 from typing import Any, Literal
 
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import End, Features, FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
 from catstream.web.objects import Objects
+from catstream.web.recent import Recent
 from catstream.web.surprising import SurprisingFrames
+from catstream.web.timing import POINT_SECONDS, RATE_SECONDS, SILENCE_SECONDS
 from catstream.web.viewers import Parts
 
-__all__ = ["RUNNING", "SILENCE_SECONDS", "Dashboard", "FleetDashboard"]
+__all__ = ["RUNNING", "Dashboard", "FleetDashboard"]
 
 #: Phase of a pipeline or a fleet: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
@@ -20,12 +22,7 @@ Phase = Literal["waiting", "running", "silent", "ended"]
 #: States in which the pipeline of a stream runs.
 RUNNING = ("running", "waiting", "paused")
 
-#: A process without a health report for this long counts as silent; each process sends one every second.
-SILENCE_SECONDS = 4.0
-
-_POINT_SECONDS = 0.25
 _POINTS = 480  # two minutes
-_RATE_SECONDS = 2.0  # interval over which frames per second are counted
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
 _PICTURES = 8  # number of pictures that a page may still request
@@ -74,12 +71,12 @@ class Dashboard(Parts):
         self.health: dict[str, Health] = {}
         self.last_reports: dict[str, float] = {}
         self.surprising = SurprisingFrames()
-        self.pictures: OrderedDict[int, Preview] = OrderedDict()
+        self.pictures = Recent[int, Preview](_PICTURES)
         self._last: dict[str, Health] = {}  # like `health`, but kept while the pipeline is silent
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
-        self._arrivals: OrderedDict[int, float] = OrderedDict()  # of the first track of each frame, the newest last
-        self._tracks: OrderedDict[int, dict[str, Track]] = OrderedDict()  # of the newest frames, by frame and object
+        self._arrivals = Recent[int, float](_FRAMES)  # of the first track of each frame
+        self._tracks = Recent[int, dict[str, Track]](_TRACKS)  # by frame and object
         self._frame: tuple[int, float] | None = None  # number and time of the newest frame
 
     def attach(self, endpoint: str) -> None:
@@ -132,8 +129,8 @@ class Dashboard(Parts):
 
     def rate(self, now: float) -> float:
         """Return the frames per second over the last two seconds."""
-        recent = takewhile(lambda moment: now - moment <= _RATE_SECONDS, reversed(self._arrivals.values()))
-        return len(list(recent)) / _RATE_SECONDS
+        recent = takewhile(lambda moment: now - moment <= RATE_SECONDS, reversed(self._arrivals.values()))
+        return len(list(recent)) / RATE_SECONDS
 
     def counter(self, process: str, name: str) -> float | None:
         """Return a counter from the last health report of a process, None if there is none."""
@@ -189,21 +186,11 @@ class Dashboard(Parts):
             self.surprising.drop({track.object})
             self._mark_changed("surprising")
         if self._frame is None or track.frame != self._frame[0]:
-            self._begin_frame(track, now)
+            self._frame = track.frame, track.time
+            self._tracks[track.frame], self._arrivals[track.frame] = {}, now
         self._tracks[track.frame][track.object] = track
         self._add_point(now)
         self._mark_changed("tracks")
-
-    def _begin_frame(self, track: Track, now: float) -> None:
-        """Record the arrival of the first track of a frame."""
-        self._frame = track.frame, track.time
-        self._tracks[track.frame] = {}
-        if len(self._tracks) > _TRACKS:
-            self._tracks.popitem(last=False)
-        self._arrivals[track.frame] = now
-        self._arrivals.move_to_end(track.frame)
-        if len(self._arrivals) > _FRAMES:
-            self._arrivals.popitem(last=False)
 
     def _add_model(self, model: Model, now: float) -> None:
         arrived = self._arrivals.get(model.frame)
@@ -211,15 +198,12 @@ class Dashboard(Parts):
 
     def _add_preview(self, preview: Preview) -> None:
         self.pictures[preview.frame] = preview
-        self.pictures.move_to_end(preview.frame)
-        if len(self.pictures) > _PICTURES:
-            self.pictures.popitem(last=False)
         if self.surprising.add_preview(preview):
             self._mark_changed("surprising")
         self._mark_changed("picture")
 
     def _add_point(self, now: float) -> None:
-        if not self.objects.shown or now - self._last_point < _POINT_SECONDS:
+        if not self.objects.shown or now - self._last_point < POINT_SECONDS:
             return
         self._last_point = now
         objects = {

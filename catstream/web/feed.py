@@ -12,7 +12,8 @@ from catstream.client.registry import locate
 from catstream.client.subscription import AnyMessage, Subscription
 from catstream.errors import CatstreamError
 from catstream.messages.kinds import End
-from catstream.web.dashboard import SILENCE_SECONDS, Dashboard
+from catstream.web.dashboard import Dashboard
+from catstream.web.timing import DRAIN_SECONDS, PAUSE_SECONDS, SILENCE_SECONDS
 from catstream.web.viewers import Parts, Viewers
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
@@ -20,9 +21,6 @@ from catstream.wire.endpoint import Endpoint
 __all__ = ["Feed", "PipelineFeed"]
 
 _log = logging.getLogger(__name__)
-
-_PAUSE_SECONDS = 0.5  # before a pipeline is looked up again
-_DRAIN_SECONDS = 2.0  # time for the last messages to arrive after the end
 
 #: Channels that show that a pipeline runs; those that are read while it runs; and those that are read only while a page
 #: is open, because they cost the pipeline processor time.
@@ -36,12 +34,15 @@ class Feed(ABC):
     ----------
     dashboard : the state of the page
     viewers : the open pages
+    used : time of the last request to the page
     """
 
     dashboard: Parts
+    _task: asyncio.Task[None]
 
     def __init__(self) -> None:
         self.viewers = Viewers()
+        self.used = 0.0
 
     @property
     @abstractmethod
@@ -56,7 +57,16 @@ class Feed(ABC):
         """End the updates of open pages."""
         self.viewers.closed = True
 
-    async def run(self) -> None:
+    def start(self) -> None:
+        """Feed the dashboard in a task, until `stop`."""
+        self._task = asyncio.create_task(self._run())
+
+    def stop(self) -> asyncio.Task[None]:
+        """Return the task, cancelled."""
+        self._task.cancel()
+        return self._task
+
+    async def _run(self) -> None:
         """Feed the dashboard until cancelled; each error is shown on the page, and then it continues."""
         while True:
             try:
@@ -95,7 +105,7 @@ class PipelineFeed(Feed):
     """
 
     dashboard: Dashboard
-    _pause = _PAUSE_SECONDS
+    _pause = PAUSE_SECONDS
 
     def __init__(self, endpoint: str = "", keys: str = "") -> None:
         super().__init__()
@@ -135,7 +145,7 @@ class PipelineFeed(Feed):
             for task in done:
                 self.dashboard.take(task.result(), monotonic())
             # After the end, the last health report, with the final size of the trees, and the last picture may follow.
-            await asyncio.wait(rest, timeout=_DRAIN_SECONDS)
+            await asyncio.wait(rest, timeout=DRAIN_SECONDS)
         finally:
             self.place = None
             for task in tasks:

@@ -19,10 +19,10 @@ from starlette.types import ASGIApp
 from catstream.errors import ServiceError
 from catstream.web.connections import MAX_CONNECTIONS, Connections
 from catstream.web.guard import Guard, is_loopback
+from catstream.web.timing import SHUTDOWN_SECONDS
 
 __all__ = ["Server", "Site"]
 
-_SHUTDOWN_SECONDS = 2
 _ALL_ADDRESSES = ("0.0.0.0", "::")  # bind addresses that include all interfaces
 _GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
 
@@ -86,7 +86,7 @@ class Server:
             server_header=False,
             proxy_headers=False,
             backlog=MAX_CONNECTIONS // 2,
-            timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
+            timeout_graceful_shutdown=SHUTDOWN_SECONDS,
         )
         self._server = _Uvicorn(config, site.close)
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from time import monotonic
 
 from starlette.concurrency import run_in_threadpool
@@ -18,23 +16,26 @@ from catstream.video.annotate import draw_boxes
 from catstream.video.palette import Colours
 from catstream.web.dashboard import FleetDashboard
 from catstream.web.feed import Feed, PipelineFeed
-from catstream.web.guard import TokenBucket
+from catstream.web.recent import Recent
+from catstream.web.timing import (
+    FIRST_SECONDS,
+    FRESH_SECONDS,
+    IDLE_SECONDS,
+    NEXT_SECONDS,
+    PERIOD_SECONDS,
+    REGISTRY_SECONDS,
+)
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 from catstream.wire.readable import readable
 
-__all__ = ["FleetFeed", "StreamFeeds"]
-
-_PERIOD_SECONDS, _TIMEOUT_SECONDS = 1.0, 2.0  # of the questions to the registry
+__all__ = ["FleetFeed", "StreamFeeds", "TokenBucket"]
 
 _MAX_FEEDS = 32
-_IDLE_SECONDS = 60.0  # after which a feed that nobody looks at is closed
 
 _WIDTH = 320  # pixels of a small picture
 _BURST, _PER_SECOND = 24, 10  # pictures that are made, of all streams together
-_FRESH_SECONDS = 1.0  # a picture is not made again within this time
-_FIRST_SECONDS, _NEXT_SECONDS = 2.0, 0.4  # time-outs for the first and the second preview of a stream
 _KEPT = 1024  # pictures
 
 
@@ -48,7 +49,7 @@ class FleetFeed(Feed):
     """
 
     dashboard: FleetDashboard
-    _pause = _PERIOD_SECONDS
+    _pause = PERIOD_SECONDS
 
     def __init__(self, fleet: str = "", keys: str = "") -> None:
         super().__init__()
@@ -86,10 +87,10 @@ class FleetFeed(Feed):
         """Return the endpoint of the pipeline of a stream, with the keys to connect with; None if it does not run."""
         return self._registry.place_of(stream).endpoint if self._registry is not None else None
 
-    async def run(self) -> None:
+    async def _run(self) -> None:
         try:
             with ThreadPoolExecutor(1, "registry") as self._thread:
-                await super().run()
+                await super()._run()
         finally:
             await self._feeds.stop()
             if self._registry is not None:
@@ -103,24 +104,11 @@ class FleetFeed(Feed):
     def _ask(self) -> FleetStatus:
         """Return the status of the fleet; called in the thread."""
         if self._registry is None:
-            self._registry = Registry(self._fleet, self._keys, timeout=_TIMEOUT_SECONDS)
+            self._registry = Registry(self._fleet, self._keys, timeout=REGISTRY_SECONDS)
         return self._registry.streams()
 
     def _mark_silent(self, reason: str) -> None:
         self.dashboard.mark_silent(reason, monotonic())
-
-
-@dataclass(slots=True)
-class _Open:
-    """A feed that runs.
-
-    task  runs it
-    used  time of the last request to the page of its stream
-    """
-
-    feed: PipelineFeed
-    task: asyncio.Task[None]
-    used: float = 0.0
 
 
 class StreamFeeds:
@@ -133,7 +121,7 @@ class StreamFeeds:
 
     def __init__(self, make_feed: Callable[[str], PipelineFeed]) -> None:
         self._make_feed = make_feed
-        self._open: dict[str, _Open] = {}
+        self._open: dict[str, PipelineFeed] = {}
 
     def __len__(self) -> int:
         return len(self._open)
@@ -145,30 +133,41 @@ class StreamFeeds:
                 self.close_unused(0.0)
             if len(self) >= _MAX_FEEDS:
                 return None
-            feed = self._make_feed(name)
-            self._open[name] = _Open(feed, asyncio.create_task(feed.run()))
+            self._open[name] = self._make_feed(name)
+            self._open[name].start()
         self._open[name].used = monotonic()
-        return self._open[name].feed
+        return self._open[name]
 
-    def close_unused(self, seconds: float = _IDLE_SECONDS) -> None:
+    def close_unused(self, seconds: float = IDLE_SECONDS) -> None:
         """End the feeds that nobody looks at, and to which the last request was so many seconds ago."""
-        for name, opened in list(self._open.items()):
-            if not opened.feed.viewers.count and monotonic() - opened.used >= seconds:
-                opened.task.cancel()
-                del self._open[name]
+        for name, feed in list(self._open.items()):
+            if not feed.viewers.count and monotonic() - feed.used >= seconds:
+                self._open.pop(name).stop()
 
     def close_viewers(self) -> None:
         """End the updates of all open pages."""
-        for opened in self._open.values():
-            opened.feed.close_viewers()
+        for feed in self._open.values():
+            feed.close_viewers()
 
     async def stop(self) -> None:
         """End all feeds."""
-        tasks = [opened.task for opened in self._open.values()]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.gather(*(feed.stop() for feed in self._open.values()), return_exceptions=True)
         self._open.clear()
+
+
+class TokenBucket:
+    """Allows bursts of `size` requests, and `rate` requests per second on average."""
+
+    def __init__(self, size: float, rate: float) -> None:
+        self._size, self._rate = size, rate
+        self._full_at = float("-inf")  # time from which it is full
+
+    def take(self, now: float) -> bool:
+        """Count a request; return False, without counting it, if it exceeds the limit."""
+        if self._full_at - now > (self._size - 1) / self._rate:
+            return False
+        self._full_at = max(self._full_at, now) + 1 / self._rate
+        return True
 
 
 class Pictures:
@@ -182,7 +181,7 @@ class Pictures:
     def __init__(self, endpoint_of: Callable[[StreamStatus], Endpoint | None]) -> None:
         self._endpoint_of = endpoint_of
         self._limit = TokenBucket(_BURST, _PER_SECOND)
-        self._kept: OrderedDict[str, tuple[float, bytes]] = OrderedDict()  # the time at which it was made, and JPEG
+        self._kept = Recent[str, tuple[float, bytes]](_KEPT)  # the time at which it was made, and JPEG
         self._pending: dict[str, asyncio.Task[bytes | None]] = {}
 
     async def get(self, stream: StreamStatus) -> bytes | None:
@@ -193,9 +192,8 @@ class Pictures:
         name = stream.name
         made, jpeg = self._kept.get(name, (float("-inf"), None))
         if name not in self._pending:
-            if monotonic() - made < _FRESH_SECONDS or self._limit.wait(monotonic()):
+            if monotonic() - made < FRESH_SECONDS or not self._limit.take(monotonic()):
                 return jpeg
-            self._limit.take(monotonic())
             self._pending[name] = asyncio.create_task(self._make(stream))
         return await asyncio.shield(self._pending[name]) or jpeg
 
@@ -211,9 +209,6 @@ class Pictures:
                 colours.of(name)
             jpeg = await run_in_threadpool(draw_boxes, preview, colours, _WIDTH)
             self._kept[stream.name] = monotonic(), jpeg
-            self._kept.move_to_end(stream.name)
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
             return jpeg
         finally:
             del self._pending[stream.name]
@@ -226,8 +221,8 @@ async def _newest_preview(endpoint: Endpoint) -> Preview | None:
     pipeline sends none.
     """
     with Subscriber(PREVIEWS, endpoint) as previews:
-        first = await _next(previews, _FIRST_SECONDS)
-        return first and (await _next(previews, _NEXT_SECONDS) or first)
+        first = await _next(previews, FIRST_SECONDS)
+        return first and (await _next(previews, NEXT_SECONDS) or first)
 
 
 async def _next(previews: Subscriber[Preview], seconds: float) -> Preview | None:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from catstream.messages.heads import APPEARANCE
 from catstream.messages.kinds import Features, Model, Preview, TrainingRows
+from catstream.web.recent import Recent
+from catstream.web.timing import APART_SECONDS
 
 __all__ = ["SurprisingFrame", "SurprisingFrames", "surprise"]
 
-_Value = TypeVar("_Value")
-
 _FRAMES = 12
-_APART_SECONDS = 1.0  # minimum distance, because neighbouring frames are similar
 _PENDING = 64  # number of frames whose picture or features are waited for
 
 
@@ -54,8 +52,8 @@ class SurprisingFrames:
     def __init__(self) -> None:
         self.frames: list[SurprisingFrame] = []  #: in the order of the video
         self._measured: Counter[str] = Counter()
-        self._surprises: OrderedDict[int, tuple[float, dict[str, float]]] = OrderedDict()  # frame -> time, by object
-        self._pictures: OrderedDict[int, Preview] = OrderedDict()
+        self._surprises = Recent[int, tuple[float, dict[str, float]]](_PENDING)  # frame -> time, by object
+        self._pictures = Recent[int, Preview](_PENDING)
 
     @property
     def measured(self) -> int:
@@ -87,21 +85,15 @@ class SurprisingFrames:
         }
         if not surprises:
             return False
-        self._keep(self._surprises, features.frame, (features.time, surprises))
+        self._surprises[features.frame] = features.time, surprises
         return self._match(features.frame)
 
     def add_preview(self, preview: Preview) -> bool:
         """Add the picture of a frame; return whether the selection has changed."""
         if not preview.boxes:
             return False
-        self._keep(self._pictures, preview.frame, preview)
+        self._pictures[preview.frame] = preview
         return self._match(preview.frame)
-
-    @staticmethod
-    def _keep(pending: OrderedDict[int, _Value], frame: int, value: _Value) -> None:
-        pending[frame] = value
-        if len(pending) > _PENDING:
-            pending.popitem(last=False)
 
     def _match(self, frame: int) -> bool:
         """Measure a frame if its features and its picture are here; return whether the selection has changed."""
@@ -116,7 +108,7 @@ class SurprisingFrames:
 
     def _insert(self, new: SurprisingFrame) -> None:
         """Add a frame to the selection, unless others are more surprising."""
-        near = [one for one in self.frames if one.object == new.object and abs(one.time - new.time) < _APART_SECONDS]
+        near = [one for one in self.frames if one.object == new.object and abs(one.time - new.time) < APART_SECONDS]
         if any(one.surprise >= new.surprise for one in near):
             return
         rest = [one for one in self.frames if one not in near]

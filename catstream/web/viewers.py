@@ -11,12 +11,10 @@ from time import monotonic
 
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
-__all__ = ["UPDATE_SECONDS", "Parts", "Viewers"]
+from catstream.web.timing import KEEP_ALIVE_SECONDS, RETRY_SECONDS, UPDATE_SECONDS
 
-#: Seconds between two updates of an open page.
-UPDATE_SECONDS = 0.1
+__all__ = ["Parts", "Viewers"]
 
-_KEEP_ALIVE_SECONDS = 5.0  # an idle stream sends a comment after this time, which detects closed connections
 _MAX_VIEWERS = 64
 
 
@@ -92,12 +90,12 @@ class Viewers:
         seen: dict[str, int] = {}
         last_sent = monotonic()
         with self.counted():
-            yield "retry: 1000\n\n"
+            yield f"retry: {1000 * RETRY_SECONDS:.0f}\n\n"
             while not self.closed:
                 if parts := page.updates(seen):
                     last_sent = monotonic()
                     yield _event(parts)
-                elif monotonic() - last_sent > _KEEP_ALIVE_SECONDS:
+                elif monotonic() - last_sent > KEEP_ALIVE_SECONDS:
                     last_sent = monotonic()
                     yield ":\n\n"
                 await asyncio.sleep(UPDATE_SECONDS)

@@ -46,7 +46,7 @@ def sent_until_it_is_closed(client, data):
 
 @pytest.mark.parametrize("begun", BEGUN.values(), ids=BEGUN)
 def test_a_request_that_is_incomplete_after_the_timeout_closes_its_connection(serve, connect, monkeypatch, begun):
-    monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.05)
+    monkeypatch.setattr(connections, "REQUEST_SECONDS", 0.05)
     client = connect(serve())
     client.sendall(begun)
     with suppress(ConnectionResetError):
@@ -55,14 +55,14 @@ def test_a_request_that_is_incomplete_after_the_timeout_closes_its_connection(se
 
 
 def test_a_request_sent_byte_by_byte_has_the_same_timeout(serve, connect, monkeypatch):
-    monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.05)
+    monkeypatch.setattr(connections, "REQUEST_SECONDS", 0.05)
     client = connect(serve())
     client.sendall(HALF)
     sent_until_it_is_closed(client, b"x")
 
 
 def test_a_client_that_does_not_read_its_response_is_disconnected(serve, connect, monkeypatch):
-    monkeypatch.setattr(connections, "_ANSWER_SECONDS", 0.05)
+    monkeypatch.setattr(connections, "ANSWER_SECONDS", 0.05)
     monkeypatch.setattr(Dashboard, "picture", lambda *_: Preview(1, 64, 48, None, bytes(1 << 23)))
     client = connect(serve())
     sent_until_it_is_closed(client, b"GET /pictures/1.jpg HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
@@ -105,7 +105,7 @@ async def late(scope, receive, send):  # noqa: ARG001
 
 
 def test_a_response_is_not_cut_off_if_the_application_returns_late_from_the_request_before(serve_site, monkeypatch):
-    monkeypatch.setattr(connections, "_REQUEST_SECONDS", 0.3)
+    monkeypatch.setattr(connections, "REQUEST_SECONDS", 0.3)
     client = serve_site(Site(late, lambda: None))
     assert client.get("/healthz").text == "ok"
     assert client.get("/parts").text.endswith("partthe end")

@@ -24,7 +24,7 @@ def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_s
     node, chromium = shutil.which("node"), shutil.which("chromium")
     if node is None or chromium is None or not (HERE / "node_modules" / "axe-core").exists():
         pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
-    monkeypatch.setattr(streams, "_TIMEOUT_SECONDS", 1.0)
+    monkeypatch.setattr(streams, "REGISTRY_SECONDS", 1.0)
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
     fleet.node("south-2", cores=4.0)
     fleet.node("south", "dead", cores=4.0, trouble="no answer since 02:14:07")

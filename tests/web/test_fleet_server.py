@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from catstream.cli.view import fleet_view
 from catstream.web import streams
 from catstream.web.feed import PipelineFeed
-from catstream.web.streams import StreamFeeds
+from catstream.web.streams import StreamFeeds, TokenBucket
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, allowed, create, public_key, synchronise
 
@@ -106,7 +106,7 @@ def test_the_picture_of_a_stream_is_small_and_has_the_boxes_of_its_objects(fleet
 def test_no_more_pictures_are_made_than_the_limit_allows(fleet, serve_fleet, camera, folder, until, monkeypatch):
     made = []
     monkeypatch.setattr(streams, "draw_boxes", lambda *_: made.append(1) or b"picture %d" % len(made))
-    monkeypatch.setattr(streams, "_FRESH_SECONDS", 0.0)
+    monkeypatch.setattr(streams, "FRESH_SECONDS", 0.0)
     monkeypatch.setattr(streams, "_BURST", 2)
     monkeypatch.setattr(streams, "_PER_SECOND", 1e-6)
     fleet.stream("cam-7", endpoint=str(folder))
@@ -114,6 +114,11 @@ def test_no_more_pictures_are_made_than_the_limit_allows(fleet, serve_fleet, cam
     shown(page, until)
     pictures = [asked(page, "/streams/cam-7/picture.jpg", camera).content for _ in range(4)]
     assert pictures == [b"picture 1", b"picture 2", b"picture 2", b"picture 2"]
+
+
+def test_a_token_bucket_allows_its_burst_and_its_rate():
+    bucket = TokenBucket(3, 0.5)
+    assert [moment for moment in range(20) if bucket.take(moment)] == [0, 1, 2, 3, 4, 6, 8, 10, 12, 14, 16, 18]
 
 
 def test_the_page_of_a_stream_is_below_that_of_the_fleet(fleet, page, camera, folder, until):
@@ -163,7 +168,7 @@ def test_metrics_are_documented_with_their_labels(fleet, page, until):
 def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams(
     fleet, manager, serve_fleet, until, monkeypatch
 ):
-    monkeypatch.setattr(streams, "_TIMEOUT_SECONDS", 1.0)
+    monkeypatch.setattr(streams, "REGISTRY_SECONDS", 1.0)
     fleet.stream("cam-7")
     page = serve_fleet()
     shown(page, until)
