@@ -111,8 +111,8 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
     options = group.make_context("catstream", list(service["command"]))
     verb, command, rest = group.resolve_command(options, service["command"])
     page = command.make_context(verb, rest, parent=options).params
-    assert (page["endpoint"], page["port"]) == (settings("detector").run.endpoint, 8000)
-    server = Server(pipeline_site(page["endpoint"]), host=page["host"], port=0, token=page["token"])
+    assert (page["endpoint"], page["listen"].port) == (settings("detector").run.endpoint, 8000)
+    server = Server(pipeline_site(page["endpoint"]), host=page["listen"].host, port=0, token=page["token"])
     script = service["healthcheck"]["test"][-1].replace(":8000", f":{urlsplit(server.url).port}")
     with server.in_background():
         subprocess.run([sys.executable, "-P", "-c", script], check=True)

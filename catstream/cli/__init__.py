@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
 
 import click
 
+from catstream.cli.interrupts import INTERRUPTS, stopped
+from catstream.cli.output import complain
 from catstream.errors import CatstreamError
 
-__all__ = ["COMMANDS", "INTERRUPTED", "interruptible", "load_command", "main"]
-
-#: Exit code of a command that was interrupted by Ctrl-C.
-INTERRUPTED = 130
+__all__ = ["COMMANDS", "load_command", "main"]
 
 #: Command -> summary. The module of a command is imported when it is called, because some imports take long.
 COMMANDS = {
@@ -55,28 +50,6 @@ def load_command(name: str) -> click.Command:
     return command
 
 
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """End this process at once on Ctrl-C inside a `with`. It is for imports before any work.
-
-    Kernels are compiled during these imports, and the compiler hides a KeyboardInterrupt or makes another error of it.
-    If SIGINT is ignored, as in the background job of a script, it stays ignored.
-    """
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        yield
-        return
-
-    def leave(*_: object) -> None:
-        os.write(2, b"stopped\n")
-        os._exit(INTERRUPTED)
-
-    before = signal.signal(signal.SIGINT, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 class _Commands(click.Group):
     def list_commands(self, _: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -88,8 +61,7 @@ class _Commands(click.Group):
         try:
             return super().invoke(context)
         except (KeyboardInterrupt, click.Abort):  # click would report it as an error
-            click.echo("stopped", err=True)
-            context.exit(INTERRUPTED)
+            stopped()
 
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -109,8 +81,9 @@ def group() -> None:
 
 def main() -> None:
     """Run the command line. The exit code is 1 after an error, which is one line, and `INTERRUPTED` after Ctrl-C."""
+    INTERRUPTS.install()
     try:
         group(prog_name="catstream")
     except CatstreamError as error:
-        click.echo(f"catstream: {error}", err=True)
+        complain(error)
         sys.exit(1)

@@ -8,10 +8,9 @@ from typing import TypeVar
 
 import click
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from catstream.box import Box
+from catstream.cli.output import line_of, messages
 from catstream.cli.track import track
 from catstream.services.options import PATH
 
@@ -71,8 +70,8 @@ def _one(output: Path, frames: int | None, render_only: bool) -> None:
     from catstream.applications.evaluation.metrics import score
     from catstream.video.demo import FRAMES, write
 
-    console, frames = Console(), frames or FRAMES
-    video, boxes = _rendered(console, frames, lambda done: write(output, frames, done=done))
+    frames = frames or FRAMES
+    video, boxes = _rendered(frames, lambda done: write(output, frames, done=done))
     if render_only:
         return
     tracks = output / "tracks"
@@ -80,10 +79,10 @@ def _one(output: Path, frames: int | None, render_only: bool) -> None:
     truth = np.array([box or (np.nan,) * 4 for box in boxes])
     found = np.loadtxt(tracks / "demo.txt", delimiter=",", ndmin=2)
     absent, nothing = np.isnan(truth).any(axis=1), np.isnan(found).any(axis=1)
-    console.print(f"success rate: {score(found, truth).success:.3f} (overlap with the ground truth above 0.5)")
+    click.echo(f"success rate: {score(found, truth).success:.3f} (overlap with the ground truth above 0.5)")
     if absent.any():
-        console.print(f"absence reported: {(absent & nothing).sum()} of {absent.sum()} frames")
-    console.print(f"annotated video: {tracks / 'demo.mp4'}", soft_wrap=True)
+        click.echo(f"absence reported: {(absent & nothing).sum()} of {absent.sum()} frames")
+    click.echo(f"annotated video: {tracks / 'demo.mp4'}")
 
 
 def _several(output: Path, objects: int, frames: int | None, render_only: bool) -> None:
@@ -92,8 +91,8 @@ def _several(output: Path, objects: int, frames: int | None, render_only: bool) 
     from catstream.sinks.formats import CsvSink
     from catstream.video.crowd import FRAMES, write
 
-    console, frames = Console(), frames or FRAMES
-    video, truth = _rendered(console, frames, lambda done: write(output, objects, frames, done=done))
+    frames = frames or FRAMES
+    video, truth = _rendered(frames, lambda done: write(output, objects, frames, done=done))
     if render_only:
         return
     tracks = output / "tracks"
@@ -102,20 +101,18 @@ def _several(output: Path, objects: int, frames: int | None, render_only: bool) 
     for each in CsvSink.tracks(tracks / "crowd.csv"):
         found[each.frame][each.object] = each.box
     scores = score_multiple(truth, found)
-    console.print(
+    click.echo(
         f"MOTA {scores.mota:.3f}, IDF1 {scores.idf1:.3f}, HOTA {scores.hota:.3f}, identity switches {scores.switches}"
     )
-    console.print(f"annotated video: {tracks / 'crowd.mp4'}", soft_wrap=True)
+    click.echo(f"annotated video: {tracks / 'crowd.mp4'}")
 
 
-def _rendered(
-    console: Console, frames: int, write: Callable[[Callable[[int], None]], tuple[Path, Truth]]
-) -> tuple[Path, Truth]:
+def _rendered(frames: int, write: Callable[[Callable[[int], None]], tuple[Path, Truth]]) -> tuple[Path, Truth]:
     """Render with a progress bar; return the video and its truth."""
-    with Progress(TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), console=console, transient=True) as bar:
-        task = bar.add_task("", total=frames)
+    with line_of(messages()) as bar:
+        task = bar.add_task("rendering", total=frames)
         video, truth = write(lambda count: bar.update(task, completed=count))
-    console.print(f"video: {video}", soft_wrap=True)
+    click.echo(f"video: {video}")
     return video, truth
 
 

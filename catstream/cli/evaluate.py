@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Task
 from rich.table import Table
 
-from catstream.cli import INTERRUPTED, interruptible
-from catstream.cli.figures import check_json, write_json
+from catstream.cli.files import with_json_file, write_json
+from catstream.cli.interrupts import interruptible, stopped
+from catstream.cli.output import complain, line_of, messages, screen, table
 from catstream.errors import CatstreamError
 from catstream.services.options import PATH, with_settings
 from catstream.settings import Settings
@@ -36,7 +36,7 @@ __all__ = ["evaluate"]
 @click.option("--peer-models", type=PATH, help="Folder of model files for nano and vit.")
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of processes.")
 @click.option("--output", type=PATH, help="Folder for results and report.html.")
-@click.option("--json", "json_file", type=PATH, help="File for all figures and their provenance.")
+@with_json_file
 @with_settings
 def evaluate(
     settings: Settings,
@@ -115,38 +115,39 @@ def evaluate(
         raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     sequences = [sequence for path in paths for sequence in find_sequences(path)]
-    check_json(json_file)
     seen = {} if attributes is None else read_attributes(attributes)
 
     errors: list[CatstreamError] = []
-    console = Console(width=None if sys.stdout.isatty() else 120)
-    with _reporting_interrupt(output), _progress(console) as (begin, done):
-        runs = run_all(
-            sequences,
-            names,
-            settings,
-            starts=choose_starts(starts, jitter, shifts=shifts),
-            peer_models=peer_models,
-            jobs=jobs,
-            output=output,
-            begin=begin,
-            done=done,
-            failed=errors.append,
-        )
+    try:
+        with _progress() as (begin, done):
+            runs = run_all(
+                sequences,
+                names,
+                settings,
+                starts=choose_starts(starts, jitter, shifts=shifts),
+                peer_models=peer_models,
+                jobs=jobs,
+                output=output,
+                begin=begin,
+                done=done,
+                failed=errors.append,
+            )
+    except KeyboardInterrupt:
+        stopped("" if output is None else f"complete runs are in {str(output)!r}; the same command continues")
 
     for error in errors:
-        click.echo(f"catstream: {error}", err=True)
+        complain(error)
     if not runs:
         raise CatstreamError("all runs have failed: see above")
     rows = rows_of(runs)
-    console.print(_table(rows, mean_of(rows)))
+    screen().print(_table(rows, mean_of(rows)))
     for line in describe_flips(rows):
-        console.print(line, soft_wrap=True)
+        click.echo(line)
     if json_file is not None or output is not None:
         shared = attributes_of({run.sequence.name: run.sequence for run in runs}.values(), seen)
         write_json(json_file, to_json(rows, settings, shared))
         if output is not None:
-            console.print(f"report: {write_report(output / 'report.html', runs, settings, shared)}", soft_wrap=True)
+            click.echo(f"report: {write_report(output / 'report.html', runs, settings, shared)}")
     if errors:
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
@@ -154,11 +155,15 @@ def evaluate(
 
 
 @contextmanager
-def _progress(console: Console) -> Iterator[tuple[Callable[[int], None], Callable[[EvaluationRun], None]]]:
+def _progress() -> Iterator[tuple[Callable[[int], None], Callable[[EvaluationRun], None]]]:
     """Show a bar; yield the functions that take the number of frames, and each finished run."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("frames", total=None)
+
+    def parts(task: Task) -> list[str]:
+        left = [] if task.time_remaining is None else [f"{timedelta(seconds=round(task.time_remaining))} left"]
+        return [task.description, f"{task.completed:.0f}/{task.total or 0:.0f} frames", *left]
+
+    with line_of(messages(), parts) as progress:
+        task = progress.add_task("starting", total=None)
 
         def begin(frames: int) -> None:
             progress.update(task, total=frames)
@@ -169,29 +174,15 @@ def _progress(console: Console) -> Iterator[tuple[Callable[[int], None], Callabl
         yield begin, done
 
 
-@contextmanager
-def _reporting_interrupt(output: Path | None) -> Iterator[None]:
-    """After Ctrl-C, print how to continue."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        kept = "" if output is None else f": complete runs are in {str(output)!r}; the same command continues"
-        click.echo(f"stopped{kept}", err=True)
-        sys.exit(INTERRUPTED)
-
-
 def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
     """Return a table of the sequences and the means."""
     from catstream.applications.evaluation.summary import MEASURES, cells
 
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("sequence")
-    table.add_column("tracker")
-    for heading in ("frames", *MEASURES.values()):
-        table.add_column(heading, justify="right")
+    numbers = ("frames", *MEASURES.values())
+    made = table("sequence", "tracker", *numbers, right=numbers)
     for row in rows:
-        table.add_row(row.name, row.tracker, str(row.frames), *cells(row))
-    table.add_section()
+        made.add_row(row.name, row.tracker, str(row.frames), *cells(row))
+    made.add_section()
     for tracker, mean in means.items():
-        table.add_row("mean", tracker, "", *cells(mean), style="bold")
-    return table
+        made.add_row("mean", tracker, "", *cells(mean), style="bold")
+    return made

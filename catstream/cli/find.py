@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 from rich.progress import Task
-from rich.table import Table
 
-from catstream.cli import INTERRUPTED, interruptible
-from catstream.cli.interrupts import Interrupts
-from catstream.cli.line import line_of
+from catstream.cli.interrupts import INTERRUPTS, interruptible, stopped
+from catstream.cli.output import complain, line_of, messages, screen, table
 from catstream.errors import CatstreamError, VideoError
 from catstream.messages.names import counted
 from catstream.numerics.threads import one_thread
@@ -141,35 +137,31 @@ def find(
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
     search = Search(load_models(models), reading, threshold, every, sizes)
     files = find_files(paths)
-    interrupts = Interrupts()
     with SearchLog(output / "search.ndjson", search.description, overwrite=overwrite) as log:
-        interrupts.install()
-        console = Console(stderr=True, soft_wrap=True)
         try:
             with one_thread(opencv=True):
-                _search(search, files, log, interrupts, console)
+                _search(search, files, log)
             interrupted = False
         except KeyboardInterrupt:
             interrupted = True
-        with interrupts.deferred():
+        with INTERRUPTS.deferred():
             results = list(log.results.values())
             write_tables(output, results, search.description)
             report = write_report(output / "report.html", list(search.models), results)
     _print(results, report)
     if interrupted:
-        click.echo("stopped: the results so far are kept; the same command continues", err=True)
-        sys.exit(INTERRUPTED)
+        stopped("the results so far are kept; the same command continues")
     problems = [problem for result in results for problem in result.problems]
     for problem in problems:
-        click.echo(f"catstream: {problem}", err=True)
+        complain(problem)
     if problems:
         found = f"{counted(len(problems), 'problem')} in {counted(len(files), 'file')}"
         raise CatstreamError(f"{found}: what could be read was searched")
 
 
-def _search(search: Search, files: list[File], log: SearchLog, interrupts: Interrupts, console: Console) -> None:
+def _search(search: Search, files: list[File], log: SearchLog) -> None:
     """Search all files that are not complete, and show the progress."""
-    with line_of(console, _line) as progress:
+    with line_of(messages(), _line) as progress:
         task = progress.add_task("", total=None, files=len(files), result=None, searched=0.0)
         searched = 0.0  # seconds of video
         for number, file in enumerate(files, 1):
@@ -187,7 +179,7 @@ def _search(search: Search, files: list[File], log: SearchLog, interrupts: Inter
             try:
                 for step in search.file(file, result.position, opened=opened, damaged=damaged):
                     searched += step.time - result.time
-                    with interrupts.deferred():  # a step is in the log as a whole
+                    with INTERRUPTS.deferred():  # a step is in the log as a whole
                         log.step(result, step)
                     progress.update(task, searched=searched)
             except VideoError as error:
@@ -213,20 +205,16 @@ def _print(results: list[FileResult], report: Path) -> None:
     """Print the best intervals, and the path of the report."""
     from catstream.applications.html.timeline import clock
 
-    console = Console(width=None if sys.stdout.isatty() else 120)
     intervals = sorted((each for result in results for each in result.intervals), key=lambda each: -each.best.score)
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for heading in ("object", "file"):
-        table.add_column(heading, overflow="fold")
-    for heading in ("from", "to", "sightings", "score"):
-        table.add_column(heading, justify="right")
+    numbers = ("from", "to", "sightings", "score")
+    best = table("object", "file", *numbers, right=numbers)
     for each in intervals[:_SHOWN]:
         times = clock(each.first.time), clock(each.last.time)
-        table.add_row(each.first.object, each.first.file, *times, str(each.count), f"{each.best.score:.2f}")
+        best.add_row(each.first.object, each.first.file, *times, str(each.count), f"{each.best.score:.2f}")
     if intervals:
-        console.print(table)
+        screen().print(best)
     if len(intervals) > _SHOWN:
-        console.print(f"and {len(intervals) - _SHOWN} more intervals")
+        click.echo(f"and {len(intervals) - _SHOWN} more intervals")
     if not intervals:
-        console.print("nothing was found")
-    console.print(f"report: {report}", soft_wrap=True)
+        click.echo("nothing was found")
+    click.echo(f"report: {report}")

@@ -17,6 +17,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
+from catstream.cli.output import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
 from catstream.errors import FleetError, ServiceError
@@ -105,7 +106,7 @@ def up(running: Fleet, replace: bool, **options: Any) -> None:
       catstream fleet up examples/fleet.toml --detach
       catstream fleet up fleet.toml --address 10.0.0.1:6379
     """
-    console = Console()
+    console = screen()
     try:
         lines = _up(running, replace=replace, **options)
     except FleetError as error:
@@ -166,7 +167,7 @@ def status(place: str, keys: str, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(found)))
     else:
-        _show(Console(), found)
+        _show(screen(), found)
     streams = found.streams.values()
     if any(each.state in ("failed", "unplaced") or "it skips" in each.trouble for each in streams):
         sys.exit(1)
@@ -326,14 +327,12 @@ def _show(console: Console, status: FleetStatus) -> None:
 
 def _streams(status: FleetStatus) -> Table:
     """A row for each stream, those with trouble first."""
-    table = Table("stream", "node", "state", box=None, pad_edge=False, header_style="bold")
-    for name in ("frames/s", "skipped", "cores", "model", "restarts"):
-        table.add_column(name, justify="right")
-    table.add_column("trouble", overflow="fold")
+    numbers = ("frames/s", "skipped", "cores", "model", "restarts")
+    shown = table("stream", "node", "state", *numbers, "trouble", right=numbers)
     for each in sorted(status.streams.values(), key=lambda each: (not each.trouble, each.name)):
         model = max(each.models.values(), default=0)
         restarts = str(each.restarts) if each.restarts else "-"
-        table.add_row(
+        shown.add_row(
             each.name,
             each.node or "-",
             each.state,
@@ -344,7 +343,7 @@ def _streams(status: FleetStatus) -> Table:
             restarts,
             _trouble(each),
         )
-    return table
+    return shown
 
 
 def _trouble(stream: StreamStatus) -> str:
@@ -353,13 +352,11 @@ def _trouble(stream: StreamStatus) -> str:
 
 
 def _nodes(status: FleetStatus) -> Table:
-    table = Table("\nnode", "\nstate", "\naddress", box=None, pad_edge=False, header_style="bold")
-    for name in ("\nreserved", "\nof cores", "\nstreams"):
-        table.add_column(name, justify="right")
-    table.add_column("\nlabels")
+    numbers = ("\nreserved", "\nof cores", "\nstreams")
+    shown = table("\nnode", "\nstate", "\naddress", *numbers, "\nlabels", right=numbers)
     for each in status.nodes.values():
         labels = ", ".join(f"{key}={value}" for key, value in each.labels.items())
-        table.add_row(
+        shown.add_row(
             each.name, each.state, each.address, f"{each.used:.2g}", f"{each.cores:.3g}", str(each.streams), labels
         )
-    return table
+    return shown

@@ -1,12 +1,21 @@
-"""Defers SIGINT, SIGTERM and SIGHUP to the end of a block, so that they take effect between two frames."""
+"""What Ctrl-C, SIGTERM and the loss of the terminal do: each ends a command, between two frames."""
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
-__all__ = ["Interrupts"]
+import click
+
+__all__ = ["INTERRUPTED", "INTERRUPTS", "Interrupts", "interruptible", "stopped"]
+
+#: Exit code of a command that was interrupted.
+INTERRUPTED = 130
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupts:
@@ -17,7 +26,7 @@ class Interrupts:
 
     def install(self) -> None:
         """Install the handlers. A signal that is ignored, as under nohup, stays ignored, except SIGTERM."""
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in _SIGNALS:
             if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._handle)
 
@@ -29,11 +38,44 @@ class Interrupts:
             yield
         finally:
             self._deferring = False
-        if self._pending:
-            self._pending = False
+            pending, self._pending = self._pending, False
+        if pending:
             raise KeyboardInterrupt
 
     def _handle(self, *_: object) -> None:
         if not self._deferring:
             raise KeyboardInterrupt
         self._pending = True
+
+
+#: The handlers of this process; the command line installs them.
+INTERRUPTS = Interrupts()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """End this process at once on Ctrl-C inside a `with`. It is for imports before any work.
+
+    Kernels are compiled during these imports, and the compiler hides a KeyboardInterrupt or makes another error of it.
+    If SIGINT is ignored, as in the background job of a script, it stays ignored.
+    """
+
+    def leave(*_: object) -> None:
+        os.write(2, b"stopped\n")
+        os._exit(INTERRUPTED)
+
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, leave)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def stopped(result: str = "") -> NoReturn:
+    """End a command that was interrupted; say what is there so far, and how to continue."""
+    click.echo(f"stopped: {result}" if result else "stopped", err=True)
+    raise SystemExit(INTERRUPTED)

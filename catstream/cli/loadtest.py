@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import re
-import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
-from rich.table import Table
 
-from catstream.cli import INTERRUPTED
-from catstream.cli.figures import check_json, write_json
+from catstream.cli.files import with_json_file, write_json
+from catstream.cli.interrupts import stopped
+from catstream.cli.output import complain, line_of, messages, screen, table
 from catstream.errors import CatstreamError
-from catstream.services.options import PATH, with_settings
+from catstream.services.options import with_settings
 
 if TYPE_CHECKING:
     from catstream.applications.loadtest.limits import Limit
@@ -58,7 +55,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option(
     "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see above."
 )
-@click.option("--json", "json_file", type=PATH, help="File for all figures.")
+@with_json_file
 @click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html.")
 @with_settings
 def loadtest(
@@ -112,13 +109,9 @@ def loadtest(
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     parameters = Plan(**plan)
-    check_json(json_file)
     if output is not None:
         _make(output)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    console = Console(width=None if sys.stdout.isatty() else 140)
-    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[figures]}")
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with line_of(messages(), lambda task: [task.description, task.fields["figures"]]) as progress:
         task = progress.add_task("starting", total=1.0, figures="")
 
         def report(activity: str, share: float, figures: str) -> None:
@@ -127,28 +120,25 @@ def loadtest(
         def done(result: Result) -> None:
             if find_limit:
                 verdict = "; ".join(violations(asked, result)) or "met"
-                console.print(
+                click.echo(
                     f"{result.plan.rate:g} frames/s due, {result.followed:.1f} tracked, "
                     f"p99 {milliseconds(percentiles(result.track)['p99'])} ms: {verdict}"
                 )
 
         load_test = run_load_test(parameters, asked, find=find_limit, report=report, done=done)
     if load_test.results:
-        _print(console, load_test.result, asked)
+        _print(load_test.result, asked)
         write_json(json_file, to_json(load_test))
         if output is not None:
-            console.print(f"report: {write_report(output / 'report.html', load_test)}", soft_wrap=True)
+            click.echo(f"report: {write_report(output / 'report.html', load_test)}")
     if load_test.interrupted:
-        console.print(
-            "stopped: these are the figures so far" if load_test.results else "stopped: there are no measurements yet"
-        )
-        sys.exit(INTERRUPTED)
+        stopped("these are the figures so far" if load_test.results else "there are no measurements yet")
     if load_test.highest_rate:
-        console.print(
+        click.echo(
             f"the highest rate that meets {', '.join(map(str, asked))}: {load_test.highest_rate:g} frames/s a stream"
         )
     for line in load_test.violations:
-        click.echo(f"catstream: broken: {line}", err=True)
+        complain(f"broken: {line}")
     if load_test.violations:
         sys.exit(_FAILED)
 
@@ -161,24 +151,23 @@ def _make(output: Path) -> None:
         raise CatstreamError(f"cannot write to {str(output)!r} ({error.strerror}): give another folder") from None
 
 
-def _print(console: Console, result: Result, limits: list[Limit]) -> None:
+def _print(result: Result, limits: list[Limit]) -> None:
     from catstream.applications.loadtest.report import milliseconds, tables
 
-    console.print(
+    click.echo(
         f"{result.plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most "
         f"{milliseconds(result.camera_late)} ms late",
     )
     for each in tables(result):
-        table = Table(box=None, header_style="bold", pad_edge=False)
-        for number, head in enumerate(each.rows[0]):
-            table.add_column(head, justify="right" if number else "left")
+        heads = list(each.rows[0])
+        made = table(*heads, right=heads[1:])
         for row in each.cells():
-            table.add_row(*row)
-        console.print(table)
+            made.add_row(*row)
+        screen().print(made)
     if result.other_load > _QUIET_CORES:
-        console.print(
+        click.echo(
             f"other processes kept {result.other_load:.1f} cores busy: run it on a quiet machine for reliable figures"
         )
     for limit in limits:
-        mark = "[green]met[/]" if limit.is_met(result) else "[red]broken[/]"
-        console.print(f"{mark}: {limit.describe(result)}")
+        mark = click.style("met", "green") if limit.is_met(result) else click.style("broken", "red")
+        click.echo(f"{mark}: {limit.describe(result)}")

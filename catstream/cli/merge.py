@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from catstream.errors import ServiceError
+from catstream.cli.files import check_file
+from catstream.cli.output import complain
 from catstream.run.learned import Learned
 from catstream.run.learned import merge as merged
 from catstream.services.options import PATH, with_overwrite
@@ -33,13 +34,12 @@ def merge(files: tuple[Path, ...], output: Path, overwrite: bool, force: bool) -
     EXAMPLES
       catstream merge door.safetensors yard.safetensors -o anna.safetensors
     """
-    if output.exists() and not overwrite:
-        raise ServiceError(f"{output} exists already: replace it with --overwrite, or give another name")
+    check_file(output, overwrite=overwrite)
     parts = [Learned.load(file) for file in files]
     with warnings.catch_warnings(record=True, action="always", category=UserWarning) as doubts:
         whole = merged(parts, force=force)
     for doubt in doubts:
-        click.echo(f"catstream: warning: {doubt.message}", err=True)
+        complain(f"warning: {doubt.message}")
     whole.save(output)
     tree = whole.trees["object"]
     click.echo(

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress, Task
 
-from catstream.cli.line import line_of
+from catstream.cli.output import line_of
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, counted
 from catstream.pipeline import Pipeline

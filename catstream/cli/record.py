@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -49,7 +48,6 @@ def record(output: Path, endpoint: str, keys: str, wait: float) -> None:
       catstream record --output walk.mcap --endpoint run
     """
     require_extra("record")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     place = locate(endpoint, keys)
     with (
         Subscriber(TRAINING, place, early=True) as training,

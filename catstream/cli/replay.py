@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Column, Table
 
+from catstream.cli.output import line_of, messages, screen, table
 from catstream.errors import RecordingError
 from catstream.messages.kinds import Features, Model, Run, Track
 from catstream.services.options import PATH
@@ -76,9 +74,8 @@ def replay(
     """
     if not learns and (pairs or output or incomplete):
         raise click.UsageError("--set, --output and --incomplete need --learn")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    found, console = Recording(recording), Console(stderr=True)
-    console.print(f"{recording}: {found}", highlight=False, soft_wrap=True)
+    found, console = Recording(recording), messages()
+    console.print(f"{recording}: {found}")
     if learns:
         _learn(found, pairs, output, incomplete, console)
     else:
@@ -107,14 +104,12 @@ def _learn(
     if pairs:
         trials[" ".join(pairs)] = then.but(pairs).for_length(total)
     newest = next(reversed(trials))
-    table = Table(Column("settings", overflow="fold"), box=None, header_style="bold", pad_edge=False)
-    for name in ("models", "identical", "rows", "levels", "MB", "seconds", "error", "apart"):
-        table.add_column(name, justify="right")
+    numbers = ("models", "identical", "rows", "levels", "MB", "seconds", "error", "apart")
+    results = table("settings", *numbers, right=numbers)
     recorded = recording.counts[Model]
-    table.add_row("as recorded", f"{recorded}", *["-"] * 5, *_prequential_cells(prequential_of_recorded(recording)))
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn())
+    results.add_row("as recorded", f"{recorded}", *["-"] * 5, *_prequential_cells(prequential_of_recorded(recording)))
     with ExitStack() as stack:
-        progress = stack.enter_context(Progress(*columns, console=console, transient=True))
+        progress = stack.enter_context(line_of(console))
         writer = (
             stack.enter_context(RecordingWriter(output, Run.from_settings(trials[newest].portable())))
             if output
@@ -130,12 +125,12 @@ def _learn(
                 step=partial(progress.advance, task),
             )
             same = f"{result.identical} of {recorded}"
-            table.add_row(
+            results.add_row(
                 name, f"{result.models}", same, *_training_cells(result), *_prequential_cells(result.prequential)
             )
             if settings is then:
                 differing = recorded - result.identical
-    Console().print(table)
+    screen().print(results)
     if differing and not incomplete:
         raise RecordingError(
             f"{differing} of {recorded} recorded models were not reproduced: they were recorded by catstream "

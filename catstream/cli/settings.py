@@ -6,9 +6,8 @@ import json
 import sys
 
 import click
-from rich.console import Console
-from rich.table import Table
 
+from catstream.cli.output import screen, table
 from catstream.errors import SettingsError
 from catstream.services.options import with_json
 from catstream.settings import describe
@@ -46,7 +45,7 @@ def settings(words: tuple[str, ...], as_json: bool) -> None:
         for name, takes, default, meaning in rows:
             click.echo(f"{name}\t{default}\t{takes}\t{meaning}")
         return
-    table = Table("setting", "default", "takes", "meaning", box=None, pad_edge=False, header_style="bold")
+    shown = table("setting", "default", "takes", "meaning")
     for name, takes, default, meaning in rows:
-        table.add_row(name, str(default), takes, meaning)
-    Console().print(table)
+        shown.add_row(name, str(default), takes, meaning)
+    screen().print(shown)

@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
-from catstream.cli.interrupts import Interrupts
+from catstream.cli.interrupts import INTERRUPTS
 from catstream.client.subscription import subscribe
 from catstream.messages.kinds import Run
 from catstream.messages.names import counted, listed
@@ -64,8 +64,6 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
     """
     for path in with_logs(files):
         check_writable(path)
-    interrupts = Interrupts()
-    interrupts.install()
     written, max_repeats, reason = 0, 0, ""
     newest: dict[str, int] = {}  # frame of the last track of each object
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
@@ -82,7 +80,7 @@ def sink(files: tuple[Path, ...], endpoint: str, keys: str, wait: float, source:
                 # A restarted detector repeats some frames; a track that was missed before is not written out of order.
                 if track.frame < last or track.frame == newest.get(track.object):
                     continue
-                with interrupts.deferred():  # a track is written to all files or to none
+                with INTERRUPTS.deferred():  # a track is written to all files or to none
                     for each in sinks:
                         each.write([track])
                     written, newest[track.object] = written + 1, track.frame

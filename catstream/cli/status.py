@@ -8,8 +8,10 @@ import time
 from typing import Any
 
 import click
+from rich.table import Table
 
 from catstream.cli.attach import with_endpoint
+from catstream.cli.output import complain, screen, table
 from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health
@@ -62,8 +64,11 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
         click.echo(json.dumps(summary))
     elif reports:
         click.echo(_format(summary))
+        if any(summary["objects"]):  # they have names
+            click.echo()
+            screen().print(_table(summary["objects"]))
     if silent:
-        click.echo(f"catstream: no health report at {place} within {wait:g} s from: {', '.join(silent)}", err=True)
+        complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}")
         sys.exit(1)
 
 
@@ -146,9 +151,8 @@ def _rate(history: list[Health]) -> float | None:
     if len(history) < 2 or history[-1].time <= history[0].time:
         return None
     frames = history[-1].counters["sent"] - history[0].counters["sent"]
-    return round(
-        max(0.0, frames) / (history[-1].time - history[0].time), 1
-    )  # the counter of a restarted detector decreases
+    # The counter of a restarted detector decreases.
+    return round(max(0.0, frames) / (history[-1].time - history[0].time), 1)
 
 
 def _format(summary: dict[str, Any]) -> str:
@@ -171,17 +175,13 @@ def _format(summary: dict[str, Any]) -> str:
             f"rejected   {sum(summary['rejected'].values())} messages",
             f"reports    {', '.join(history)}",
             *(f"trouble    {name}: {trouble}" for name, trouble in summary["trouble"].items()),
-            *_table(summary["objects"]),
         )
     )
 
 
-def _table(objects: dict[str, dict[str, Any]]) -> list[str]:
-    """The lines of a table of the objects; none if there is only one without a name."""
-    width = max(map(len, ["object", *objects]))
-
-    def line(name: str, *cells: object) -> str:
-        return f"{name:<{width}}" + "".join(f"{'-' if cell is None else str(cell):>9}" for cell in cells)
-
-    rows = (line(name or "-", *each.values()) for name, each in objects.items())
-    return ["", line("object", "state", "score", "model", "leaves"), *rows] if any(objects) else []
+def _table(objects: dict[str, dict[str, Any]]) -> Table:
+    figures = ("state", "score", "model", "leaves")
+    shown = table("object", *figures, right=figures)
+    for name, each in objects.items():
+        shown.add_row(name or "-", *("-" if cell is None else str(cell) for cell in each.values()))
+    return shown

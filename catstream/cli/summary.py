@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from catstream.cli import interruptible
-from catstream.cli.interrupts import Interrupts
+from catstream.cli.files import check_file
+from catstream.cli.interrupts import INTERRUPTS, interruptible
+from catstream.cli.output import line_of, messages
 from catstream.errors import ObjectError, SettingsError, VideoError
 from catstream.messages.names import boxes_by_name, listed, split_name
 from catstream.services.options import PATH, with_overwrite, with_settings
@@ -90,8 +90,7 @@ def summary(
         from catstream.sinks.recording.file import Recording
 
     _check_output(output, json_beside(output), overwrite)
-    interrupts, console = Interrupts(), Console(stderr=True, soft_wrap=True, highlight=False)
-    interrupts.install()
+    console = messages()
     if _is_recording(path):
         sheet = _of_recording(Recording(path), count, name, source, console)
     elif box is not None or (path.is_dir() and Job.is_in(path)):
@@ -100,7 +99,7 @@ def summary(
             sheet = _of_recording(_tracked(job, Path(folder), console), count, name, source or job.source, console)
     else:
         sheet = _of_images(path, count, console)
-    with interrupts.deferred():
+    with INTERRUPTS.deferred():
         sheet.save(output)
     console.print(f"{sheet.about[0]}\n{output} and {json_beside(output)}")
 
@@ -123,18 +122,8 @@ def _job(path: Path, box: str, settings: Settings) -> Job:
 def _check_output(output: Path, json: Path, overwrite: bool) -> None:
     if output == json:
         raise SettingsError(f"--output is the contact sheet, got {str(output)!r}: give a name that ends in .html")
-    if not output.absolute().parent.is_dir():
-        raise VideoError(f"cannot write {str(output)!r}: its folder does not exist, make it first")
     for file in (output, json):
-        if file.exists() and not overwrite:
-            raise VideoError(f"{str(file)!r} exists: give another --output, or --overwrite to replace it")
-
-
-def _progress(doing: str, things: str, console: Console) -> Progress:
-    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn(things)
-    progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-    progress.add_task(doing, total=None)
-    return progress
+        check_file(file, overwrite=overwrite)
 
 
 def _of_images(path: Path, count: int, console: Console) -> Sheet:
@@ -146,8 +135,8 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
     from catstream.video.image import jpeg
 
     collection, selection = Collection(path), RowSelection[tuple[Origin, bytes]](count)
-    with _progress("reading", "files", console) as progress, one_thread():
-        (task,) = progress.task_ids
+    with line_of(console) as progress, one_thread():
+        task = progress.add_task("reading files", total=None)
         for origin, image in collection:
             selection.add(describe(image), (origin, jpeg(image, WIDTH)))
             progress.update(
@@ -174,9 +163,9 @@ def _tracked(job: Job, folder: Path, console: Console) -> Recording:
     file = folder / f"run{_RECORDING}"
     with (
         Pipeline(job.source, job.boxes, job.settings, model=job.models, part=job.part, record=file) as pipeline,
-        _progress("tracking", "frames", console) as progress,
+        line_of(console) as progress,
     ):
-        (task,) = progress.task_ids
+        task = progress.add_task("tracking frames", total=None)
         for track in pipeline:
             progress.update(task, total=pipeline.frames, completed=track.frame + 1)
     return Recording(file)
@@ -191,9 +180,8 @@ def _of_recording(recording: Recording, count: int, name: str | None, source: st
 
     require_features(recording, incomplete=True)
     settings, source = recording.settings, source or _source_of(recording)
-    with _progress("comparing", "frames", console) as progress, one_thread():
-        (task,) = progress.task_ids
-        progress.update(task, total=recording.counts[Features])
+    with line_of(console) as progress, one_thread():
+        task = progress.add_task("comparing frames", total=recording.counts[Features])
         objects = taught_frames(recording.features(), settings.coreset, lambda: progress.advance(task))
     measured = objects[_object_of(list(objects), name)]
     frames, pictures = most_taught(measured, count), dict[int, bytes]()

@@ -14,14 +14,14 @@ import click
 from rich.console import Console
 
 from catstream.box import Box
-from catstream.cli import INTERRUPTED
-from catstream.cli.interrupts import Interrupts
+from catstream.cli.files import check_file
+from catstream.cli.interrupts import INTERRUPTS, stopped
+from catstream.cli.output import messages
 from catstream.cli.progress import RunProgress
 from catstream.cli.serving import PORT, Address, AddressType, with_token
 from catstream.errors import RecordingError, ServiceError, require_extra
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, doubtful, listed
-from catstream.messages.storage import why_not_writable
 from catstream.pipeline import Pipeline
 from catstream.run.job import Results
 from catstream.services.options import (
@@ -230,7 +230,7 @@ def track(**options: Any) -> None:
         require_extra("view")
     files = request.files(pipeline)
     _check_files(request, pipeline, files)
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = messages()
     for line in _doubts(request, pipeline):
         console.print(line)
     if request.resume is not None:
@@ -264,10 +264,7 @@ def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None
         known=[*earlier.write, *([earlier.output] if earlier.output is not None else [])],
     )
     for file in request.saved.values():
-        if file.exists() and not request.overwrite:
-            raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
-        if reason := why_not_writable(file):
-            raise ServiceError(reason)
+        check_file(file, overwrite=request.overwrite)
         if [*request.saved.values()].count(file) > 1:
             raise ServiceError(f"{file} is named twice: give each object its own file")
 
@@ -301,7 +298,6 @@ class _Run:
     def __init__(self, request: _Request, pipeline: Pipeline, files: RunFiles, console: Console) -> None:
         self._request, self._pipeline, self._files, self._console = request, pipeline, files, console
         self._progress = RunProgress(pipeline, files.names() if request.resume is not None else ())
-        self._interrupts = Interrupts()
         self._recording: Recording | None = None
 
     def execute(self) -> None:
@@ -318,8 +314,7 @@ class _Run:
             self._console.print(f"saved model: {file}")
         if interrupted:
             hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
-            self._console.print(f"stopped: the results so far are kept{hint}")
-            sys.exit(INTERRUPTED)
+            stopped(f"the results so far are kept{hint}")
         if self._recording is not None and not self._recording.complete:
             raise RecordingError(
                 f"{request.record} is not complete: see why above, and record the run again if you need it whole"
@@ -327,7 +322,6 @@ class _Run:
 
     def _run(self) -> bool:
         """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
-        self._interrupts.install()
         try:
             with self._pipeline, ExitStack() as stack:
                 if self._request.view is not None:
@@ -364,7 +358,7 @@ class _Run:
                 # The files are opened with the first track: a run that cannot start does not change older results.
                 write = write or stack.enter_context(self._files.opened(resume=self._request.resume is not None))
                 before, moment = moment, time.perf_counter()
-                with self._interrupts.deferred():  # so that a frame is in all results or in none
+                with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                     write(tracks, moment - before)
                     self._progress.show(progress, tracks)
 

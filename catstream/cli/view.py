@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from typing import TYPE_CHECKING
 
 import click
@@ -15,19 +14,20 @@ if TYPE_CHECKING:
 
 __all__ = ["fleet_view", "view"]
 
+_with_listen = click.option(
+    "--listen",
+    default=f"127.0.0.1:{PORT}",
+    show_default=True,
+    type=AddressType(),
+    help="Address to listen on; port 0 for any free port.",
+)
+
 
 @click.command()
 @with_endpoint
-@click.option("--host", default="127.0.0.1", show_default=True, help="Host name or address to listen on.")
-@click.option(
-    "--port",
-    default=PORT,
-    show_default=True,
-    type=click.IntRange(0, 65535),
-    help="Port to listen on; 0 for any free port.",
-)
+@_with_listen
 @with_token()
-def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> None:
+def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
     """Watch and control a running pipeline in a browser.
 
     The page shows the picture with the box of each object, the score, frames
@@ -52,13 +52,13 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
     \b
     EXAMPLES
       catstream view
-      catstream view --endpoint run --port 8080
-      catstream view --host 0.0.0.0
+      catstream view --endpoint run --listen 8080
+      catstream view --listen 0.0.0.0:8000
       VIEW_TOKEN_FILE=my-token catstream view
     """
     from catstream.web.app import pipeline_site
 
-    _serve(pipeline_site(endpoint, keys), Address(host, port), token)
+    _serve(pipeline_site(endpoint, keys), listen, token)
 
 
 @click.command("view")
@@ -69,13 +69,7 @@ def view(endpoint: str, keys: str, host: str, port: int, token: str | None) -> N
     help="HOST:PORT of the fleet, or the name of one of yours; not needed if only one runs.",
 )
 @click.option("--keys", default="", metavar="DIR", help="Folder of keys, if the fleet requires keys.")
-@click.option(
-    "--listen",
-    default=f"127.0.0.1:{PORT}",
-    show_default=True,
-    type=AddressType(),
-    help="Address to listen on; port 0 for any free port.",
-)
+@_with_listen
 @with_token()
 def fleet_view(fleet: str, keys: str, listen: Address, token: str | None) -> None:
     """Watch all streams of a fleet in a browser.
@@ -110,7 +104,6 @@ def _serve(site: Site, address: Address, token: str | None) -> None:
     """Print the links of a site, and serve it until Ctrl-C or SIGTERM."""
     from catstream.web.server import Server
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     server = Server(site, host=address.host, port=address.port, token=token)
     for url in server.urls:
         click.echo(url)

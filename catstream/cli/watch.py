@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import signal
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -15,11 +14,11 @@ import click
 import numpy as np
 from rich.console import Console, Group
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from catstream.box import Box
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
+from catstream.cli.output import table
 from catstream.client.subscription import AnyMessage, Subscription
 from catstream.messages.heads import APPEARANCE, GROUPS, TREES
 from catstream.messages.kinds import Features, Health, Model, Preview, Sample, Track
@@ -146,7 +145,6 @@ def watch(
       catstream watch tracks --stream cam-7
       catstream watch tracks --stream cam-7 --fleet head:5690 --keys anna
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     seen = 0
     with Subscription[AnyMessage](endpoint, channel, object=name, keys=keys) as messages:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
@@ -212,15 +210,13 @@ class _Screen:
 
     def _draw(self) -> Group:
         rows = list(self._rows.values())
-        table = Table(box=None, header_style="bold", pad_edge=False)
-        columns = max(rows, key=len, default={})  # rows of objects without a name have no cell for it
-        for name in columns:
-            table.add_column(name, justify="left" if name in _LEFT else "right")
+        columns: dict[str, str] = max(rows, key=len, default={})  # rows of objects without a name have no cell for it
+        shown = table(*columns, right=columns.keys() - _LEFT)
         for cells in rows:
-            table.add_row(*(cells.get(name, "-") for name in columns))
+            shown.add_row(*(cells.get(name, "-") for name in columns))
         rate = len(self._recent()) / _RATE_SECONDS
         line = f"{rate:.0f} a second   {self._messages.missed} missed   {self._messages.endpoint}"
-        return Group(table, Text(line, style="dim"))
+        return Group(shown, Text(line, style="dim"))
 
     def __enter__(self) -> Self:
         self._live.start()

@@ -68,9 +68,9 @@ def test_a_video_with_a_box_is_tracked(video, succeed, tmp_path):
     [
         (["photos", "-k", "20"], "k = 20 images cannot be selected from 9: give a smaller k"),
         (["empty"], "the folder 'empty' and its subfolders hold neither images nor videos"),
-        (["photos", "--output", "no/where.html"], "its folder does not exist"),
+        (["photos", "--output", "no/where.html"], "give a file in a folder that exists"),
         (["photos", "--output", "some.json"], "give a name that ends in .html"),
-        (["photos", "--output", "old.html"], "'old.html' exists: give another --output, or --overwrite"),
+        (["photos", "--output", "old.html"], "old.html exists already: replace it with --overwrite"),
         (["0"], "0 is a live source: record it to a video first"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import encodings.idna  # noqa: F401  # used below as another user, who may not read this installation
 import os
 import subprocess
 import sys
@@ -49,7 +50,7 @@ def another_user():
             os.seteuid(0)
 
 
-@pytest.mark.parametrize("words", [("view", "--port", "0"), ("fleet", "view", "--listen", "127.0.0.1:0")])
+@pytest.mark.parametrize("words", [("view", "--listen", "127.0.0.1:0"), ("fleet", "view", "--listen", "127.0.0.1:0")])
 def test_another_user_of_the_machine_can_neither_watch_nor_steer(started, words):
     process, link = started(*words)
     url, _, token = link.partition("?token=")
@@ -67,6 +68,6 @@ def test_another_user_of_the_machine_can_neither_watch_nor_steer(started, words)
 
 
 def test_with_no_token_the_page_is_open_to_every_user_of_the_machine(started):
-    _, link = started("view", "--port", "0", "--no-token")
+    _, link = started("view", "--listen", "127.0.0.1:0", "--no-token")
     with another_user(), httpx.Client(base_url=link, verify=False) as stranger:
         assert [stranger.get(path).status_code for path in ("/", "/metrics")] == [200, 200]

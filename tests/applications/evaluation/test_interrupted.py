@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from catstream.applications.evaluation.workers import run_tasks
-from catstream.cli import INTERRUPTED, interruptible
+from catstream.cli.interrupts import INTERRUPTED, interruptible
 from catstream.services.start import sigint_blocked
 
 EVALUATE = [sys.executable, "-c", "from catstream.cli import main; main()", "evaluate"]

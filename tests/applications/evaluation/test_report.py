@@ -143,10 +143,10 @@ def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk):
 
 
 def test_an_unwritable_json_path_is_an_error_before_the_work(tmp_path, walk):
-    for place, message in ((tmp_path, "it is a folder"), (tmp_path / "a" / "b", "does not exist")):
+    for place in (tmp_path, tmp_path / "a" / "b"):
         result = CliRunner().invoke(evaluate, [str(walk), "--tracker", "mil", "--json", str(place)])
         assert isinstance(result.exception, CatstreamError)
-        assert message in str(result.exception)
+        assert "give a file in a folder that exists" in str(result.exception)
         assert not result.output
 
 

@@ -1,0 +1,52 @@
+"""The files that commands write: checks before the work, and figures as JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from catstream.errors import ServiceError
+from catstream.messages.storage import why_not_writable
+from catstream.services.options import PATH
+
+__all__ = ["check_file", "with_json_file", "write_json"]
+
+
+def check_file(file: Path, *, overwrite: bool) -> None:
+    """Check before the work that a file can be written.
+
+    Raises
+    ------
+    ServiceError
+        If it cannot, or if it exists already and may not be replaced.
+    """
+    if file.exists() and not overwrite:
+        raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
+    if reason := why_not_writable(file):
+        raise ServiceError(reason)
+
+
+def _checked(_: click.Context, __: click.Parameter, file: Path | None) -> Path | None:
+    if file is not None:
+        check_file(file, overwrite=True)
+    return file
+
+
+with_json_file = click.option("--json", "json_file", type=PATH, callback=_checked, help="File for all figures.")
+
+
+def write_json(file: Path | None, figures: dict[str, object]) -> None:
+    """Write figures to a file, if one is given.
+
+    Raises
+    ------
+    ServiceError
+        If it cannot be written.
+    """
+    if file is not None:
+        try:
+            file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise ServiceError(f"cannot write {str(file)!r}: {error.strerror}") from None
