@@ -137,10 +137,8 @@ class _Pages:
         return Response(preview.jpeg, media_type="image/jpeg")
 
     async def live(self, request: Request) -> Response:
-        feed = self._pipeline(request)
-        return feed.viewers.too_many() or StreamingResponse(
-            _annotated_stream(feed), media_type="multipart/x-mixed-replace; boundary=picture"
-        )
+        stream = _annotated_stream(self._pipeline(request))
+        return StreamingResponse(stream, media_type="multipart/x-mixed-replace; boundary=picture")
 
     async def control(self, request: Request) -> Response:
         feed = self._pipeline(request)

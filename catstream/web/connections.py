@@ -1,8 +1,8 @@
 """Time-outs of connections and a limit on their number, so that one client cannot block the server.
 
 The server waits for a client until its request is complete, and while the client does not read the response. If more
-than `MAX_CONNECTIONS` are open, the one whose client it has waited for longest is closed. A new client is therefore
-always answered, even if many open connections come from one address, as behind a proxy.
+than `MAX_CONNECTIONS` are open, the one whose client it has waited for longest is closed; if all others are open pages,
+the new one. A new client is therefore answered even if many open connections come from one address, as behind a proxy.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class _Connection(asyncio.Protocol):
         self._inner.connection_made(transport)
         self.change()
         if len(self._all.open) > MAX_CONNECTIONS:
-            next(iter(self._all.waiting))._abort()
+            next(iter(self._all.waiting))._abort()  # at the latest the new one
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._all.open.pop(self._address, None)

@@ -9,13 +9,11 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from time import monotonic
 
-from starlette.responses import PlainTextResponse, Response, StreamingResponse
+from starlette.responses import Response, StreamingResponse
 
 from catstream.web.timing import KEEP_ALIVE_SECONDS, RETRY_SECONDS, UPDATE_SECONDS
 
 __all__ = ["Parts", "Viewers"]
-
-_MAX_VIEWERS = 64
 
 
 class Parts:
@@ -76,15 +74,9 @@ class Viewers:
             if not self.count:
                 self._exist.clear()
 
-    def too_many(self) -> Response | None:
-        """Return an error if too many pages are open."""
-        if self.count < _MAX_VIEWERS:
-            return None
-        return PlainTextResponse(f"{_MAX_VIEWERS} pages or live pictures are open already\n", 503)
-
     def events(self, page: Parts) -> Response:
         """Return the response to a page that asks for its updates."""
-        return self.too_many() or StreamingResponse(self._stream(page), media_type="text/event-stream")
+        return StreamingResponse(self._stream(page), media_type="text/event-stream")
 
     async def _stream(self, page: Parts) -> AsyncIterator[str]:
         seen: dict[str, int] = {}

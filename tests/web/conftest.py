@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from pathlib import Path
 from threading import Event
 from uuid import uuid4
 
@@ -70,6 +72,15 @@ class Facts:
 @pytest.fixture(scope="session")
 def facts():
     return Facts
+
+
+@pytest.fixture
+def script_of_browser(tmp_path):
+    """Returns the words of a command that starts a script in this folder with a browser, at a URL."""
+    node, chromium, here = shutil.which("node"), shutil.which("chromium"), Path(__file__).parent
+    if node is None or chromium is None or not (here / "node_modules" / "axe-core").exists():
+        pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
+    return lambda script, url, *words: [node, here / script, url, chromium, tmp_path / "profile", *words]
 
 
 @pytest.fixture

@@ -1,32 +1,21 @@
 // What a person does on the page of a fleet, in a real browser; says what was seen, as JSON, a line each.
 //   node fleet.mjs URL CHROMIUM PROFILE; after the line "silence" the fleet stops to answer
 
-import { readFileSync } from "node:fs";
-import { createRequire } from "node:module";
-import { chromium } from "playwright-core";
+import { axe, errorsOf, patience, violationsOf, withBrowser } from "./browser.mjs";
 
 const [url, executablePath, profile] = process.argv.slice(2);
-const axe = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
-const options = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-  "--disable-component-update", "--disable-sync"];
-const patience = { timeout: 60_000 };
-const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args: options });
 const say = (name, value) => console.log(JSON.stringify([name, value]));
 
-try {
-  const page = browser.pages()[0] ?? (await browser.newPage());
-  const wrong = [];
-  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
-  page.on("pageerror", (error) => wrong.push(error.message));
+await withBrowser(executablePath, profile, async (browser) => {
+  const page = await browser.newPage();
+  const wrong = errorsOf(page);
   const shown = () => page.locator(".cards li:not([hidden]) h3").allInnerTexts();
   const until = (condition, value) => page.waitForFunction(condition, value, patience);
   const check = async (state) => {
     for (const [colorScheme, width, height] of [["light", 1440, 900], ["dark", 390, 844]]) {
       await page.setViewportSize({ width, height });
       await page.emulateMedia({ colorScheme });
-      const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));
-      const found = violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html, any }) => `${html} ${any[0]?.message ?? ""}`).join("; ")}`);
-      say("violations", found.map((text) => `${state}, ${colorScheme}: ${text}`));
+      say("violations", (await violationsOf(page)).map((text) => `${state}, ${colorScheme}: ${text}`));
       say("too wide", await page.evaluate(() => Math.max(0, document.documentElement.scrollWidth - innerWidth)));
     }
     await page.setViewportSize({ width: 1440, height: 900 });
@@ -69,7 +58,4 @@ try {
   say("silent", await page.locator("#silence").innerText());
   await check("silent");
   say("errors", wrong.filter((text) => !/404/.test(text))); // a picture may be gone when it is asked for
-} finally {
-  await browser.close();
-}
-process.exit(0);
+});

@@ -2,22 +2,15 @@
 //   node page.mjs URL CHROMIUM PROFILE BOX WIDTH, then on standard input: "restart" once the pipeline is another
 
 import { createInterface } from "node:readline";
-import { chromium } from "playwright-core";
+import { errorsOf, patience, placeOf, withBrowser } from "./browser.mjs";
 
 const [url, executablePath, profile, box] = process.argv.slice(2);
 const [left, top, wide, tall] = box.split(",").map(Number);
-const patience = { timeout: 60_000 };
-const options = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-  "--disable-component-update", "--disable-sync"];
-const browser = await chromium.launchPersistentContext(profile, {
-  executablePath, headless: true, args: options, viewport: { width: 800, height: 600 },
-});
 
-try {
-  const page = browser.pages()[0] ?? (await browser.newPage());
-  const wrong = [];
-  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
-  page.on("pageerror", (error) => wrong.push(error.message));
+await withBrowser(executablePath, profile, async (browser) => {
+  const page = await browser.newPage();
+  await page.setViewportSize({ width: 800, height: 600 });
+  const wrong = errorsOf(page);
   await page.goto(url);
   const state = page.locator("#state");
   const is = (name) => page.waitForSelector(`#state[data-state="${name}"]`, patience);
@@ -25,7 +18,7 @@ try {
   await page.waitForFunction(() => document.querySelector("#overlay").textContent === "", null, patience);
   console.log("state", await state.innerText());
   const draw = async (left, top, wide, tall) => {
-    const view = await page.locator("#picture").boundingBox();
+    const view = await placeOf(page, "#picture");
     const scale = view.width / Number(process.argv[6]);
     const at = (x, y) => [view.x + x * scale, view.y + y * scale];
     await page.mouse.move(...at(left, top));
@@ -56,7 +49,7 @@ try {
   await click("dialog .danger");
   await page.waitForSelector("#objects", { state: "hidden", ...patience });
   console.log("forgotten", (await page.locator("#message").innerText()).replace(/\d+$/, "N"));
-  await page.waitForSelector("#message.faded", { state: "attached", ...patience });
+  await page.waitForSelector("#message:empty", { state: "attached", ...patience });
 
   await is("absent");
   console.log("state", await state.innerText());
@@ -73,7 +66,4 @@ try {
   await page.setViewportSize({ width: 360, height: 740 });
   console.log("overflow", await page.evaluate(() => document.documentElement.scrollWidth - innerWidth));
   console.log("errors", JSON.stringify(wrong.filter((text) => !/40[04]/.test(text))));
-} finally {
-  await browser.close();
-}
-process.exit(0);
+});

@@ -1,14 +1,9 @@
 // The page in each of its states, light and dark: what axe finds wrong with it, and what it says, as JSON.
 //   node states.mjs URL CHROMIUM PROFILE PICTURE [SCREENSHOTS]; the stream of events is a stand-in, the rest is the page
 
-import { readFileSync } from "node:fs";
-import { createRequire } from "node:module";
-import { chromium } from "playwright-core";
+import { axe, placeOf, violationsOf, withBrowser } from "./browser.mjs";
 
 const [url, executablePath, profile, picture, screenshots] = process.argv.slice(2);
-const axe = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
-const options = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-  "--disable-component-update", "--disable-sync"];
 const DESKTOP = { width: 1200, height: 900 }, PHONE = { width: 390, height: 844 };
 const PAGES = process.env.EVERY_SIZE
   ? [["light", DESKTOP], ["dark", PHONE], ["light", PHONE], ["dark", DESKTOP]] : [["light", DESKTOP], ["dark", PHONE]];
@@ -66,7 +61,7 @@ const STATES = {
 };
 const draw = async (page, viewport) => {
   await page.waitForFunction(() => document.querySelector("#overlay").textContent === "");
-  const view = await page.locator("#picture").boundingBox();
+  const view = await placeOf(page, "#picture");
   const at = (part) => ({ x: view.x + view.width * part, y: view.y + view.height * part });
   if (viewport === PHONE) { // with a finger
     const touch = await page.context().newCDPSession(page);
@@ -94,7 +89,7 @@ const doing = {
   "drawing the next one while the answer comes": async (page) => {
     let answer;
     answered = new Promise((resolve) => { answer = resolve; });
-    const { x, y } = await page.locator("#picture").boundingBox();
+    const { x, y } = await placeOf(page, "#picture");
     await page.click("#follow");
     await page.mouse.move(x + 20, y + 20);
     await page.mouse.down();
@@ -115,9 +110,8 @@ const doing = {
 
 const colours = (lines) => [...new Set(lines.map((line) => getComputedStyle(line).stroke))];
 
-const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args: options });
 const seen = [];
-try {
+await withBrowser(executablePath, profile, async (browser) => {
   for (const [scheme, viewport] of PAGES) {
     const page = await browser.newPage();
     await page.setViewportSize(viewport);
@@ -142,7 +136,6 @@ try {
     for (const [name, parts] of Object.entries(STATES)) {
       await page.evaluate((told) => events.onmessage({ data: JSON.stringify(told) }), parts);
       await doing[name]?.(page, viewport);
-      const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));
       seen.push({ state: name, scheme, pill: await page.locator("#state").innerText(), overlay: await page.locator("#overlay").textContent(),
         source: await page.locator("#source").textContent(), frame: await page.locator("#frame").textContent(),
         objects: await page.locator(".objects b").allTextContents(), chosen: await page.locator('.choose[aria-pressed="true"] b').allTextContents(),
@@ -152,13 +145,10 @@ try {
         folded: !(await page.locator(".trees").isVisible()), lines: await page.locator("polyline").evaluateAll(colours),
         frames: await page.locator(".surprising li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
         wide: await page.evaluate(() => document.documentElement.scrollWidth - innerWidth),
-        violations: violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html, any }) => `${html} ${any[0]?.message ?? ""}`).join("; ")}`) });
+        violations: await violationsOf(page) });
       if (screenshots) await page.screenshot({ path: `${screenshots}/${name}-${scheme}-${viewport.width}.png`, fullPage: ["present", "three objects"].includes(name) });
     }
     await page.close();
   }
   console.log(JSON.stringify(seen));
-} finally {
-  await browser.close();
-}
-process.exit(0);
+});

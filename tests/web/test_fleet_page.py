@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import threading
-from pathlib import Path
 
 import pytest
 
@@ -14,16 +12,12 @@ from catstream.web import streams
 
 pytestmark = pytest.mark.system
 
-HERE = Path(__file__).parent
 TOKEN = "correct-horse-battery"
 
 
 def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_silent(
-    fleet, manager, serve_fleet, camera, folder, tmp_path, monkeypatch
+    fleet, manager, serve_fleet, camera, folder, script_of_browser, monkeypatch
 ):
-    node, chromium = shutil.which("node"), shutil.which("chromium")
-    if node is None or chromium is None or not (HERE / "node_modules" / "axe-core").exists():
-        pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
     monkeypatch.setattr(streams, "REGISTRY_SECONDS", 1.0)
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
     fleet.node("south-2", cores=4.0)
@@ -33,12 +27,11 @@ def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_s
     fleet.stream("cam-9", "unplaced", trouble="cam-9 needs a node with site=west, there is none")
     fleet.stream("dock", "waiting", node="south-2")
     link = str(serve_fleet(token=TOKEN).base_url.copy_set_param("token", TOKEN))
-    words = [node, HERE / "fleet.mjs", link, chromium, tmp_path / "profile"]
     said = {}
     over = threading.Event()
     turning = threading.Thread(target=lambda: [camera() for _ in iter(lambda: over.wait(0.02), True)])
     turning.start()
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as browser:
+    with subprocess.Popen(script_of_browser("fleet.mjs", link), stdout=subprocess.PIPE, text=True) as browser:
         for line in browser.stdout:
             name, *values = json.loads(line)
             said.setdefault(name, []).extend(values)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import threading
-from pathlib import Path
 
 import pytest
 
@@ -20,23 +18,18 @@ from catstream.web.server import Server
 
 pytestmark = pytest.mark.system
 
-HERE = Path(__file__).parent
 SIZE = (320, 240)
 LEAVES = 475  # frame of the demo in which the object has left the picture
 
 
 @pytest.fixture
-def browse(tmp_path):
+def browse(script_of_browser):
     """Starts a browser that does what `page.mjs` says; the lines that it prints, and where to write to it."""
-    node, chromium = shutil.which("node"), shutil.which("chromium")
-    if node is None or chromium is None or not (HERE / "node_modules" / "playwright-core").exists():
-        pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
     browsers = []
 
     def start(url, box):
-        profile, box = str(tmp_path / "profile"), ",".join(map(str, box))
         browser = subprocess.Popen(
-            [node, HERE / "page.mjs", url, chromium, profile, box, str(SIZE[0])],
+            script_of_browser("page.mjs", url, ",".join(map(str, box)), str(SIZE[0])),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,20 +14,16 @@ from catstream.web.server import Server
 
 pytestmark = pytest.mark.system
 
-HERE = Path(__file__).parent
 SEVERAL = ("three objects", "another one chosen", "drawing one more", "forgetting", "two objects")
 
 
 @pytest.fixture
-def seen(tmp_path):
+def seen(script_of_browser, tmp_path):
     """What `states.mjs` saw, by colour scheme and state."""
-    node, chromium = shutil.which("node"), shutil.which("chromium")
-    if node is None or chromium is None or not (HERE / "node_modules" / "axe-core").exists():
-        pytest.skip("no browser: apt-get install nodejs npm chromium, and npm ci --prefix tests/web")
     cv2.imwrite(str(tmp_path / "picture.jpg"), np.full((240, 320, 3), (200, 160, 90), np.uint8))
     server = Server(pipeline_site(str(tmp_path / "nowhere")), port=0, token="correct-horse-battery")
     with server.in_background():
-        words = [node, HERE / "states.mjs", server.url, chromium, tmp_path / "profile", tmp_path / "picture.jpg"]
+        words = script_of_browser("states.mjs", server.url, tmp_path / "picture.jpg")
         run = subprocess.run(words, capture_output=True, text=True, check=False)
     assert run.stdout, run.stderr
     return {(state["scheme"], state["state"]): state for state in json.loads(run.stdout)}

@@ -3,15 +3,20 @@
 const $ = (selector) => document.querySelector(selector);
 
 export class BoxForm {
-  constructor(objects) {
+  /** actions: accept() and cancel() are called if the user confirms or cancels. */
+  constructor(objects, { accept, cancel }) {
     this.objects = objects;
-    [this.role, this.name] = [$("#role"), $("#name")];
+    [this.form, this.role, this.name] = [$("#drawing"), $("#role"), $("#name")];
     this.role.onchange = () => this.showName();
+    this.form.onsubmit = (event) => { event.preventDefault(); accept(); };
+    this.form.onkeydown = ({ key }) => key === "Escape" && cancel();
+    $("#cancel").onclick = cancel;
   }
 
   /** Show the form with a name for a new object. */
   begin() {
     const first = !this.objects.list.length;
+    this.name.required = !first;
     this.name.value = first ? "" : this.objects.suggestion;
     this.name.placeholder = first ? "optional" : "";
     this.offer("new");
@@ -33,20 +38,20 @@ export class BoxForm {
   }
 
   showName() {
-    this.name.parentElement.hidden = this.role.value !== "new";
+    this.name.disabled = this.name.parentElement.hidden = this.role.value !== "new";
   }
 
-  /** What is wrong with the name of a new object; empty if nothing is. */
-  get error() {
-    const name = this.name.value.trim();
-    if (this.role.value !== "new" || !this.objects.list.length) return "";
-    if (!name) return "Give the new object a name.";
-    return this.objects.get(name) ? `There is an object ${name} already: give another name.` : "";
+  /** Whether a new object has a name that no other has; if not, the browser says what is wrong. */
+  check() {
+    this.name.value = this.name.value.trim();
+    const taken = this.objects.get(this.name.value);
+    this.name.setCustomValidity(taken?.name ? `There is an object ${taken.name} already: give another name.` : "");
+    return this.form.reportValidity();
   }
 
   /** The fields of the command. */
   get fields() {
     const role = this.role.value;
-    return { object: role === "new" ? this.name.value.trim() : this.objects.chosen, keep: role === "keep" };
+    return { object: role === "new" ? this.name.value : this.objects.chosen, keep: role === "keep" };
   }
 }

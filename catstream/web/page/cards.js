@@ -1,6 +1,6 @@
 // The streams of a fleet as cards, and its nodes as the rows of a table; those in trouble first, then by name.
 
-import { add, Items, write } from "./dom.js";
+import { add, duration, Items, many, write } from "./dom.js";
 import { Pictures } from "./pictures.js";
 
 const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping", failed: "absent",
@@ -131,12 +131,10 @@ function fillRow({ element, button, state, labels, trouble, used, bar, streams }
 
 const round = (value, digits = 2) => String(Number(value.toFixed(digits)));
 const join = (...parts) => parts.filter(Boolean).join(" · ");
-const many = (count, noun) => `${count.toLocaleString("en")} ${noun}${count === 1 ? "" : "s"}`;
 
 /** The age of the state in the store; it changes only when it passes a limit. */
 function stored(seconds) {
   if (seconds === null) return "nothing stored";
   const limit = [5, 10, 15, 30, 60].find((each) => seconds < each);
-  if (limit) return `stored < ${limit} s ago`;
-  return seconds < 7200 ? `stored ${Math.floor(seconds / 60)} min ago` : `stored ${Math.floor(seconds / 3600)} h ago`;
+  return limit ? `stored < ${limit} s ago` : `stored ${duration(Math.floor(seconds / 60) * 60)} ago`;
 }

@@ -20,6 +20,15 @@ export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
+/** A number with its noun. */
+export const many = (count, noun, nouns = `${noun}s`) => `${count.toLocaleString("en")} ${count === 1 ? noun : nouns}`;
+
+/** A time span in the largest unit of which there are two or more. */
+export function duration(seconds) {
+  if (seconds < 120) return `${seconds} s`;
+  return seconds < 7200 ? `${Math.floor(seconds / 60)} min` : `${Math.floor(seconds / 3600)} h`;
+}
+
 /** A figure with a left and a right caption, and an SVG drawing below. */
 export function figure(parent, className, title) {
   const element = add(parent, "figure", { className });

@@ -1,7 +1,7 @@
 // The page of a fleet: passes updates to the cards of the streams and to the table of the nodes.
 
 import { Nodes, Streams } from "./cards.js";
-import { write } from "./dom.js";
+import { duration, write } from "./dom.js";
 import { Search } from "./search.js";
 
 const $ = (selector) => document.querySelector(selector);
@@ -93,9 +93,4 @@ export class FleetPage {
     sessionStorage.removeItem("top");
     scrollTo(0, Number(top));
   }
-}
-
-function duration(seconds) {
-  if (seconds < 120) return `${seconds} s`;
-  return seconds < 7200 ? `${Math.floor(seconds / 60)} minutes` : `${Math.floor(seconds / 3600)} hours`;
 }

@@ -8,7 +8,7 @@ import { Stage } from "./stage.js";
 import { SurprisingFrames } from "./surprising.js";
 import { Trees } from "./trees.js";
 
-const MESSAGE_SECONDS = 8;
+const MESSAGE = { delay: 8000, duration: 1000 }; // milliseconds that a message is shown, and fades
 const $ = (selector) => document.querySelector(selector);
 
 export class StreamPage {
@@ -23,7 +23,7 @@ export class StreamPage {
     this.trees = new Trees($(".trees"), $("#tree-summary"));
     this.surprising = new SurprisingFrames($(".surprising"), $("#surprising-summary"));
     this.objects = new Objects($(".objects"), { choose: (name) => this.showChosen(name), forget: (name) => this.askToForget(name) });
-    this.form = new BoxForm(this.objects);
+    this.form = new BoxForm(this.objects, { accept: () => this.stage.accept(), cancel: () => this.stage.cancel() });
     this.stage = new Stage($("#stage"), this.objects, { pause: () => this.pause(), follow: (box, leave) => this.follow(box, leave),
       changed: (drawing, box) => this.showDrawing(drawing, box) });
     $("#stream").hidden = false;
@@ -35,12 +35,6 @@ export class StreamPage {
   /** Attach the handlers of the controls. */
   listen() {
     $("#draw").onclick = () => { $("#stage").focus(); this.stage.begin(); };
-    $("#follow").onclick = () => this.stage.accept();
-    $("#cancel").onclick = () => this.stage.cancel();
-    this.form.name.onkeydown = ({ key }) => {
-      if (key === "Enter") this.stage.accept();
-      if (key === "Escape") this.stage.cancel();
-    };
     $("#pause").onclick = () => this.send(this.paused ? "resume" : "pause");
     $("#stop").onclick = () => this.ask("Stop the pipeline?", "Everything learned is stored first. The pipeline cannot be restarted from this page.",
       "Stop it", "Continue", () => this.send("stop"));
@@ -125,11 +119,7 @@ export class StreamPage {
 
   /** Send the box, as that of a new object or of the chosen one. */
   async follow(box, leave) {
-    if (this.form.error) {
-      this.showMessage(this.form.error, true);
-      this.form.name.focus();
-      return false;
-    }
+    if (!this.form.check()) return false;
     const answer = await this.send("set-box", { ...this.form.fields, box: box.map((side) => Math.round(side * 10) / 10) });
     if (!answer) return false;
     this.objects.choose(answer.object);
@@ -160,9 +150,9 @@ export class StreamPage {
     const message = $("#message");
     message.textContent = text;
     message.classList.toggle("wrong", wrong);
-    message.classList.remove("faded");
-    clearTimeout(this.fading);
-    if (fades) this.fading = setTimeout(() => message.classList.add("faded"), MESSAGE_SECONDS * 1000);
+    this.fading?.cancel();
+    this.fading = fades ? message.animate({ opacity: [1, 0] }, MESSAGE) : null;
+    if (fades) this.fading.onfinish = () => write(message, "");
   }
 
   showDrawing(drawing, box) {

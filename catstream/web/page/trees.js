@@ -1,7 +1,7 @@
 // The coreset trees. Of a tree its leaves are known: the levels of its nodes are the binary digits of their number,
 // since two nodes of a level are always merged. So each node, kept or merged, has its place above its leaves.
 
-import { add, figure, make } from "./dom.js";
+import { add, figure, make, many } from "./dom.js";
 
 const [HEIGHT, EDGE] = [120, 8];
 const CLOSEST = 7; // pixels between two nodes of a level that is still drawn
@@ -77,7 +77,7 @@ export class Trees {
       if (to - from > 9) filled.push(make("text", { x: x(node), y: y(node) - 9 }, String(node.level)));
     }
     tree.drawing.replaceChildren(make("path", { class: "fan", d: fans.join("") }), make("path", { d: lines.join("") }), ...merged, ...filled);
-    tree.right.textContent = count ? `${plural(count, "leaf", "leaves")} in ${plural(kept.length, "node", "nodes")}` : "no leaf yet";
+    tree.right.textContent = count ? `${many(count, "leaf", "leaves")} in ${many(kept.length, "node")}` : "no leaf yet";
     tree.drawing.setAttribute("aria-label", count ? `levels ${kept.map(({ level }) => level).join(", ")}` : "empty");
     tree.leaves = count;
   }
@@ -94,5 +94,4 @@ function nodes(count) {
   return found;
 }
 
-const plural = (count, one, more) => `${count.toLocaleString("en")} ${count === 1 ? one : more}`;
 const key = ({ level, from }) => `${level}:${from}`;

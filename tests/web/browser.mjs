@@ -1,0 +1,40 @@
+// A browser for the tests of the page, what axe finds wrong with a page, and the errors that a page reports.
+
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+import { chromium } from "playwright-core";
+
+export const patience = { timeout: 60_000 };
+export const axe = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
+const args = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+  "--disable-component-update", "--disable-sync"];
+
+/** Call act(browser) with a new browser, and end it and this program. */
+export async function withBrowser(executablePath, profile, act) {
+  const browser = await chromium.launchPersistentContext(profile, { executablePath, headless: true, args });
+  try {
+    await act(browser);
+  } finally {
+    await browser.close();
+  }
+  process.exit(0);
+}
+
+/** The list of the errors that a page reports from now on. */
+export function errorsOf(page) {
+  const wrong = [];
+  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
+  page.on("pageerror", (error) => wrong.push(error.message));
+  return wrong;
+}
+
+/** The place of an element in the window, even if it is replaced again and again, as a picture is. */
+export function placeOf(page, selector) {
+  return page.evaluate((each) => document.querySelector(each).getBoundingClientRect().toJSON(), selector);
+}
+
+/** What axe, which the page has evaluated, finds wrong with it. */
+export async function violationsOf(page) {
+  const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));
+  return violations.map(({ id, nodes }) => `${id}: ${nodes.map(({ html, any }) => `${html} ${any[0]?.message ?? ""}`).join("; ")}`);
+}
