@@ -25,7 +25,7 @@ RUNNING = ("running", "waiting", "paused")
 _POINTS = 480  # two minutes
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
-_PICTURES = 8  # number of pictures that a page may still request
+_PICTURES = 64  # number of pictures that a page may still request, for slow connections
 
 #: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
 #: whether it is present.

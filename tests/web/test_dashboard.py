@@ -196,16 +196,16 @@ def test_another_run_begins_with_no_surprising_frames(dashboard, facts):
 
 
 def test_recent_pictures_are_kept_and_older_ones_are_not(dashboard, facts):
-    for frame in range(30):
+    for frame in range(130):
         dashboard.take(facts.preview(frame), 0.1 * frame)
     assert dashboard.updates({})["picture"] == {
-        "frame": 29,
+        "frame": 129,
         "width": 64,
         "height": 48,
         "boxes": {"": (4.0, 3.0, 20.0, 10.0)},
     }
-    assert dashboard.picture(25).jpeg.endswith(b"25")
-    assert dashboard.picture(5) is None
+    assert dashboard.picture(100).jpeg.endswith(b"100")
+    assert dashboard.picture(50) is None
 
 
 def names(dashboard):
