@@ -139,10 +139,15 @@ class CompressorLoop:
         self._process.beat(self._counters, self._forest.object_counters, now=last)
 
     def end(self, end: End) -> None:
-        """Send the end of the stream, and wait for the end of the tracks if they are recorded."""
+        """Send the end of the stream, and wait for the end of the tracks if they are recorded.
+
+        The detector sends that one after the owner of the run has received its own, which may take any time.
+        """
         self._samples.send(end)
         deadline = time.monotonic() + TRACKS_END_SECONDS
         while self._recorder is not None and self._recorder.end is None and time.monotonic() < deadline:
+            if self._features.is_connected and not self._process.stop_requested:
+                deadline = time.monotonic() + TRACKS_END_SECONDS
             self._features.receive(TURN_SECONDS)  # a detector that did not receive the last acknowledgement asks again
             self._recorder.receive()
             self._process.beat(self._counters, self._forest.object_counters)

@@ -66,6 +66,6 @@ class Progress:
         end : the end of the stream, if it was received
         """
         position = replace(self.position, objects=now.objects)
-        if end is None:
+        if end is None or end.seq <= position.seq:
             return position
         return replace(position, seq=end.seq, unsaved=position.unsaved and position.unsaved + 1)

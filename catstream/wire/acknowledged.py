@@ -151,6 +151,11 @@ class Receiver(ChannelSocket[Message]):
         return self.window.position_requested
 
     @property
+    def is_connected(self) -> bool:
+        """Whether the sender was connected when `receive` was last called."""
+        return self._window.connected
+
+    @property
     def has_sender(self) -> bool:
         """Whether the sender was connected when `receive` was last called, and has not sent its end."""
         return self.window.connected and not self.window.ended

@@ -13,7 +13,8 @@ replies once the application has processed it:
 The receiver replies with a Position if a message is missing, and if the sender asks (with an empty frame, the
 hello). The sender asks if it was restarted, and after `PATIENCE_SECONDS` without a reply while messages wait.
 So either side may be restarted, and any frame may be lost or arrive twice: each message is still delivered once, in
-order.
+order. The end of the stream is delivered at any `seq` up to the next one: a restarted sender may end before it has
+repeated all that was delivered.
 
 `Stored.seq` may include messages that the receiver has only in memory, because its disk cannot be written; `unsaved`
 is their number. If such a receiver is restarted, the sender cannot retransmit them and raises `StreamRewoundError`.
@@ -229,10 +230,11 @@ class ReceiveWindow:
 
     def receive(self, peer: bytes, seq: int, now: float, last: bool = False) -> list[Deliver | Reply | Reject]:
         """A message arrived; `last` says whether it is the end of the stream."""
-        if seq <= self.taken:  # retransmitted: the sender does not know that it arrived
+        ends = last and not self.ended  # also before a restarted sender has repeated what was delivered
+        if seq <= self.taken and not ends:  # retransmitted: the sender does not know that it arrived
             return [Reply(peer, self._stored())]
-        if seq == self.taken + 1:
-            self.taken, self.ended = seq, last
+        if seq <= self.taken + 1:
+            self.taken, self.ended = max(seq, self.taken), last
             self._peer, self.connected, self._gap_reported = peer, True, -math.inf
             return [Deliver()]
         actions: list[Deliver | Reply | Reject] = []

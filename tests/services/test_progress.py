@@ -75,6 +75,12 @@ class Storing(RuleBasedStateMachine):
         assert acknowledged.unsaved == (position.unsaved + 1 if position.unsaved else 0)
         assert self.progress.acknowledgement(now, None).seq == position.seq
 
+    @invariant()
+    def the_end_of_a_detector_that_repeats_messages_changes_nothing(self):
+        """It failed before it had repeated all that was received."""
+        position = self.progress.position
+        assert self.progress.acknowledgement(position, End(position.seq, "it failed")) == position
+
 
 TestStoring = Storing.TestCase
 

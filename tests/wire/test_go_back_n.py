@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import replace
 
 import pytest
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -255,6 +255,21 @@ class Histories(RuleBasedStateMachine):
 
 TestHistories = Histories.TestCase
 TestHistories.settings = settings(max_examples=150, stateful_step_count=60)
+
+
+@given(taken=st.integers(0, 5), seq=st.integers(1, 9))
+def test_an_end_is_delivered_once_at_any_number_up_to_the_next_one(taken, seq):
+    """A restarted sender may end before it has repeated what was delivered; a gap before the end is asked for."""
+    receiver = ReceiveWindow(Position(taken), 4)
+    delivered = receiver.receive(b"restarted", seq, 1.0, last=True) == [Deliver()]
+    assert delivered == receiver.ended == receiver.connected == (seq <= taken + 1)
+    assert receiver.taken == (max(seq, taken) if delivered else taken)
+    receiver.acknowledge(Position(receiver.taken))
+    again = receiver.receive(b"restarted", seq, 2.0, last=True)
+    assert Deliver() not in again
+    if delivered:
+        (reply,) = again
+        assert reply.message.seq >= seq, "the sender knows that it arrived"
 
 
 def made(**versions):

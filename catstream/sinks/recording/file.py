@@ -17,7 +17,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from contextlib import ExitStack
 from itertools import count, groupby, islice
 from pathlib import Path
@@ -177,7 +177,8 @@ class Recording:
     path : of its first file
     files : all of its files, in order
     run : the settings of the pipeline
-    counts : messages by kind, `counts[Features]` ...; of features and models those that `features` and `models` yield
+    counts : messages by kind, `counts[Features]` ...; of features and models those that `features` and `models` yield,
+        of tracks one of each object in a frame
     missing : frames whose features or tracks are missing, by the gaps in `seq`; also before the first and, if the end
         was recorded, after the last
     frames : number of frames that have a track
@@ -203,7 +204,7 @@ class Recording:
         self.end: End | None = None
         self.damaged = self.torn = 0
         self._ends: list[int] = []  # of the last whole message of each file
-        self._tracks: set[int] = set()
+        self._tracks: defaultdict[int, set[str]] = defaultdict(set)  # the objects of each frame, by seq
         self._features: list[tuple[int, _Place]] = []  # seq and place of the features that the trees hold
         # Of each object: number of features that a model was trained on, and its place.
         self._models: defaultdict[str, list[tuple[int, _Place]]] = defaultdict(list)
@@ -211,10 +212,11 @@ class Recording:
             self._read(number)
         self.counts[Features] = len(self._features)
         self.counts[Model] = sum(map(len, self._models.values()))
+        self.counts[Track] = sum(map(len, self._tracks.values()))
         self.size, self.frames = sum(self._ends), len(self._tracks)
         self.missing = {
             Features: self._missing({seq for seq, _ in self._features}),
-            Track: self._missing(self._tracks),
+            Track: self._missing(self._tracks.keys()),
         }
 
     def __str__(self) -> str:
@@ -230,7 +232,7 @@ class Recording:
     @property
     def complete(self) -> bool:
         """Whether it has all features and tracks from its first frame to the end of the run."""
-        seqs: tuple[set[int], ...] = ({seq for seq, _ in self._features}, self._tracks)
+        seqs: tuple[Set[int], ...] = ({seq for seq, _ in self._features}, self._tracks.keys())
         return self.end is not None and all(self._missing(each) == min(each, default=1) - 1 for each in seqs)
 
     @property
@@ -307,14 +309,14 @@ class Recording:
             models, trained = self._models[model.object], model.frame + 1
             _drop_from(models, trained)
             models.append((trained, place))
-        elif kind is Track:
-            self._tracks.add(entry.sequence)
+        elif kind is Track:  # a restarted detector may have repeated it
+            self._tracks[entry.sequence].add(_decode(self.files[number], entry, Track).object)
         elif kind is End:
             self.end = _decode(self.files[number], entry, End)
 
-    def _missing(self, seqs: set[int]) -> int:
-        last = self.end.seq - 1 if self.end else max(seqs, default=0)
-        return last - len(seqs)
+    def _missing(self, seqs: Set[int]) -> int:
+        # The end has a lower number if the source failed while a restarted detector repeated frames.
+        return max(self.end.seq - 1 if self.end else 0, max(seqs, default=0)) - len(seqs)
 
 
 def _drop_from(places: list[tuple[int, _Place]], seq: int) -> None:

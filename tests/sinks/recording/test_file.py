@@ -259,6 +259,17 @@ def test_a_frame_with_a_track_of_any_object_is_not_missing(written):
     assert (recording.counts[Track], recording.frames, recording.missing[Track]) == (5, 4, 1)
 
 
+def test_a_track_that_a_restarted_detector_repeats_counts_once(written):
+    tracks = [track(seq, name) for seq in (1, 2) for name in ("anna", "ben")]
+    recording = Recording(written([*tracks, *tracks[2:], track(3, "ben")]))
+    assert (recording.counts[Track], recording.frames, recording.missing[Track]) == (5, 3, 0)
+
+
+def test_tracks_behind_the_end_of_a_detector_that_failed_while_it_repeated_frames_are_not_missing(written):
+    recording = Recording(written([features(1), *map(track, (1, 2, 3)), End(2, "it failed", True)]))
+    assert recording.missing == {Features: 0, Track: 0}
+
+
 def test_another_program_tells_the_objects_apart_by_a_field_of_each_message(written):
     path = written([track(1, "anna"), track(1, "ben"), model(1, 0, "anna"), model(2, 0)])
     with path.open("rb") as file:

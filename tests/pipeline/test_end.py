@@ -1,0 +1,48 @@
+"""The end of a run reaches every receiver, whatever was restarted before, and however slow the owner is."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from itertools import islice
+
+import cv2
+import pytest
+
+from catstream.errors import VideoError
+from catstream.pipeline import Pipeline
+from catstream.services.timing import TRACKS_END_SECONDS
+from catstream.settings import Settings
+from catstream.sinks.recording.file import Recording
+from catstream.video.source import open_source
+
+
+def test_a_source_that_fails_while_frames_are_repeated_ends_the_run_with_its_error(video, tmp_path):
+    """The compressor has stored nothing yet, so all frames that the owner has are repeated."""
+    with open_source(video[0]) as source:
+        for frame in source:
+            cv2.imwrite(str(tmp_path / f"{frame.number:03d}.png"), frame.image)
+    settings = Settings(run={"checkpoint_seconds": 600.0})
+    with Pipeline(tmp_path, video[1][0], settings) as pipeline:
+        tracks = list(islice(pipeline, 11))
+        (tmp_path / "005.png").write_bytes(b"damaged meanwhile")
+        for victim in ("detector", "compressor"):
+            os.kill(pipeline.pids[victim], signal.SIGKILL)
+        with pytest.raises(VideoError, match=r"005\.png"):
+            tracks.extend(pipeline)
+        assert [track.frame for track in tracks] == list(range(len(tracks)))
+        assert "005.png" in pipeline.reason
+        assert pipeline.totals["sent"] == pipeline.totals["stored"] == 5
+
+
+def test_a_recording_has_its_end_although_the_owner_is_slower_than_every_limit(video, tmp_path):
+    with Pipeline(video[0], video[1][0], record=tmp_path / "run.mcap") as pipeline:
+        tracks = list(islice(pipeline, 1))
+        time.sleep(TRACKS_END_SECONDS + 2)
+        tracks.extend(pipeline)
+        assert len(tracks) == pipeline.frames
+    recording = Recording(tmp_path / "run.mcap")
+    assert recording.end is not None
+    assert recording.end.totals["sent"] == pipeline.frames
+    assert recording.files == [tmp_path / "run.mcap"]
