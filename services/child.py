@@ -10,7 +10,7 @@ from pathlib import Path
 
 from catstream.services.loop import SOURCE_FAILED
 from catstream.services.process_log import ProcessLog
-from catstream.services.start_server import Request, StartedProcess, start_server
+from catstream.services.start_server import StartedProcess, StartRequest, start_server
 from catstream.services.timing import LOOK_SECONDS, STEP_SECONDS, STOPPED_SECONDS
 from catstream.services.watchdog import Watchdog
 
@@ -54,7 +54,7 @@ class Child:
         self._watchdog, self.killed = Watchdog(), False
         self._turns = self.silent = self._stopped = 0.0
         self.seen = time.monotonic()
-        request = Request.here(self.name, self._job, restarted=bool(self.restarts))
+        request = StartRequest.here(self.name, self._job, restarted=bool(self.restarts))
         try:
             self._process = start_server().start(request, self.log.fileno(), self._watchdog.handle)
         except OSError:  # the server has ended just now

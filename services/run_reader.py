@@ -164,7 +164,7 @@ class RunReader:
         for line in [*start_server_lines(), *(self.supervisor.new_lines("detector") if self._live else ())]:
             _log.warning("%s", line)  # kernels are compiled; a live source was lost or is available again
         if self.supervisor.finished and self.end is None:
-            raise ServiceError("the processes ended before the video did: this should not happen, please report it")
+            raise ServiceError("a signal ended the detector before its first frame: start the run again, or resume it")
 
     def _exit(self) -> Generator[Wait, None, None]:
         """Wait until the detector has exited; it does so once its last message is acknowledged."""

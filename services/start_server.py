@@ -16,8 +16,8 @@ The server has one thread: a fork copies only the thread that calls it, and a lo
 locked in the copy. If a library has started a thread, the server starts each process without forking, and logs that.
 
 The kernel kills these processes when the server ends, and the server ends with its program, however that ended. If the
-server is killed, its processes are restarted like any that died, by a new server. A server of one program that a signal
-has stopped is killed as soon as one of its processes stands still or waits for its start.
+server is killed, its processes are restarted like any that died, by a new server. A server that a signal has stopped is
+killed as soon as one of its processes stands still or waits for its start.
 
 Several programs can share a server, such as the streams of a fleet on one node (`share_start_server`). It ends with a
 process that outlives them; if one of the programs ends, the server kills the processes of that one. A program finds the
@@ -58,7 +58,7 @@ from catstream.services.timing import KILLED_SECONDS, LOOK_SECONDS, SHARED_SECON
 
 __all__ = [
     "NAMES",
-    "Request",
+    "StartRequest",
     "StartServer",
     "StartedProcess",
     "main",
@@ -79,7 +79,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class StartRequest:
     """A process to start.
 
     name         one of `NAMES`
@@ -96,7 +96,7 @@ class Request:
     environment: dict[str, str]
 
     @classmethod
-    def here(cls, name: str, job: Path, *, restarted: bool) -> Request:
+    def here(cls, name: str, job: Path, *, restarted: bool) -> StartRequest:
         """With the folder and the environment of this process."""
         try:
             folder = str(Path.cwd())
@@ -111,7 +111,7 @@ class StartedProcess:
     Parameters
     ----------
     answers : socket on which the server sends the process id, and later the exit code
-    server : process id of the server; 0 if it is not known
+    server : process id of the server
     """
 
     def __init__(self, answers: socket.socket, server: int) -> None:
@@ -142,11 +142,11 @@ class StartedProcess:
     @property
     def is_suspended(self) -> bool:
         """Whether a signal such as SIGSTOP has stopped the process, or its server, which then reports no end of it."""
-        return any(map(is_suspended, filter(None, (self._pid, self._server))))
+        return is_suspended(self._server) or bool(self._pid and is_suspended(self._pid))
 
     def kill(self) -> None:
         """Kill the process if it runs; its server too, with all processes, if a signal has stopped that."""
-        if self.poll() is None and self._server and is_suspended(self._server):
+        if self.poll() is None and is_suspended(self._server):
             with suppress(ProcessLookupError):
                 os.kill(self._server, signal.SIGKILL)
         self.send_signal(signal.SIGKILL)
@@ -195,6 +195,7 @@ class StartServer:
 
     Attributes
     ----------
+    pid : its process id
     log : what it logged: that kernels are compiled, that it cannot fork; a shared one logs to the standard error of the
         program that has started it
 
@@ -210,16 +211,13 @@ class StartServer:
         self._process: subprocess.Popen[bytes] | None = None
         if shared_with is not None:
             self._requests = _connected(shared_with)
+            self.pid = _other_end(self._requests)[0]
         self.log = ProcessLog("start server", cast(BinaryIO, tempfile.TemporaryFile()))  # noqa: SIM115
         if shared_with is None:
             self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
                 self._process = _start(theirs, self._program, self.log.fileno())
-
-    @property
-    def pid(self) -> int:
-        """Its process id; 0 for a shared one."""
-        return self._process.pid if self._process is not None else 0
+            self.pid = self._process.pid
 
     @property
     def is_owned(self) -> bool:
@@ -240,8 +238,8 @@ class StartServer:
         """Whether all its processes have ended."""
         return all(process.poll() is not None for process in self._processes)
 
-    def start(self, request: Request, log: int, watchdog: int) -> StartedProcess:
-        """Request a process, and return without waiting for its start.
+    def start(self, request: StartRequest, log: int, watchdog: int) -> StartedProcess:
+        """StartRequest a process, and return without waiting for its start.
 
         Parameters
         ----------
@@ -313,10 +311,10 @@ def _connected(program: int) -> socket.socket:
         requests = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             requests.connect(name)
-            if _user(requests) != os.getuid():
+            if _other_end(requests)[1] != os.getuid():
                 raise PermissionError(errno.EPERM, "the start server is of another user")
             return requests
-        except ConnectionRefusedError:  # nobody listens
+        except ConnectionRefusedError:  # nobody listens, or not yet
             requests.close()
             if time.monotonic() > deadline:
                 raise
@@ -326,18 +324,17 @@ def _connected(program: int) -> socket.socket:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
             try:
                 listener.bind(name)
-            except OSError:  # another program has bound it, and will listen
+            except OSError:  # it is bound for a server that will listen
                 time.sleep(LOOK_SECONDS)
                 continue
-            listener.listen()
             # The server is no child of this process, whose end may be that of all its children.
             _start(listener, program, None, "import os; os.fork() and os._exit(0); ").wait()
 
 
-def _user(channel: socket.socket) -> int:
-    """The user at the other end of a Unix socket."""
-    credentials = channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    return int(_CREDENTIALS.unpack(credentials)[1])
+def _other_end(channel: socket.socket) -> tuple[int, int]:
+    """The process and the user at the other end of a Unix socket: of a server, those that listen."""
+    process, user, _ = _CREDENTIALS.unpack(channel.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    return process, user
 
 
 _servers: list[StartServer] = []
@@ -395,13 +392,15 @@ class _Server:
 
     Parameters
     ----------
-    requests : socket of the requests, which the program closes when it ends; for a shared server, one that listens
+    requests : socket of the requests, which the program closes when it ends; for a shared server, one with a name
     program : process id of the program with which it ends
     """
 
     def __init__(self, requests: socket.socket, program: int) -> None:
         self._requests = requests
-        self._is_shared = bool(requests.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
+        self._is_shared = bool(requests.getsockname())
+        if self._is_shared:
+            requests.listen()  # by the server itself: so a program that connects knows its process id
         self._clients = {} if self._is_shared else {requests.fileno(): requests}
         self._processes: dict[int, tuple[socket.socket, int]] = {}  # answers and client of those that run, by id
         self._ended, ended = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -419,7 +418,7 @@ class _Server:
                 raise SystemExit(0) from None
         self._logged = False
 
-    def serve(self) -> tuple[Request, int] | None:
+    def serve(self) -> tuple[StartRequest, int] | None:
         """Start processes until the program ends.
 
         Returns
@@ -444,7 +443,7 @@ class _Server:
                     return None
                 file, log, watchdog, answers = descriptors
                 with os.fdopen(file, "rb") as content:
-                    request = Request(**json.loads(content.read()))
+                    request = StartRequest(**json.loads(content.read()))
                 if request.name in to_import:
                     to_import.remove(request.name)
                     _import(request.name)
@@ -460,7 +459,7 @@ class _Server:
     def _accept(self) -> None:
         """Accept a program that shares this server."""
         client, _ = self._requests.accept()
-        if _user(client) != os.getuid():
+        if _other_end(client)[1] != os.getuid():
             client.close()
             return
         self._clients[client.fileno()] = client
@@ -475,7 +474,7 @@ class _Server:
         del self._clients[client.fileno()]
         client.close()
 
-    def _start(self, request: Request, log: int, watchdog: int, answers: int, client: socket.socket) -> bool:
+    def _start(self, request: StartRequest, log: int, watchdog: int, answers: int, client: socket.socket) -> bool:
         """Start a process, and send its process id; returns whether this is the new process."""
         channel = socket.socket(fileno=answers)
         try:
@@ -505,7 +504,7 @@ class _Server:
             _log.warning("processes start without a fork, and later: a library has started %d threads", threads - 1)
         return threads == 1
 
-    def _leave(self, log: int, request: Request) -> None:
+    def _leave(self, log: int, request: StartRequest) -> None:
         """Keep nothing of the server in the process that it has forked."""
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -551,7 +550,7 @@ def _import(name: str) -> None:
     gc.freeze()  # a later collection leaves the memory alone that all processes share
 
 
-def _spawn(request: Request, log: int, watchdog: int) -> int:
+def _spawn(request: StartRequest, log: int, watchdog: int) -> int:
     """Start a process without forking; returns its process id."""
     command = service_command("child", request.name, request.job, "--parent", str(os.getpid()))
     command += ["--watchdog", str(watchdog), *["--restarted"] * request.restarted]
@@ -569,12 +568,13 @@ def main(requests: int, program: int) -> None:
     program : process id of the program
     """
     limit_process()  # before anything imports numpy
+    server = _Server(socket.socket(fileno=requests), program)  # listens before the imports, which take long
     from catstream.services.loop import Parent, run_child
 
     set_process_title("start server")
     logging.basicConfig(format="start server: %(message)s", level=logging.INFO)
     gc.disable()  # nothing of what is imported is garbage
-    server = os.getpid()
-    if (forked := _Server(socket.socket(fileno=requests), program).serve()) is not None:
+    parent = os.getpid()
+    if (forked := server.serve()) is not None:
         request, watchdog = forked
-        sys.exit(run_child(request.name, Path(request.job), Parent(server, watchdog), restarted=request.restarted))
+        sys.exit(run_child(request.name, Path(request.job), Parent(parent, watchdog), restarted=request.restarted))

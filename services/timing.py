@@ -33,7 +33,7 @@ CLOSE_SECONDS = 30.0  #: for closing all sockets after the last turn
 RESTART_SECONDS = 0.1  #: before the second restart in a minute; doubled for each further one
 RESTARTS, RECENT_SECONDS = 5, 60.0  #: how often a process may be restarted, and in which time
 LOCK_SECONDS = 10.0  #: limit for an earlier compressor to end
-SHARED_SECONDS = 2.0  #: limit to connect to a shared start server, which another program may be starting
+SHARED_SECONDS = 10.0  #: limit for a shared start server to listen, before its imports
 
 # The end.
 FEATURES_END_SECONDS = 10.0  #: limit for the end of the features to be stored, once the detector was asked to end

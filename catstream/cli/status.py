@@ -162,7 +162,9 @@ def _format(summary: dict[str, Any]) -> str:
     history = (f"{name} {of['seconds_ago']:.1f} s ago" for name, of in summary["processes"].items())
     size = "-" if summary["bytes"] is None else f"{summary['bytes'] / 1e6:.1f}"
     lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "there"
-    source = f"source     {lost}, {shown('skipped')} frames skipped, reopened {shown('reopened')} times"
+    source = f"source     {lost}, {shown('skipped')} frames skipped"
+    if summary["reopened"] is not None:  # a demo is never lost
+        source += f", reopened {shown('reopened')} times"
     return "\n".join(
         (
             f"pipeline   {summary['endpoint']}",

@@ -180,8 +180,9 @@ class Job:
     def _frames(self) -> str:
         """The size and the numbers of the frames, for an error."""
         size = "" if self.size is None else f"{self.size[0]}x{self.size[1]} pixels, "
-        numbers = (self.part.start, self.part.stop, self.part.step)
-        return f"{size}frames {':'.join('' if number is None else str(number) for number in numbers)}"
+        first, stop, stride = self.part.start or 0, self.part.stop, self.part.step or 1
+        numbers = f"frames {first} to {'the last' if stop is None else stop - 1}"
+        return f"{size}{numbers}{f' in steps of {stride}' * (stride > 1)}"
 
 
 def files_by_name(files: Models | None) -> dict[str, Path]:

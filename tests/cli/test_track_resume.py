@@ -117,7 +117,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
     refusals = {
         "continue it": ["track", source, "--box", box, "--state", kept],
         "started with coreset.size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset.size=32"],
-        "frames 3::": ["track", "--resume", kept, "--start", "3"],
+        "frames 3 to the last": ["track", "--resume", kept, "--start", "3"],
         "contains no run": ["track", "--resume", tmp_path / "none"],
         "give one of them": ["track", "--resume", kept, "--state", kept],
         "needs SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],

@@ -10,6 +10,7 @@ from itertools import islice
 import cv2
 import pytest
 
+from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.services.timing import TRACKS_END_SECONDS
@@ -46,3 +47,16 @@ def test_a_recording_has_its_end_although_the_owner_is_slower_than_every_limit(v
     assert recording.end is not None
     assert recording.end.totals["sent"] == pipeline.frames
     assert recording.files == [tmp_path / "run.mcap"]
+
+
+def test_a_subscriber_that_reads_nothing_from_a_restart_to_the_end_does_not_wait_for_ever(video):
+    """Its subscription is sent to the restarted detector only once it reads."""
+    with Pipeline(video[0], video[1][0]) as pipeline, subscribe(pipeline.endpoint, "tracks") as tracks:
+        list(islice(pipeline, 3))
+        first = next(tracks)
+        os.kill(pipeline.pids["detector"], signal.SIGKILL)
+        list(pipeline)
+        pipeline.close()
+        rest = list(tracks)
+    assert [track.seq for track in [first, *rest]] == list(range(first.seq, first.seq + len(rest) + 1))
+    assert "did not receive its end" in tracks.end.reason

@@ -16,7 +16,7 @@ import pytest
 from catstream.run.job import Job
 from catstream.services import start_server as module
 from catstream.services.process_log import ProcessLog
-from catstream.services.start_server import Request, start_server
+from catstream.services.start_server import StartRequest, start_server
 from catstream.services.watchdog import Watchdog
 
 
@@ -37,7 +37,7 @@ def start(server, folder, tmp_path):  # noqa: ARG001  its processes end before t
     def trainer(job=None):
         file = job or Job(endpoint=str(folder)).save(tmp_path)
         log, watchdog = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), Watchdog()
-        request = Request.here("trainer", file, restarted=False)
+        request = StartRequest.here("trainer", file, restarted=False)
         process = start_server().start(request, log.fileno(), watchdog.handle)
         started.append((process, watchdog, log))
         return started[-1]
@@ -243,12 +243,13 @@ SHARING = """
 import sys, time
 from catstream.services import start_server as module
 from catstream.services.process_log import ProcessLog
-from catstream.services.start_server import Request, share_start_server, start_server
+from catstream.services.start_server import StartRequest, share_start_server, start_server
 from catstream.services.watchdog import Watchdog
 
 share_start_server(int(sys.argv[1]))
 log, watchdog = ProcessLog("trainer", open(sys.argv[2] + ".log", "w+b")), Watchdog()
-process = start_server().start(Request.here("trainer", sys.argv[2], restarted=False), log.fileno(), watchdog.handle)
+request = StartRequest.here("trainer", sys.argv[2], restarted=False)
+process = start_server().start(request, log.fileno(), watchdog.handle)
 print(process.pid, flush=True)
 time.sleep(600)
 """
@@ -304,12 +305,27 @@ def test_a_shared_server_that_was_killed_is_replaced_by_another_one(sharing, unt
         node.kill()
 
 
+def test_a_shared_server_that_a_signal_has_stopped_is_killed_if_a_process_waits_for_its_start(
+    server, start, monkeypatch
+):
+    server.close()
+    with subprocess.Popen(["sleep", "600"]) as node:
+        monkeypatch.setattr(module, "_shared_with", node.pid)
+        shared = psutil.Process(start()[0].pid).parent()
+        assert shared.pid == start_server().pid != node.pid
+        shared.suspend()
+        process, _, _ = start()
+        assert process.pid == 0
+        assert process.poll() == -signal.SIGKILL
+        assert psutil.Process(start()[0].pid).ppid() == start_server().pid != shared.pid
+        node.kill()
+
+
 def test_a_shared_server_whose_process_has_ended_before_it_started_ends_too():
     with subprocess.Popen(["true"]) as node:
         node.wait()
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind("")  # any free name
-        listener.listen()
         server = module._start(listener, node.pid, subprocess.DEVNULL)
     assert server.wait(60) == 0
 
