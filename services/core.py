@@ -11,6 +11,8 @@ not in it, only what a decision depends on. A frame of a file passes through the
              v   │  a command sets a box, or ends the pause
            BOX, HELD
 
+The end of the stream passes FEATURES, TAKEN, RESULTS and OWNER in this order.
+
 The last thousand events are kept, and are written to a file if the process crashes: see `History`.
 """
 
@@ -253,14 +255,16 @@ def _forgotten(state: State, objects: Mapping[str, DesiredObject]) -> list[Actio
 
 
 class Stepped(_Event, frozen=True):
-    """`Step` was carried out: the detectors after the frame, by name."""
+    """`Step` was carried out: the detectors after the frame, by name, and how far the receivers are."""
 
     only_in = Phase.STEP
     known: dict[str, Known]
+    progress: Progress
 
     def change(self, state: State) -> Moved:
         """Send the message; carry out the commands that have waited for the end of the repeated frames."""
-        state = replace(state, phase=Phase.RESULTS, seq=state.seq + 1, known=self.known, given=())
+        seq, known, progress = state.seq + 1, self.known, self.progress
+        state = replace(state, phase=Phase.RESULTS, seq=seq, known=known, given=(), progress=progress)
         if not state.waiting or state.is_repeating:
             return state, []
         state, answers = commands.waited(state)
@@ -270,43 +274,56 @@ class Stepped(_Event, frozen=True):
 def _results(state: State) -> Moved | None:
     """Send the tracks to the owner of the run, if it has one."""
     if not state.rules.owned:
-        return replace(state, phase=Phase.FEATURES), []
-    return _sent(state, Phase.OWNER, actions.Send("results", state.seq))
+        return replace(state, phase=Phase.OWNER), []
+    return _sent(state, Phase.OWNER, "results", state.progress.owner_acknowledged)
 
 
 def _owner(state: State) -> Moved | None:
     """In lockstep the owner is never behind: after a crash, all continue after the same message."""
-    if state.rules.lockstep and state.progress.owner_taken < state.seq and state.stopping < 0:
+    owned, lockstep, progress = state.rules.owned, state.rules.lockstep, state.progress
+    if state.over:
+        return None if owned and _is_owed(state, "results", progress.owner_acknowledged) else _finished(state)
+    if owned and lockstep and progress.owner_taken < state.seq and state.stopping < 0:
         return None
     return replace(state, phase=Phase.FEATURES), []
 
 
 def _features(state: State) -> Moved | None:
     """Send the features to the compressor."""
-    moved = _sent(state, Phase.TAKEN, actions.Send("features", state.seq))
-    return moved and (moved[0], [*moved[1], actions.Show()])
+    moved = _sent(state, Phase.TAKEN, "features", state.progress.acknowledged)
+    if moved is not None and not state.over:
+        moved[1].append(actions.Show())
+    return moved
 
 
-def _sent(state: State, phase: Phase, message: actions.Send) -> Moved | None:
+def _sent(state: State, phase: Phase, channel: actions.DataChannel, acknowledged: int) -> Moved | None:
     """Send a message if there is room in the window; give it up if the process is to end; otherwise wait.
 
     There is no other time-out, as a receiver that died is restarted. Nothing follows a message that was given up: no
     receiver takes a message before the one before it.
     """
-    progress, channel = state.progress, message.channel
-    acknowledged = progress.acknowledged if channel == "features" else progress.owner_acknowledged
+    seq = state.seq + state.over
     if channel in state.given_up:
         return replace(state, phase=phase), []
-    if message.seq - acknowledged <= state.rules.window:
-        return replace(state, phase=phase), [message]
-    if state.stopping >= (_END_SECONDS[channel] if message.end else 0.0):
+    if seq - acknowledged <= state.rules.window:
+        return replace(state, phase=phase), [actions.Send(channel, seq, state.over)]
+    if state.stopping >= (_END_SECONDS[channel] if state.over else 0.0):
         state = replace(state, phase=phase, given_up=(*state.given_up, channel))
-        return state, [actions.GiveUp(channel, message.seq)]
+        return state, [actions.GiveUp(channel, seq)]
     return None
 
 
+def _is_owed(state: State, channel: actions.DataChannel, acknowledged: int) -> bool:
+    """Whether the end of the stream was not acknowledged yet, and is still awaited."""
+    is_open = channel not in state.given_up and acknowledged <= state.seq
+    return is_open and state.stopping < _END_SECONDS[channel]
+
+
 def _taken(state: State) -> Moved | None:
-    """Limit the lag of training behind the detector; a live source does not wait."""
+    """Limit the lag of training behind the detector; a live source does not wait. The end has to be stored."""
+    if state.over:
+        owed = _is_owed(state, "features", state.progress.acknowledged)
+        return None if owed else (replace(state, phase=Phase.RESULTS), [])
     if state.live or state.end_reason:
         return replace(state, phase=Phase.FRAME), []
     if min(state.progress.taken, state.progress.due) < state.due:
@@ -316,10 +333,11 @@ def _taken(state: State) -> Moved | None:
 
 def _model(state: State) -> Moved | None:
     """The same for the models; the compressor may be restarted meanwhile."""
-    if state.end_reason or state.progress.taken < state.due:
+    due, progress, known = state.due, state.progress, state.known
+    if state.end_reason or progress.taken < due:
         return replace(state, phase=Phase.TAKEN), []
-    for name, version in state.progress.samples.items():
-        if (known := state.known.get(name)) is not None and known.began < state.due and known.newest < version:
+    for name, version in progress.samples.items():
+        if (each := known.get(name)) is not None and each.began < due and each.newest < version:
             return None
     return replace(state, phase=Phase.FRAME), []
 
@@ -395,36 +413,15 @@ class Ended(_Event, frozen=True):
     failed: bool = False
 
     def change(self, state: State) -> Moved:
-        """Send the end of the stream, and wait until it is stored."""
+        """Send the end of the stream, to the owner once it is stored: the end of the tracks says so."""
         reason = self.reason if self.failed else state.end_reason or self.reason
         state, rejected = commands.rejected_boxes(state, f"the pipeline is ending: {reason}")
-        state, answers = commands.waited(replace(state, phase=Phase.END_FEATURES, ending=reason))
+        state, answers = commands.waited(replace(state, phase=Phase.FEATURES, ending=reason, over=True))
         return state, commands.concluded(state, [*rejected, *answers])
 
 
-def _end_features(state: State) -> Moved | None:
-    return _sent(state, Phase.END_STORED, actions.Send("features", state.seq + 1, end=True))
-
-
-def _end_stored(state: State) -> Moved | None:
-    waits = "features" not in state.given_up and state.progress.acknowledged <= state.seq
-    if waits and state.stopping < FEATURES_END_SECONDS:
-        return None
-    return replace(state, phase=Phase.END_RESULTS), []
-
-
-def _end_results(state: State) -> Moved | None:
-    if not state.rules.owned:
-        return replace(state, phase=Phase.END_OWNER), []
-    return _sent(state, Phase.END_OWNER, actions.Send("results", state.seq + 1, end=True))
-
-
-def _end_owner(state: State) -> Moved | None:
+def _finished(state: State) -> Moved:
     """Clear the command `stop` at the end of the run, so that a resumed detector does not stop at once."""
-    awaited = state.rules.owned and "results" not in state.given_up
-    waits = awaited and state.progress.owner_acknowledged <= state.seq
-    if waits and state.stopping < RESULTS_END_SECONDS:
-        return None
     state = replace(state, phase=Phase.ENDED, desired=with_fields(state.desired, stopped=False))
     return state, [*commands.concluded(state, []), actions.Finish()]
 
@@ -438,10 +435,6 @@ _MOVES: dict[Phase, Callable[[State], Moved | None]] = {
     Phase.FEATURES: _features,
     Phase.TAKEN: _taken,
     Phase.MODEL: _model,
-    Phase.END_FEATURES: _end_features,
-    Phase.END_STORED: _end_stored,
-    Phase.END_RESULTS: _end_results,
-    Phase.END_OWNER: _end_owner,
 }
 
 Event = (

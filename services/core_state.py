@@ -31,14 +31,10 @@ class Phase(StrEnum):
     HELD = "a command ends the pause, or sets a box in the frame that is held"
     STEP = "the objects are found in the frame"
     RESULTS = "there is room in the window of the results"
-    OWNER = "the owner of the run has processed the tracks"
+    OWNER = "the owner of the run has processed the tracks, or received the end"
     FEATURES = "there is room in the window of the features"
-    TAKEN = "the compressor processes the features of a frame"
+    TAKEN = "the compressor processes the features of a frame, or stores the end"
     MODEL = "the models arrive that were learned from that frame"
-    END_FEATURES = "there is room for the end of the features"
-    END_STORED = "the compressor stores the end"
-    END_RESULTS = "there is room for the end of the results"
-    END_OWNER = "the owner of the run has received the end"
     ENDED = "nothing more"
 
 
@@ -133,6 +129,7 @@ class State(msgspec.Struct, frozen=True):
     arrived   version of the newest model of each object, before the positions agree
     given_up  the channels on which a message was given up
     ending    reason for which no more frames are tracked; empty while frames are tracked
+    over      whether only the end of the stream is sent
     stopping  seconds since a signal asked the process to end; negative if none has
     """
 
@@ -154,6 +151,7 @@ class State(msgspec.Struct, frozen=True):
     arrived: dict[str, int] = {}
     given_up: tuple[str, ...] = ()
     ending: str = ""
+    over: bool = False
     stopping: float = -1.0
 
     @classmethod

@@ -59,10 +59,6 @@ _CHANNELS = {
     Phase.OWNER: "results",
     Phase.FEATURES: "features",
     Phase.TAKEN: "features",
-    Phase.END_FEATURES: "features",
-    Phase.END_STORED: "features",
-    Phase.END_RESULTS: "results",
-    Phase.END_OWNER: "results",
 }
 
 _GIVEN_UP = "message %d of %s was not sent: its receiver did not answer in time"
@@ -284,14 +280,17 @@ class DetectorLoop:
                 self.tell(core.ModelArrived(model.object, model.version, known))
 
     def _progressed(self) -> Event | None:
-        """The progress of the receivers, if it is another one than before."""
-        senders, due = self._outputs.senders, self.state.due
-        features = self._outputs.features.window
-        results = senders["results"].window if "results" in senders else features
-        progress = Progress(
-            features.acknowledged, features.taken, results.acknowledged, results.taken, due, features.count_samples(due)
-        )
-        return core.Progressed(progress) if progress != self.state.progress else None
+        """The progress of the receivers, if the core waits for it and it is another one than before."""
+        if self.state.phase is Phase.FRAME or (progress := self._progress(self.state.due)) == self.state.progress:
+            return None
+        return core.Progressed(progress)
+
+    def _progress(self, due: int) -> Progress:
+        """How far the receivers are; the samples count up to message `due`."""
+        outputs = self._outputs
+        features, results = outputs.features.window, (outputs.results or outputs.features).window
+        samples = features.count_samples(due)
+        return Progress(features.acknowledged, features.taken, results.acknowledged, results.taken, due, samples)
 
     # What the core orders
 
@@ -356,7 +355,7 @@ class DetectorLoop:
         self._features = replace(features, objects=features.objects | models)
         self._given, self._begun = {}, {}
         self._outputs.publish(self._tracks, self._features)
-        return core.Stepped(self._known())
+        return core.Stepped(self._known(), self._progress(self.state.due + 1))
 
     def _send(self, order: actions.Send) -> Event | None:
         results, features = self._outputs.results, self._outputs.features

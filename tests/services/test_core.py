@@ -85,11 +85,14 @@ class World:
 
     def progress(self):
         """Tell how far the receivers are."""
-        features, results, due = self.receivers["features"], self.receivers["results"], self.state.due
+        self.tell(core.Progressed(self.progress_of(self.state.due)))
+
+    def progress_of(self, due):
+        features, results = self.receivers["features"], self.receivers["results"]
         samples = {name: version for seq, name, version in self.samples if seq <= due}
         acknowledged, taken = min(features.acknowledged, features.sent), min(features.taken, features.sent)
         owner = min(results.acknowledged, results.sent), min(results.taken, results.sent)
-        self.tell(core.Progressed(Progress(acknowledged, taken, *owner, due, samples)))
+        return Progress(acknowledged, taken, *owner, due, samples)
 
     def receive_all(self):
         for receiver in self.receivers.values():
@@ -176,20 +179,13 @@ class World:
                 if made <= due and name in self.detectors and self.detectors[name].began < due:
                     assert self.detectors[name].newest >= version, "never further ahead than the lag"
         self.given = set()
-        return core.Stepped(dict(self.detectors))
+        return core.Stepped(dict(self.detectors), self.progress_of(self.state.due + 1))
 
     def Send(self, order):
         assert order.seq == self.state.seq + bool(order.end)
         if order.channel == "features" and self.rules.lockstep and self.rules.owned and self.state.stopping < 0:
             assert self.receivers["results"].taken >= self.state.seq, "in lockstep the owner is never behind"
         self.receivers[order.channel].send(order.seq, order.end)
-        if order.channel == "features":
-            due = self.state.due
-            return core.Progressed(replace(self.state.progress, due=due, samples=self.samples_of(due)))
-        return None
-
-    def samples_of(self, due):
-        return {name: version for seq, name, version in self.samples if seq <= due}
 
     def GiveUp(self, order):
         assert self.state.stopping >= 0, "only if the process is to end"
@@ -588,7 +584,7 @@ def test_a_stop_holds_until_the_end_of_the_stream_is_stored():
 
 def test_an_event_that_cannot_happen_is_an_error():
     with pytest.raises(ValueError, match="Stepped is not expected while the detector waits until the next frame"):
-        handle(World(desired=ANNA).state, core.Stepped({}))
+        handle(World(desired=ANNA).state, core.Stepped({}, Progress()))
 
 
 @given(st.integers(0, 9), st.sampled_from(["features", "results"]), st.floats(0, 30))
