@@ -11,16 +11,14 @@ from catstream.numerics.threads import limit_process
 limit_process()  # before anything imports numpy
 
 import sys
-from pathlib import Path
 from typing import Any
 
 import click
 
 from catstream.errors import CatstreamError
 from catstream.run.job import Job
-from catstream.services.loop import Parent, log_as, run, run_child
+from catstream.services.loop import log_as, run
 from catstream.services.options import PATH, with_model, with_object, with_part, with_settings
-from catstream.services.start_server import NAMES
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
@@ -88,17 +86,6 @@ def supervisor(**options: Any) -> None:
 
     log_as("supervisor")
     sys.exit(supervisor.main(Job(**options)))
-
-
-@main.command(hidden=True)
-@click.argument("name", type=click.Choice(NAMES))
-@click.argument("file", type=PATH)
-@click.option("--parent", type=int, required=True, help="Process id of the parent; this process ends with it.")
-@click.option("--watchdog", type=int, help="File descriptor of the watchdog's shared memory.")
-@click.option("--restarted", is_flag=True, help="Continue the work of a process that died.")
-def child(name: str, file: Path, parent: int, watchdog: int | None, restarted: bool) -> None:
-    """Run one process of the job in a file."""
-    sys.exit(run_child(name, file, Parent(parent, watchdog), restarted=restarted))
 
 
 def start() -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
+
+import msgspec
 
 from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import storage
-from catstream.messages.names import check_name
 
 __all__ = ["DesiredObject", "DesiredState", "PastObject"]
 
@@ -97,7 +96,7 @@ class DesiredState:
             If the file cannot be written.
         """
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        storage.write_atomically(path, json.dumps(asdict(self)).encode())
+        storage.write_atomically(path, msgspec.json.encode(self))
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -109,17 +108,9 @@ class DesiredState:
             If the file cannot be read.
         """
         try:
-            read = json.loads(path.read_text())
-            objects = {check_name(name): _object(each) for name, each in read["objects"].items()}
-            past = (PastObject(check_name(was["name"]), _object(was["each"]), int(was["last"])) for was in read["past"])
-            return cls(objects, tuple(past), bool(read["paused"]), bool(read["stopped"]))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            return msgspec.json.decode(path.read_bytes(), type=cls)
+        except (OSError, msgspec.DecodeError) as error:
             raise ProtocolError(
                 f"the desired state cannot be read from {path} ({error!r}): the run starts with its original boxes, "
                 "repeat later commands"
             ) from None
-
-
-def _object(read: Mapping[str, Any]) -> DesiredObject:
-    """An object as JSON gives it."""
-    return DesiredObject(Box(*read["box"]), int(read["begins"]), str(read["model"]))

@@ -123,7 +123,8 @@ class DetectorLoop:
         self._models = stack.enter_context(Subscriber(MODELS, process.endpoint))
         self._source: Source | None = None
         self._kept: DesiredState | None = None  # in the file
-        self._frame: Frame | None = None  # the present one
+        self._frame: Frame  # the present one, and its pyramid
+        self._pyramid: Pyramid
         self._given: dict[str, Result] = {}  # of the objects that are not searched in it
         self._begun: dict[str, Learned] = {}  # the saved models that begin in it
         self._tracks = Tracks(0, 0, {})  # the last ones
@@ -165,7 +166,7 @@ class DetectorLoop:
         """Wait in turns until the next frame can be taken, or the stream has ended."""
         while self.state.phase not in (Phase.FRAME, Phase.ENDED):
             self.turn()
-        if self._frame is None and self.state.phase is Phase.ENDED:  # nothing was sent yet
+        if self.state.phase is Phase.ENDED:  # a signal arrived before anything was sent
             raise SystemExit(0)
 
     def turn(self) -> None:
@@ -314,7 +315,7 @@ class DetectorLoop:
 
     def _set_box(self, order: actions.SetBox) -> Event:
         self._process.allow(OPEN_SECONDS)
-        detectors, time_ = self._detectors, self._present.time
+        detectors, time_ = self._detectors, self._frame.time
         act = detectors.correct if order.keep else detectors.begin
         try:
             self._given[order.name] = act(order.name, self._pyramid, order.box, time_)
@@ -324,7 +325,7 @@ class DetectorLoop:
 
     def _begin(self, order: actions.Begin) -> None:
         self._process.allow(OPEN_SECONDS)
-        self._given[order.name] = self._detectors.begin(order.name, self._pyramid, order.box, self._present.time)
+        self._given[order.name] = self._detectors.begin(order.name, self._pyramid, order.box, self._frame.time)
 
     def _seek(self, order: actions.Seek) -> None:
         self._process.allow(OPEN_SECONDS)
@@ -343,14 +344,14 @@ class DetectorLoop:
 
     def _miss(self, order: actions.Miss) -> None:
         absent = Detector(self._process.settings, order.name)
-        self._given[order.name] = absent.miss(self.state.seq + 1, self._present.time)
+        self._given[order.name] = absent.miss(self.state.seq + 1, self._frame.time)
 
     def _step(self, _: actions.Step) -> Event:
-        tracks, features = self._detectors.step(self._pyramid, self._present.time, self._given)
+        tracks, features = self._detectors.step(self._pyramid, self._frame.time, self._given)
         models = {
             name: replace(features.objects[name], model=learned.to_bytes()) for name, learned in self._begun.items()
         }
-        pts = self._present.pts
+        pts = self._frame.pts
         self._tracks = replace(tracks, tracks={name: replace(each, pts=pts) for name, each in tracks.tracks.items()})
         self._features = replace(features, objects=features.objects | models)
         self._given, self._begun = {}, {}
@@ -367,9 +368,10 @@ class DetectorLoop:
         return None
 
     def _show(self, order: actions.Show) -> None:
-        wanted = self.state.desired.objects if order.held else self._tracks.tracks
-        shown = {name: each for name, each in self._tracks.tracks.items() if name in wanted}
-        self._outputs.show(self._present.number, self._present.image, shown)
+        tracks, frame = self._tracks.tracks, self._frame
+        wanted = self.state.desired.objects if order.held else tracks
+        boxes = {name: each.box for name, each in tracks.items() if each.box is not None and name in wanted}
+        self._outputs.previews.show(frame.number, frame.image, boxes)
 
     def _conclude(self, order: actions.Conclude) -> None:
         """Store the desired state if it has changed, then send the answers; those say so if it could not be stored."""
@@ -389,13 +391,6 @@ class DetectorLoop:
     def _finish(self, _: actions.Finish) -> None:
         self._outputs.publish(self._end, self._end)
         self._process.beat(self._counters, self._object_counters, now=True)
-
-    @property
-    def _present(self) -> Frame:
-        """The present frame."""
-        if self._frame is None:
-            raise ValueError("there is no frame yet")
-        return self._frame
 
     @cached_property
     def _end(self) -> End:

@@ -55,11 +55,11 @@ class Parent(NamedTuple):
     """The parent process; this process ends with it.
 
     pid       its process id
-    watchdog  file descriptor of the watchdog's shared memory; None if the parent has no watchdog
+    watchdog  file descriptor of the watchdog's shared memory
     """
 
     pid: int
-    watchdog: int | None
+    watchdog: int
 
 
 class Process:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Self
 
-import numpy as np
-
-from catstream.messages.kinds import End, Features, Track, Tracks
+from catstream.messages.kinds import End, Features, Tracks
 from catstream.services.loop import RECORDER, Process
 from catstream.services.previews import Previews
 from catstream.services.timing import TURN_SECONDS
@@ -30,6 +27,7 @@ class Outputs:
     features : sender of the features to the compressor
     results : sender of the tracks to the owner of the run; None if it has no owner
     senders : both senders by the names of their channels, `features` first; without `results` if it is None
+    previews : pictures of frames for subscribers
     """
 
     def __init__(self, process: Process) -> None:
@@ -40,7 +38,7 @@ class Outputs:
             self.results = stack.enter_context(Sender(RESULTS, endpoint, window)) if owned else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
             self._training = stack.enter_context(Publisher(TRAINING, endpoint, first_message=process.run))
-            self._previews = stack.enter_context(Previews(endpoint))
+            self.previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
         self.senders: dict[str, DataSender] = {"features": self.features}
         if self.results is not None:
@@ -62,18 +60,13 @@ class Outputs:
         """Send the first message or the newest preview to new subscribers."""
         self._tracks.serve_late_joiners()
         self._training.serve_late_joiners()
-        self._previews.turn()
+        self.previews.turn()
 
     def publish(self, tracks: Tracks | End, features: Features | End) -> None:
         """Send the tracks of a frame, one message an object, and its features to all subscribers; or the end."""
         for each in tracks.tracks.values() if isinstance(tracks, Tracks) else (tracks,):
             self._tracks.send(each)
         self._training.send(features)
-
-    def show(self, frame: int, image: np.ndarray, tracks: Mapping[str, Track]) -> None:
-        """Send a preview of a frame, with the boxes of its tracks, if one is due."""
-        boxes = {name: track.box for name, track in tracks.items() if track.box is not None}
-        self._previews.show(frame, image, boxes)
 
     def __enter__(self) -> Self:
         return self

@@ -20,22 +20,17 @@ from typing import Any
 
 from catstream import errors
 
-__all__ = ["SPAWN", "environment", "import_path", "python_command", "service_command", "sigint_blocked"]
+__all__ = ["SPAWN", "environment", "import_path", "python_command", "sigint_blocked"]
 
 
-def service_command(*arguments: str) -> list[str]:
-    """The command that runs `catstream.services` with these arguments; run it with the variables of `environment`.
+def python_command(program: str, *arguments: str) -> list[str]:
+    """The command that runs a program with the modules of this process; run it with the variables of `environment`.
 
     Raises
     ------
     ServiceError
         If no Python interpreter is known.
     """
-    return python_command("from catstream.services.__main__ import start; start()", *arguments)
-
-
-def python_command(program: str, *arguments: str) -> list[str]:
-    """The command that runs a program with the modules of this process; otherwise like `service_command`."""
     # Folders that only the interpreter knows come last; `-P` and no PYTHONPATH keep the current folder off its list.
     start = f"import sys; sys.path[:] = dict.fromkeys({import_path()!r} + sys.path); {program}"
     return [_interpreter(), "-P", "-c", start, *arguments]

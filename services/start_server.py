@@ -53,7 +53,7 @@ from catstream.errors import ServiceError
 from catstream.numerics.threads import limit_process
 from catstream.services.process_log import ProcessLog
 from catstream.services.process_title import is_suspended, process_fields, set_process_title
-from catstream.services.start import environment, import_path, python_command, service_command
+from catstream.services.start import environment, import_path, python_command
 from catstream.services.timing import KILLED_SECONDS, LOOK_SECONDS, SHARED_SECONDS, STOPPED_SECONDS
 
 __all__ = [
@@ -62,6 +62,7 @@ __all__ = [
     "StartServer",
     "StartedProcess",
     "main",
+    "run_started",
     "share_start_server",
     "start_server",
     "start_server_lines",
@@ -552,8 +553,8 @@ def _import(name: str) -> None:
 
 def _spawn(request: StartRequest, log: int, watchdog: int) -> int:
     """Start a process without forking; returns its process id."""
-    command = service_command("child", request.name, request.job, "--parent", str(os.getpid()))
-    command += ["--watchdog", str(watchdog), *["--restarted"] * request.restarted]
+    arguments = request.name, request.job, request.restarted, os.getpid(), watchdog
+    command = python_command(f"from catstream.services.start_server import run_started; run_started{arguments!r}")
     process = _run(command, watchdog, log, request.folder, request.environment)
     process.returncode = 0  # the server waits for its end as for that of the others
     return process.pid
@@ -568,13 +569,19 @@ def main(requests: int, program: int) -> None:
     program : process id of the program
     """
     limit_process()  # before anything imports numpy
-    server = _Server(socket.socket(fileno=requests), program)  # listens before the imports, which take long
-    from catstream.services.loop import Parent, run_child
-
+    server = _Server(socket.socket(fileno=requests), program)
     set_process_title("start server")
     logging.basicConfig(format="start server: %(message)s", level=logging.INFO)
     gc.disable()  # nothing of what is imported is garbage
     parent = os.getpid()
     if (forked := server.serve()) is not None:
         request, watchdog = forked
-        sys.exit(run_child(request.name, Path(request.job), Parent(parent, watchdog), restarted=request.restarted))
+        run_started(request.name, request.job, request.restarted, parent, watchdog)
+
+
+def run_started(name: str, job: str, restarted: bool, parent: int, watchdog: int) -> None:
+    """Run a process that the server with this process id has started, and exit with its code."""
+    limit_process()  # before anything imports numpy
+    from catstream.services.loop import Parent, run_child
+
+    sys.exit(run_child(name, Path(job), Parent(parent, watchdog), restarted=restarted))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
 from catstream.run.job import Job
 from catstream.run.state import TREES
+from catstream.services.start import environment, python_command
 from catstream.services.start_server import NAMES, start_server
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
@@ -129,9 +131,10 @@ def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folde
     assert detector.poll() is None
 
 
-def test_a_process_whose_parent_has_already_ended_ends_at_once(folder, service):
-    file = Job(endpoint=str(folder)).save(folder)
-    assert service("child", "trainer", file, "--parent", 2**22 + 1).wait(60) == 0
+def test_a_process_whose_parent_has_already_ended_ends_at_once(folder):
+    arguments = "trainer", str(Job(endpoint=str(folder)).save(folder)), False, 2**22 + 1, 0
+    command = python_command(f"from catstream.services.start_server import run_started; run_started{arguments!r}")
+    assert subprocess.run(command, env=environment(), timeout=60, check=False).returncode == 0
 
 
 def test_an_error_that_a_restart_cannot_resolve_is_reported_and_not_retried(folder):

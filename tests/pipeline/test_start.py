@@ -12,7 +12,7 @@ import pytest
 
 import catstream
 from catstream.errors import ServiceError
-from catstream.services.start import environment, import_path, service_command
+from catstream.services.start import environment, import_path, python_command
 
 HOME = str(Path(catstream.__file__).parents[1])
 
@@ -43,15 +43,16 @@ def test_children_import_the_catstream_of_their_parent(tmp_path, monkeypatch):
     (tmp_path / "catstream").mkdir()
     (tmp_path / "catstream" / "__init__.py").write_text("raise SystemExit('another catstream')")
     monkeypatch.chdir(tmp_path)
-    done = subprocess.run(service_command("--help"), env=environment(), capture_output=True, text=True, timeout=60)
-    assert done.stdout.startswith("Usage: python -P -m catstream.services"), done.stderr
+    command = python_command("import catstream; print(catstream.__file__)")
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == catstream.__file__, done.stderr
 
 
 @pytest.mark.parametrize("executable", ["", "/usr/sbin/uwsgi"])
 def test_a_program_that_embeds_python_is_not_used_as_the_interpreter(executable, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", executable)
     monkeypatch.setattr(spawn, "get_executable", lambda: executable)
-    assert Path(service_command()[0]).name.startswith("python")
+    assert Path(python_command("")[0]).name.startswith("python")
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     with pytest.raises(ServiceError, match=r"multiprocessing.set_executable"):
-        service_command()
+        python_command("")
