@@ -148,14 +148,14 @@ class RunReader:
             self.rows += len(message.tracks)
             return message
         if message is not None:
-            self._incoming.acknowledge(Position(self._incoming.taken))
+            self._incoming.acknowledge(Position(self._incoming.window.taken))
             self.end = message
         return None
 
     def _receive_rest(self) -> None:
         """Receive the tracks that nobody reads any more."""
         while self._incoming.receive(0) is not None:
-            self._incoming.acknowledge(Position(self._incoming.taken))
+            self._incoming.acknowledge(Position(self._incoming.window.taken))
 
     def _check_processes(self) -> None:
         """Receive the health, restart processes that died, and log warnings for the user."""

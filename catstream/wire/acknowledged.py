@@ -153,7 +153,7 @@ class Receiver(ChannelSocket[Message]):
     @property
     def is_connected(self) -> bool:
         """Whether the sender was connected when `receive` was last called."""
-        return self._window.connected
+        return self.window.connected
 
     @property
     def has_sender(self) -> bool:
