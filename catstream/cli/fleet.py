@@ -13,16 +13,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from catstream.cli.output import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
-from catstream.errors import FleetError, ServiceError
+from catstream.errors import FleetError, ServiceError, SilenceError
 from catstream.messages import storage
-from catstream.messages.kinds import FleetStatus, StreamStatus
+from catstream.messages.kinds import FleetStatus
 from catstream.messages.names import UNNAMED, split_name
 
 if TYPE_CHECKING:
@@ -118,6 +119,8 @@ def up(running: Fleet, replace: bool, **options: Any) -> None:
         click.echo(line)
     with suppress(KeyboardInterrupt):
         _watch(console, running)
+        if running.is_owner:
+            _watch_until_its_end(console, running)
     if running.is_owner:
         with Console(stderr=True).status("storing the states of all streams"):
             running.down()
@@ -130,19 +133,38 @@ def _up(fleet: Fleet, **options: Any) -> list[str]:
 
 
 def _watch(console: Console, fleet: Fleet) -> None:
-    """Show the streams until all have started; a fleet that ends with this program, until then."""
+    """Show the streams until all have started."""
     deadline = time.monotonic() + _UP_SECONDS
     status = fleet.status()
     try:
         with Live(console=console, transient=True) as live:
-            while fleet.is_owner or (
-                not all(each.state in _STARTED for each in status.streams.values()) and time.monotonic() < deadline
-            ):
-                live.update(Group(_streams(status), _nodes(status)))
+            while not all(each.state in _STARTED for each in status.streams.values()) and time.monotonic() < deadline:
+                live.update(Group(*_tables(status)))
                 time.sleep(_LOOK_SECONDS)
                 status = fleet.status()
     finally:
+        if not fleet.is_owner:
+            _show(console, status)
+
+
+def _watch_until_its_end(console: Console, fleet: Fleet) -> None:
+    """Show the streams of a fleet that this program has started, until Ctrl-C, or until another one ends it.
+
+    The registry is asked, without Ray, which prints lines of its own if its head is gone.
+    """
+    fleet.disconnect()
+    status = FleetStatus(fleet.name, 0.0)
+    try:
+        with Registry(fleet.name, timeout=_UP_SECONDS) as registry, Live(console=console, transient=True) as live:
+            registry.timeout = _LOOK_SECONDS
+            while fleet.is_running:
+                with suppress(SilenceError):  # Ray starts the controller again
+                    status = registry.streams()
+                live.update(Group(*_tables(status)))
+                time.sleep(_LOOK_SECONDS)
+    finally:
         _show(console, status)
+    click.echo(f"the fleet {fleet.name} was ended from elsewhere")
 
 
 @fleet.command()
@@ -321,14 +343,19 @@ def down(running: Fleet) -> None:
 
 
 def _show(console: Console, status: FleetStatus) -> None:
-    console.print(_streams(status))
-    console.print(_nodes(status))
+    console.print(*_tables(status), sep="\n")
+
+
+def _tables(status: FleetStatus) -> list[RenderableType]:
+    """The streams, what is wrong with them, a line for each, and the nodes."""
+    troubles = [Text(f"{each.name}: {each.trouble}") for each in status.streams.values() if each.trouble]
+    return [_streams(status), *([Text(), *troubles] if troubles else []), _nodes(status)]
 
 
 def _streams(status: FleetStatus) -> Table:
     """A row for each stream, those with trouble first."""
-    numbers = ("frames/s", "skipped", "cores", "model", "restarts")
-    shown = table("stream", "node", "state", *numbers, "trouble", right=numbers)
+    numbers = ("frames/s", "skipped", "lost", "cores", "model", "restarts")
+    shown = table("stream", "node", "state", *numbers, right=numbers)
     for each in sorted(status.streams.values(), key=lambda each: (not each.trouble, each.name)):
         model = max(each.models.values(), default=0)
         restarts = str(each.restarts) if each.restarts else "-"
@@ -338,17 +365,12 @@ def _streams(status: FleetStatus) -> Table:
             each.state,
             f"{each.rate:.1f}" if each.rate else "-",
             str(each.skipped or "-"),
+            str(each.lost_frames or "-"),
             f"{each.cores:.1f}" if each.cores else "-",
             str(model or "-"),
             restarts,
-            _trouble(each),
         )
     return shown
-
-
-def _trouble(stream: StreamStatus) -> str:
-    lost = f"{stream.lost_frames} frames in {stream.lost_seconds:.1f} s were lost" if stream.lost_frames else ""
-    return "; ".join(filter(None, (stream.trouble, lost)))
 
 
 def _nodes(status: FleetStatus) -> Table:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from catstream.client.registry import RegistryServer
 from catstream.errors import CatstreamError, FleetError
@@ -78,7 +78,6 @@ class _Known:
     call      the call for the next report, or that stops it, which was not answered yet
     report    its last report; None before the first one
     ended     digest with which its source has ended; empty if it has not
-    restarts  how many times its actor was started again
     started   moment at which its actor was started
     """
 
@@ -87,7 +86,6 @@ class _Known:
     call: Any = None
     report: Report | None = None
     ended: str = ""
-    restarts: int = 0
     started: float = float("-inf")
 
 
@@ -115,7 +113,7 @@ class Controller:
         self._streams: dict[str, _Known] = {}
         self._clients: dict[str, Client] | None = None if self._keys is None else {}
         self._clients_due = 0.0
-        self._closing = False
+        self._phase: Literal["idle", "up", "down"] = "idle"  # before the first change; and while the fleet ends
         self._recent = FleetStatus(name, time.time())
         self._over = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -166,8 +164,8 @@ class Controller:
                 self._store.put_model(given_model(stream, name), data, {})
             self._store.put_fleet(to_json(desired))
             with self._lock:
-                lines: list[str] = self._desired.spec.changes(desired.spec)
-                self._desired, self._closing = desired, False
+                lines: list[str] = self._desired.spec.changes(desired.spec, are_running=self._phase == "up")
+                self._desired, self._phase = desired, "up"
                 for name in self._streams.keys() - desired.spec.streams.keys():  # only the actor is left, until it ends
                     known = self._streams[name]
                     self._streams[name] = _Known(known.seen, known.handle, known.call)
@@ -198,7 +196,7 @@ class Controller:
 
     def close(self) -> int:
         """Stop all streams after their state was stored; returns how many still run."""
-        self._closing = True
+        self._phase = "down"
         return sum(known.handle is not None for known in self._streams.values())
 
     def end(self) -> None:
@@ -213,12 +211,16 @@ class Controller:
 
     def _begin(self) -> None:
         """Open the registry, read what should run, and find what runs."""
+        import ray
+
         if self._registry is None:
             if self._keys is not None:
                 create(self._keys)
             self._registry = RegistryServer(self._listen, str(self._keys or ""), lambda: self._recent)
         if (stored := self._store.get_fleet()) is not None:
             self._desired = from_json(stored, Desired)
+        if ray.get_runtime_context().was_current_actor_reconstructed:  # by Ray, while the fleet ran
+            self._phase = "up"
         self._turn()
         self._trouble = None
         self._start_thread(self._serve)  # not before: a client would take an empty answer for the end of its stream
@@ -258,9 +260,10 @@ class Controller:
                 self._streams.setdefault(name, _Known(Seen("absent")))
             for name, known in self._streams.items():
                 self._look(name, known, exists=name in existing)
-            wanted, seen = self._wanted(), {name: known.seen for name, known in self._streams.items()}
-            for name, step in life.diff(wanted, seen, self._nodes, time.monotonic()).items():
-                self._do(name, step, wanted.get(name))
+            if self._phase != "idle":
+                wanted, seen = self._wanted(), {name: known.seen for name, known in self._streams.items()}
+                for name, step in life.diff(wanted, seen, self._nodes, time.monotonic()).items():
+                    self._do(name, step, wanted.get(name))
             gone = [name for name, known in self._streams.items() if known.seen.state == "absent"]
             for name in set(gone) - self._desired.spec.streams.keys():
                 del self._streams[name]
@@ -277,7 +280,7 @@ class Controller:
 
     def _wanted(self) -> dict[str, Wanted]:
         """The streams that should run now."""
-        if self._closing:
+        if self._phase != "up":
             return {}
         wanted = {name: self._desired.wanted(name) for name in self._desired.spec.streams}
         return {name: each for name, each in wanted.items() if self._streams[name].ended != each.digest}
@@ -331,14 +334,12 @@ class Controller:
         known, now = self._streams[name], time.monotonic()
         before = known.seen.state
         _log.info("%s: %s, %s: %s %s", name, before, life.EVENTS[step.event], step.after, step.action)
-        if step.event in ("interrupted", "silent", "superseded") and before != "stopping":
-            known.restarts += 1
         match step.action:
             case "start" if wanted is not None:
                 self._start(name, known, wanted, now)
                 return
             case "stop":
-                known.call = known.handle.stop.remote()
+                known.call = known.handle.stop.remote("stopped" if wanted is None else "moved")
             case "restart":
                 ray.kill(known.handle, no_restart=False)
             case "kill":
@@ -354,9 +355,7 @@ class Controller:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         spec, order = self._desired.spec, wanted.order(self._nodes)
-        options: dict[str, Any] = {"label_selector": order.selector} if order.selector else {}
-        if order.node:
-            options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(order.node, soft=True)
+        where = NodeAffinitySchedulingStrategy(order.node, soft=True) if order.node else "SPREAD"
         with suppress(ValueError):  # the name is taken: the actor before it is not quite gone
             known.handle = (
                 ray.remote(StreamActor)
@@ -367,7 +366,8 @@ class Controller:
                     num_cpus=order.cores,
                     max_restarts=-1,
                     max_concurrency=4,
-                    **options,
+                    label_selector=order.selector or None,
+                    scheduling_strategy=where,
                 )
                 .remote(spec.streams[name], order, self._clients, spec.store, spec.every)
             )
@@ -379,26 +379,28 @@ class Controller:
         known = self._streams.get(name, _Known(Seen("absent")))
         source = without_password(self._desired.spec.streams[name].source)
         last = known.report.status if known.report is not None else StreamStatus(name, "starting", source=source)
-        last = replace(last, node=self._node_name(known.seen.node), restarts=last.restarts + known.restarts)
+        last = replace(last, node=self._node_name(known.seen.node))
         if known.seen.state == "working":
             return last
         last = replace(last, endpoint="", server="", rate=0.0, trouble="")
         if known.ended == self._desired.spec.streams[name].digest:
             return replace(last, state="ended", node="")
         if known.seen.state == "stopping":
-            return replace(last, state="moving")
+            return replace(last, state="moving" if self._phase == "up" else "stopping")
+        if self._phase == "down":
+            return replace(last, state="stopping", node="")
         trouble = self._waits_for(name)
         return replace(last, state="unplaced" if trouble else "starting", node="", trouble=trouble)
 
     def _waits_for(self, name: str) -> str:
         """What a stream that Ray has not placed waits for; empty if there is room for it."""
         wanted = self._desired.wanted(name)
-        if reason := objection(name, wanted, self._nodes):
-            return reason
+        if reason := objection(wanted, self._nodes):
+            return f"it {reason}"
         free = max(node.cores - self._used(node) for node in self._nodes if node.alive and wanted.fits(node))
         if free + 1e-6 >= wanted.cores:
             return ""
-        return f"{name} waits for {wanted.cores:g} free cores: no node that it may run on has more than {free:.2g}"
+        return f"it waits for {wanted.cores:g} free cores: no node that it may run on has more than {free:.2g}"
 
     def _used(self, node: Node) -> float:
         """The cores that Ray has reserved for streams on a node."""

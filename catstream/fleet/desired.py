@@ -56,8 +56,8 @@ class Desired:
     def moved(self, name: str, node: Node) -> Desired:
         """With a stream on a node, until that dies or drains: a node that was started again has another id."""
         self.check_stream(name)
-        if reason := objection(name, self.wanted(name), self.with_draining([node])):
-            raise FleetError(reason)
+        if reason := objection(self.wanted(name), self.with_draining([node])):
+            raise FleetError(f"{name} {reason}")
         return replace(self, pins=self.pins | {name: node.id})
 
     def drained(self, node: str, *, undo: bool) -> Desired:
@@ -82,7 +82,7 @@ class Desired:
     def check_fits(self, nodes: Collection[Node]) -> None:
         """Raise FleetError if the nodes cannot run all streams."""
         wanted = {name: self.wanted(name) for name in self.spec.streams}
-        reasons = [reason for name, each in wanted.items() if (reason := objection(name, each, nodes))]
+        reasons = [f"{name} {reason}" for name, each in wanted.items() if (reason := objection(each, nodes))]
         if reasons := reasons or list(filter(None, [shortage(wanted.values(), nodes)])):
             raise FleetError(
                 "nothing was changed: "
@@ -92,24 +92,24 @@ class Desired:
             )
 
 
-def objection(name: str, wanted: Wanted, nodes: Collection[Node]) -> str:
+def objection(wanted: Wanted, nodes: Collection[Node]) -> str:
     """Why a stream can run on no node, even if no other stream ran; empty if it can.
 
-    >>> objection("cam-7", Wanted("a1", 4.0), [Node("n1", "1", cores=2.0)])
-    'cam-7 needs 4 cores, and the largest node that it may run on, n1, has 2'
-    >>> objection("cam-7", Wanted("a1", labels={"site": "north"}), [Node("n1", "1")])
-    'cam-7 needs a node with site=north, and there is none: there are n1'
+    >>> objection(Wanted("a1", 4.0), [Node("n1", "1", cores=2.0)])
+    'needs 4 cores, and the largest node that it may run on, n1, has 2'
+    >>> objection(Wanted("a1", labels={"site": "north"}), [Node("n1", "1")])
+    'needs a node with site=north, and there is none: there are n1'
     """
     alive = [node for node in nodes if node.alive]
     fitting = [node for node in alive if wanted.fits(node)]
     if not fitting:
         labels = ", ".join(f"{key}={value}" for key, value in wanted.labels.items())
         needed = f"a node with {labels}" if labels else "a node that is not drained"
-        return f"{name} needs {needed}, and there is none: there are {', '.join(node.name for node in alive) or 'none'}"
+        return f"needs {needed}, and there is none: there are {', '.join(node.name for node in alive) or 'none'}"
     largest = max(fitting, key=lambda node: node.cores)
     if largest.cores < wanted.cores:
         return (
-            f"{name} needs {wanted.cores:g} cores, and the largest node that it may run on, {largest.name}, has "
+            f"needs {wanted.cores:g} cores, and the largest node that it may run on, {largest.name}, has "
             f"{largest.cores:g}"
         )
     return ""

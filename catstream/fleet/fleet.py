@@ -18,7 +18,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -127,22 +127,23 @@ class Fleet:
             raise FleetError("there are no streams: give a file, see docs/how-to/fleet.md")
         with self._starting():
             spec = self._with_store(self._spec)
-            began = self._local is not None and not self._local.running
-            try:
-                if self._local is not None and began:
+            models = _models(spec.streams.values())
+            began = False
+            with ExitStack() as undone:
+                if self._local is not None and not self._local.running:
                     self._local.start(nodes or spec.nodes, cores, detach=detach)
-                    self.is_owner = not detach
+                    undone.callback(self._local.stop)
+                    undone.callback(self.disconnect)
+                    began = True
+                self._connect()
+                if self.name not in cluster.fleets():
+                    undone.callback(self._kill_controller)
                 self._start_controller(spec)
-                models = _models(spec.streams.values())
                 lines = self._change(
                     Desired.applied, spec, self._origin, replace_other=replace, models=models, may_wait=wait
                 )
-            except BaseException:
-                if self._local is not None and began:
-                    self.is_owner = False  # there is nothing to be stored
-                    self.close()
-                    self._local.stop()
-                raise
+                undone.pop_all()
+            self.is_owner = self.is_owner or (began and not detach)
             return lines
 
     def add(self, spec: StreamSpec) -> list[str]:
@@ -208,19 +209,40 @@ class Fleet:
         while self._ask("close") and time.monotonic() < deadline:
             time.sleep(_TURN_SECONDS)
         self._ask("end")
-        import ray
-
-        ray.kill(self._controller)
+        self._kill_controller()
+        self.disconnect()
         if self._local is not None:
-            self.close()
             self._local.stop()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the cluster of a fleet on this machine still runs.
+
+        Raises
+        ------
+        FleetError
+            If it has ended because its head died.
+        """
+        if self._local is None or self._local.running:
+            return True
+        self.is_owner = False
+        if self._local.head_died:
+            raise FleetError(
+                f"the head of {self.name}, node-1, has died, and the fleet with it: catstream fleet up continues from "
+                "the last states"
+            )
+        return False
+
+    def disconnect(self) -> None:
+        """Disconnect from Ray until the next call of a method; the fleet runs on."""
+        self._controller = None
+        cluster.disconnect()
 
     def close(self) -> None:
         """Disconnect. A fleet on a cluster, or a detached one, continues; any other ends with this program."""
         if self.is_owner:
             self.down()
-        self._controller = None
-        cluster.disconnect()
+        self.disconnect()
 
     def __enter__(self) -> Self:
         return self
@@ -241,7 +263,6 @@ class Fleet:
 
     def _start_controller(self, spec: FleetSpec) -> None:
         """Start the controller, if it does not run, on the node whose address the registry has."""
-        self._connect()
         import ray
 
         options: dict[str, Any] = {}
@@ -265,12 +286,13 @@ class Fleet:
             )
             .remote(spec.name, spec.store, listen, spec.keys or str(_home() / spec.name / "keys"))
         )
-        started = self._controller
-        try:
-            self._ask("ready")
-        except CatstreamError:
-            ray.kill(started)
-            raise
+        self._ask("ready")
+
+    def _kill_controller(self) -> None:
+        import ray
+
+        with suppress(ValueError):  # it has gone
+            ray.kill(ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE))
 
     @contextmanager
     def _starting(self) -> Iterator[None]:

@@ -30,6 +30,7 @@ _START_SECONDS = 150.0  # on a machine that is busy
 _END_SECONDS = 30.0
 _LOOK_SECONDS = 0.5  # between two looks at the nodes
 _TURN_SECONDS = 0.05
+_HEAD_DIED = 3  # exit code
 _STORE_BYTES = 80 << 20  # of Ray's object store: only models and states that are merged go through it
 
 
@@ -51,6 +52,11 @@ class LocalCluster:
         with suppress(OSError), (self.folder / "pid").open() as file:
             return is_locked(file.fileno())
         return False
+
+    @property
+    def head_died(self) -> bool:
+        """Whether the cluster that this object has started has ended because its head died."""
+        return self._process is not None and self._process.poll() == _HEAD_DIED
 
     @property
     def address(self) -> str:
@@ -157,6 +163,8 @@ def main() -> None:
             (work / "ray").mkdir()
             os.environ["RAY_TMPDIR"] = str(work)
             _keep(folder, count, cores, ends)
+    if not ends.is_set():
+        sys.exit(_HEAD_DIED)
 
 
 def _set_at_the_end_of_input(ends: threading.Event) -> None:

@@ -224,8 +224,9 @@ class FleetSpec:
             streams = {name: StreamSpec.parse(name, table, folder) for name, table in values["streams"].items()}
             return cls(**values | {"streams": streams})
 
-    def changes(self, new: FleetSpec) -> list[str]:
+    def changes(self, new: FleetSpec, *, are_running: bool) -> list[str]:
         """Describe the change of each stream if another spec takes the place of this one, a line for each."""
+        same = "is unchanged" if are_running else "continues from its last state"
         lines = []
         for name in sorted(self.streams.keys() | new.streams.keys()):
             before, after = self.streams.get(name), new.streams.get(name)
@@ -234,7 +235,7 @@ class FleetSpec:
             elif before.digest != after.digest:
                 lines.append(f"{name}: starts again with its changes")
             else:
-                lines.append(f"{name}: {'is unchanged' if before == after else 'continues with its changes'}")
+                lines.append(f"{name}: {same if before == after else 'continues with its changes'}")
         return lines
 
 

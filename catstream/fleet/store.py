@@ -139,7 +139,7 @@ class States:
                 self._objects.create(self._name(token, _CLAIM), holder[:_LONGEST_HOLDER].encode())
                 with contextlib.suppress(StoreError):  # the next claim does it
                     self._objects.tidy(self.folder)
-                return Claim(self, token, holder, self.newest())
+                return Claim(self, token, holder, self.newest(), found.removed)
         raise self._busy("claimed")
 
     def clear(self, holder: str) -> None:
@@ -196,12 +196,13 @@ class States:
 class Claim:
     """The right to write the states of a stream, until another process claims it.
 
-    token   higher than that of every earlier claim
-    state   the state to continue from; None if there is none
+    token    higher than that of every earlier claim
+    state    the state to continue from; None if there is none
+    removed  token under which the stream was removed last; 0 if it never was
     """
 
-    def __init__(self, states: States, token: int, holder: str, state: Generation | None) -> None:
-        self.token, self.state = token, state
+    def __init__(self, states: States, token: int, holder: str, state: Generation | None, removed: int) -> None:
+        self.token, self.state, self.removed = token, state, removed
         self._states, self._holder = states, holder
         self._number = 0
         self._fenced: FencedError | None = None

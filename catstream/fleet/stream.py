@@ -21,7 +21,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from catstream.client.control import control
 from catstream.errors import (
@@ -39,7 +39,7 @@ from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
-from catstream.run.state import files, restore, skip
+from catstream.run.state import files, position, restore, skip
 from catstream.video.frames import without_password
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
@@ -55,10 +55,13 @@ _LATE = 3.0  # a state that is older than so many intervals is a trouble
 _SKIPPED_SHARE = 0.1  # of the frames of a live source, from which its node counts as too slow
 _LOG_LINES = 1000
 _PORTS = range(21000, 32000)  # below those that the kernel gives to connections
-_SPARE_FRAMES = 10  # more than the rate says, so that no number of a live source is used twice
+_START_SECONDS = 2.0  # from the claim of a stream to its first frame: they count as lost, too
 #: What a pipeline reports if no frames are tracked, as the state of a stream.
 _HOLDING: dict[str, StreamState] = {"waiting": "waiting", "paused": "paused"}
 _TICKS = os.sysconf("SC_CLK_TCK")
+
+#: Why a stream has ended with a state, which is its last one: "" for a state that is not.
+_End = Literal["", "ended", "moved", "stopped"]
 
 _log = logging.getLogger(__name__)
 
@@ -152,6 +155,9 @@ class Stream:
         self._stop, self._lock = threading.Event(), threading.Lock()
         self._lines: deque[str] = deque(maxlen=_LOG_LINES)
         self._stored_at = 0.0  # seconds since 1970
+        self._began_at = 0.0  # the same, of the pipeline
+        self._planned = 0  # starts of the stream that followed no failure
+        self._end: _End = ""
         self._failure = self._store_trouble = self._pipeline_trouble = ""
         self._superseded = False
         self._seq = 0
@@ -178,8 +184,8 @@ class Stream:
                     synchronise(self._keys, clients)
             self._follow = self._follow if follow is None else tuple(follow)
             age = time.time() - self._stored_at if self._stored_at else 0.0
-            is_late = not self._store_trouble and age > _LATE * self._every and self._status.state == "running"
-            late = f"its state was stored {age:.0f} s ago" if is_late else ""
+            is_late = min(age, time.time() - self._began_at) > _LATE * self._every and not self._store_trouble
+            late = f"its state was stored {age:.0f} s ago" if is_late and self._status.state == "running" else ""
             troubles = (self._failure, self._store_trouble, late, self._rates.trouble, self._pipeline_trouble)
             status = replace(
                 self._status,
@@ -194,8 +200,14 @@ class Stream:
         """The last lines that the stream logged."""
         return list(self._lines)[-lines:]
 
-    def stop(self) -> None:
-        """End the pipeline, and store its last state; returns when that is done."""
+    def stop(self, end: _End = "stopped") -> None:
+        """End the pipeline, and store its last state; returns when that is done.
+
+        Parameters
+        ----------
+        end : why, for the one that continues it
+        """
+        self._end = end
         self._stop.set()
         self._thread.join()
         self._stack.close()
@@ -226,9 +238,7 @@ class Stream:
         _log.error("%s: %s", self._spec.name, why)
         with self._lock:
             self._failure, self._pipeline_trouble = why, ""
-            self._status = replace(
-                self._status, state="failed", endpoint="", rate=0.0, restarts=self._status.restarts + 1
-            )
+            self._status = replace(self._status, state="failed", endpoint="", rate=0.0)
 
     def _run_once(self) -> None:
         """Claim the stream, and run the pipeline from the state in the store, or from the start."""
@@ -237,17 +247,21 @@ class Stream:
         self._store_trouble = ""
         shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
         self._seq = 0
-        if claim.state is not None and claim.state.facts["ended"]:
-            if claim.state.facts["digest"] == self._spec.digest:
+        facts: Metadata = claim.state.facts if claim.state is not None else {}
+        self._planned = facts["planned"] + bool(facts["end"]) if facts else claim.removed + 1
+        with self._lock:
+            self._status = replace(self._status, restarts=claim.token - self._planned)
+        if facts and facts["end"] == "ended":
+            if facts["digest"] == self._spec.digest:
                 with self._lock:
-                    self._status = replace(self._status, state="ended", frame=int(claim.state.facts["frame"]))
+                    self._status = replace(self._status, state="ended", frame=int(facts["frame"]))
                 return
-            claim.state = None  # it was changed since: it begins again
+            claim.state, facts = None, {}  # it was changed since: it begins again
         with ExitStack() as stack:
             pipeline = stack.enter_context(self._made(claim))
-            facts = claim.state.facts if claim.state is not None else {}
             with self._lock:
                 self._failure = ""
+                self._began_at, self._stored_at = time.time(), float(facts.get("time", 0.0))
                 self._status = replace(
                     self._status,
                     state="starting",
@@ -279,7 +293,7 @@ class Stream:
     def _write_last(self, claim: Claim, *, ended: bool) -> None:
         """Store the last state. A stream has ended once that is done, so it is tried again until it is."""
         while not self._superseded:
-            self._write(claim, ended=ended)
+            self._write(claim, "ended" if ended else self._end)
             if not self._store_trouble:
                 with self._lock:
                     self._status = replace(self._status, state="ended" if ended else self._status.state)
@@ -302,21 +316,19 @@ class Stream:
             return Pipeline(self._spec.source, boxes, settings, state=state)
         restore(state, claim.state.files)
         pipeline = Pipeline(self._spec.source, settings=settings, resume=state)
-        if pipeline.live:
-            self._count_lost(pipeline, state, claim)
+        if pipeline.live and claim.state.facts["end"] != "stopped":
+            self._count_lost(pipeline, state, claim.state.facts)
         return pipeline
 
-    def _count_lost(self, pipeline: Pipeline, state: Path, claim: Claim) -> None:
-        """Count the frames of a live source since the last state as lost, so that no number is used twice."""
-        if claim.state is None:
+    def _count_lost(self, pipeline: Pipeline, state: Path, facts: Metadata) -> None:
+        """Count the frames of a live source since the last state as lost: their numbers are not used again."""
+        seconds = max(0.0, time.time() - facts["time"]) + _START_SECONDS
+        tracked = max(facts["seq"], position(state).seq)
+        lost = skip(state, pipeline.settings, tracked + math.ceil(seconds * max(pipeline.rate, facts["rate"])))
+        if facts["holds"]:
             return
-        facts = claim.state.facts
-        seconds = max(0.0, time.time() - float(facts["time"]))
-        newest = int(facts["seq"]) + math.ceil(seconds * max(pipeline.rate, float(facts["rate"]))) + _SPARE_FRAMES
-        stored = newest - skip(state, pipeline.settings, newest)
-        lost = max(0, int(facts["seq"]) - stored) + round(seconds * float(facts["rate"]))
-        facts["lost_frames"] = int(facts["lost_frames"]) + lost
-        facts["lost_seconds"] = float(facts["lost_seconds"]) + seconds
+        facts["lost_frames"] += lost
+        facts["lost_seconds"] += seconds
         _log.warning("%s: %d frames in %.1f s were lost", self._spec.name, lost, seconds)
 
     def _sockets(self) -> dict[str, object]:
@@ -389,7 +401,7 @@ class Stream:
             except CatstreamError as error:
                 _log.warning("%s does not search by a merged model: %s", self._spec.name, error)
 
-    def _write(self, claim: Claim, *, ended: bool = False) -> None:
+    def _write(self, claim: Claim, end: _End = "") -> None:
         """Store the newest checkpoint. A failed write is reported in the status; a superseded claim ends the stream."""
         status, seq = self._status, self._seq
         facts: Metadata = {
@@ -402,7 +414,9 @@ class Stream:
             "lost_seconds": status.lost_seconds,
             "objects": sorted(self._spec.boxes.keys() | self._spec.models.keys()),
             "digest": self._spec.digest,
-            "ended": ended,
+            "planned": self._planned,
+            "holds": status.state in _HOLDING.values(),  # so that it tracks no frame
+            "end": end,
         }
         trouble = ""
         try:

@@ -72,7 +72,9 @@ LARGEST_GIVEN_MODEL = 63 << 20
 LARGEST_GIVEN_MODELS = 200 << 20
 
 #: The state of a stream of a fleet: "waiting" is for a box, "unplaced" is without a node that fits.
-StreamState = Literal["starting", "running", "waiting", "paused", "moving", "unplaced", "failed", "ended"]
+StreamState = Literal[
+    "starting", "running", "waiting", "paused", "moving", "stopping", "unplaced", "failed", "ended"
+]
 
 NodeState = Literal["alive", "draining", "dead"]
 
@@ -540,7 +542,8 @@ class StreamStatus:
     """The state of one stream of a fleet: where it runs, and how it is.
 
     name            name of the stream, unique in its fleet
-    state           "waiting" for a box, "unplaced" if it fits on no node, "moving" between two nodes
+    state           "waiting" for a box, "unplaced" if it fits on no node, "moving" between two nodes, "stopping" if it
+                    is to run on none
     node            name of the node on which it runs, empty if it runs on none
     source          the video source without user and password
     endpoint        of its pipeline, in the format of the setting `run.endpoint`; empty if it does not run
@@ -554,7 +557,8 @@ class StreamStatus:
     cores           processor cores that it uses, as measured; 0 before the first measurement
     models          version of the newest model of each object that has one, by name
     restarts        how many times it was started again after a failure
-    lost_frames     frames of a live source that were lost because of failures and moves
+    lost_frames     frames of a live source from the last state in the store to the first frame after it, when the
+                    stream continued after failures and moves; their numbers are not used again
     lost_seconds    duration of these frames
     stored_seconds  seconds since its newest state in the store was written; None if there is none
     trouble         description of a problem, empty if there is none

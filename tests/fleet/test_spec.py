@@ -189,7 +189,7 @@ def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
     old, box = spec(a=["0"], b=["0"], c=["0"], d=["0"]), {"": Box(1, 2, 30, 40)}
     new = spec(b=["1"], c=["0"], d=["0"], e=["0", box])
     new.streams["d"] = replace(new.streams["d"], cores=2.0)
-    assert old.changes(new) == [
+    assert old.changes(new, are_running=True) == [
         "a: is removed",
         "b: starts again with its changes",
         "c: is unchanged",

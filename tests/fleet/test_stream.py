@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import defaultdict
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -15,8 +16,11 @@ from catstream.fleet.life import Order
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
 from catstream.fleet.stream import Place, Stream
+from catstream.run.state import position, skip
+from catstream.video.live_demo import first_box
 
 FRAMES = 60
+LIVE = "demo:1?rate=10"
 
 
 @pytest.fixture
@@ -53,7 +57,7 @@ def test_a_stream_runs_to_its_end_and_its_state_is_stored(spec, store, until):
     status = stream.report().status
     assert (status.node, status.frame, status.trouble) == ("n1", FRAMES - 1, "")
     state = Store(store).newest("cam-7")
-    assert (state.facts["ended"], state.facts["seq"]) == (True, FRAMES)
+    assert (state.facts["end"], state.facts["seq"]) == ("ended", FRAMES)
 
 
 def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
@@ -74,7 +78,7 @@ def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(s
         claim = Store(store).claim("cam-7", "another node")
         until(lambda: old.report().superseded)
     assert Store(store).newest("cam-7").token < claim.token
-    claim.write({"state": b"newer"}, {"ended": False})
+    claim.write({"state": b"newer"}, {"end": ""})
     assert Store(store).newest("cam-7").files == {"state": b"newer"}
 
 
@@ -161,7 +165,7 @@ def test_a_stream_has_ended_only_once_its_last_state_is_stored(spec, store, unti
     written, write = [], Claim.write
 
     def fails_at_first(claim, files, facts):
-        if facts["ended"]:
+        if facts["end"]:
             written.append(stream.report().status.state)
         if len(written) == 1:
             raise StoreError("the store cannot be reached")
@@ -171,4 +175,57 @@ def test_a_stream_has_ended_only_once_its_last_state_is_stored(spec, store, unti
     with started(spec, store) as stream:
         until(lambda: stream.report().status.state == "ended")
     assert written == ["running", "running"]
-    assert Store(store).newest("cam-7").facts["ended"]
+    assert Store(store).newest("cam-7").facts["end"] == "ended"
+
+
+@pytest.fixture
+def live_spec():
+    return StreamSpec("gate", LIVE, {"": first_box(LIVE)})
+
+
+@pytest.fixture
+def numbers(monkeypatch):
+    """The numbers of the frames that each stream has tracked, by its node."""
+    found, take = defaultdict(list), Stream._take
+
+    def took(stream, pipeline, tracks):
+        take(stream, pipeline, tracks)
+        found[stream._place.node] += [track.seq for track in tracks.values()]
+
+    monkeypatch.setattr(Stream, "_take", took)
+    return found
+
+
+def test_after_a_death_the_lost_frames_are_those_after_the_last_state_and_it_counts_as_a_restart(
+    live_spec, store, until, numbers, monkeypatch
+):
+    continued = []
+    monkeypatch.setattr(
+        module, "skip", lambda state, *given: continued.append(position(state).seq) or skip(state, *given)
+    )
+    with started(live_spec, store, every=0.5) as first:
+        until(lambda: (found := Store(store).newest("gate")) is not None and found.facts["seq"] > 5)
+        with started(live_spec, store, "n2", every=60.0) as second:  # as if the first node had died
+            until(lambda: first.report().superseded)
+            until(lambda: numbers["n2"])
+            later = second.report().status
+    assert later.stored_seconds is not None, "that of the state that it continued from"
+    assert (first.report().status.restarts, later.restarts) == (0, 1)
+    (stored,) = continued
+    assert numbers["n2"][0] == stored + later.lost_frames + 1, "no other number is left out"
+    assert not set(numbers["n1"]) & set(numbers["n2"])
+
+
+@pytest.mark.parametrize(("end", "is_lost"), [("moved", True), ("stopped", False)])
+def test_a_move_loses_frames_and_the_time_in_which_the_fleet_is_down_does_not(
+    live_spec, store, until, numbers, end, is_lost
+):
+    stream = Stream(live_spec, Order(live_spec.digest, 1.0, {}), Place("n1"), store, 60.0)
+    until(lambda: len(numbers["n1"]) > 5)
+    stream.stop(end)
+    with started(live_spec, store, "n2") as second:
+        until(lambda: numbers["n2"])
+        status = second.report().status
+    assert (status.lost_frames > 0, status.lost_seconds > 0) == (is_lost, is_lost)
+    assert status.restarts == 0
+    assert numbers["n2"][0] == numbers["n1"][-1] + status.lost_frames + 1
