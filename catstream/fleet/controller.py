@@ -31,7 +31,7 @@ from catstream.fleet.stream import Place, Report, Stream, given_model
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
 from catstream.services.start_server import share_start_server, start_server
 from catstream.video.frames import without_password
-from catstream.wire.keys import Client, allowed, create
+from catstream.wire.keys import Client, allowed, ensure
 
 __all__ = ["Controller"]
 
@@ -41,6 +41,7 @@ Models = dict[tuple[str, str], bytes]
 _TURN_SECONDS = 0.5  # between two looks at the actors
 _QUESTION_SECONDS = 0.1  # between two looks at the questions of the registry
 _CLIENTS_SECONDS = 5.0  # between two looks at the keys of the clients
+_QUIET_SECONDS = 5.0  # after which it is a trouble that a stream does not answer
 _ANSWER_SECONDS = 10.0  # limit for a stream to answer a call that a person waits for
 
 _log = logging.getLogger(__name__)
@@ -215,7 +216,7 @@ class Controller:
 
         if self._registry is None:
             if self._keys is not None:
-                create(self._keys)
+                ensure(self._keys)
             self._registry = RegistryServer(self._listen, str(self._keys or ""), lambda: self._recent)
         if (stored := self._store.get_fleet()) is not None:
             self._desired = from_json(stored, Desired)
@@ -381,7 +382,9 @@ class Controller:
         last = known.report.status if known.report is not None else StreamStatus(name, "starting", source=source)
         last = replace(last, node=self._node_name(known.seen.node))
         if known.seen.state == "working":
-            return last
+            quiet = time.monotonic() - known.seen.answered
+            trouble = f"it has not answered for {quiet:.0f} s" if quiet > _QUIET_SECONDS else last.trouble
+            return replace(last, trouble=trouble)
         last = replace(last, endpoint="", server="", rate=0.0, trouble="")
         if known.ended == self._desired.spec.streams[name].digest:
             return replace(last, state="ended", node="")

@@ -43,7 +43,7 @@ from catstream.run.state import files, position, restore, skip
 from catstream.video.frames import without_password
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
-from catstream.wire.keys import Client, create, public_key, synchronise
+from catstream.wire.keys import Client, ensure, public_key, synchronise
 
 __all__ = ["Place", "Report", "Stream", "given_model"]
 
@@ -336,7 +336,7 @@ class Stream:
         if not self._place.address:
             return {"run.endpoint": "", "run.keys": ""}
         with self._lock:
-            create(self._keys)
+            ensure(self._keys)
             synchronise(self._keys, self._place.clients)
         endpoint = f"tcp://{self._place.address}:{_free_port(self._place.address)}"
         return {"run.endpoint": endpoint, "run.keys": str(self._keys)}

@@ -72,9 +72,7 @@ LARGEST_GIVEN_MODEL = 63 << 20
 LARGEST_GIVEN_MODELS = 200 << 20
 
 #: The state of a stream of a fleet: "waiting" is for a box, "unplaced" is without a node that fits.
-StreamState = Literal[
-    "starting", "running", "waiting", "paused", "moving", "stopping", "unplaced", "failed", "ended"
-]
+StreamState = Literal["starting", "running", "waiting", "paused", "moving", "stopping", "unplaced", "failed", "ended"]
 
 NodeState = Literal["alive", "draining", "dead"]
 

@@ -28,7 +28,19 @@ from catstream.errors import ServiceError
 from catstream.messages.storage import create_atomically, write_atomically
 from catstream.wire.channels import Role
 
-__all__ = ["ROLES", "Client", "Keys", "allow", "allowed", "clients", "create", "public_key", "revoke", "synchronise"]
+__all__ = [
+    "ROLES",
+    "Client",
+    "Keys",
+    "allow",
+    "allowed",
+    "clients",
+    "create",
+    "ensure",
+    "public_key",
+    "revoke",
+    "synchronise",
+]
 
 #: The permissions of a client: each role includes those before it.
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -123,6 +135,12 @@ def create(folder: Path) -> None:
     _write(folder / _SERVER, public=server[0], secret=server[1])
     _write(folder / _SERVER_PUBLIC, public=server[0])
     _write(folder / _CLIENTS / _OWN, role=b"pipeline", public=_pair(folder))
+
+
+def ensure(folder: Path) -> None:
+    """Make the keys of a pipeline as `create`, unless the folder holds them already."""
+    if not (folder / _CLIENTS / _OWN).exists():  # which is made last
+        create(folder)
 
 
 def allow(folder: Path, name: str, role: Role, output: Path | None = None, public: str | None = None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 import types
 from dataclasses import replace
 from importlib.machinery import ModuleSpec
@@ -19,8 +20,9 @@ from catstream.fleet.desired import Desired
 from catstream.fleet.life import Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
 from catstream.fleet.store import Store
-from catstream.fleet.stream import Report
+from catstream.fleet.stream import Report, _free_port
 from catstream.messages.kinds import StreamStatus
+from catstream.wire.keys import allow
 
 GATE, ROOF = StreamSpec("gate", "demo:1"), StreamSpec("roof", "demo:2", cores=0.5)
 SEARCHED = {"anna": "a"}
@@ -188,6 +190,23 @@ def test_a_controller_that_starts_again_touches_no_stream_that_runs(site, ray, m
     assert (ray.actors, ray.started) == (actors, ["gate", "roof"])
     assert again.change("applied", spec, "", replace_other=False) == ["gate: is unchanged", "roof: is unchanged"]
     assert states(again) == {"gate": "running", "roof": "running"}
+
+
+def test_a_controller_that_starts_again_keeps_the_keys_of_the_clients(ray, spec, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "is_local", lambda: False)
+    free_port = _free_port("127.0.0.1")
+    for has_restarted in (False, True):
+        ray.has_restarted = has_restarted
+        site = Controller("site", spec.store, f"tcp://127.0.0.1:{free_port}", str(tmp_path / "keys"))
+        try:
+            site.ready()
+            site.change("applied", spec, "", replace_other=False)
+            if not has_restarted:
+                allow(tmp_path / "keys", "desk", "watch", output=tmp_path / "desk")
+            with Registry(f"127.0.0.1:{free_port}", keys=str(tmp_path / "desk")) as registry:
+                assert sorted(registry.streams().streams) == ["gate", "roof"]
+        finally:
+            site.end()
 
 
 def test_each_node_gets_its_start_server_once_before_there_is_a_stream_for_it(site, ray):
@@ -364,6 +383,19 @@ def test_what_a_stream_waits_for_is_said(site, ray):
     waiting = site.status().streams["gate"]
     assert waiting.state == "unplaced"
     assert waiting.trouble == "it waits for 1 free cores: no node that it may run on has more than 0.5"
+
+
+def test_a_stream_that_does_not_answer_is_said_long_before_it_is_started_again(site, ray, monkeypatch):
+    running(site, ray, "gate")
+    assert site.status().streams["gate"].trouble == ""
+    ray.actors["site/stream/gate"].status = None  # its machine is cut off
+    site._turn()
+    later = time.monotonic() + 50
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    site._turn()
+    gate = site.status().streams["gate"]
+    assert (gate.state, gate.node) == ("running", "n1")
+    assert gate.trouble in ("it has not answered for 50 s", "it has not answered for 51 s")
 
 
 def test_followed_objects_and_clients_reach_a_stream_with_each_question(site, ray):

@@ -43,8 +43,8 @@ def long_spec(demo_video):
 
 
 @contextmanager
-def started(spec, store, node="n1", every=0.2):
-    stream = Stream(spec, Order(spec.digest, 1.0, {}), Place(node), store, every)
+def started(spec, store, node="n1", every=0.2, address=""):
+    stream = Stream(spec, Order(spec.digest, 1.0, {}), Place(node, address), store, every)
     try:
         yield stream
     finally:
@@ -97,10 +97,11 @@ def test_a_stream_that_has_ended_and_was_changed_begins_anew(spec, store, until)
     assert stream.report().status.began > 0
 
 
-def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, until, tmp_path, monkeypatch):
+@pytest.mark.parametrize("address", ["", "127.0.0.1"], ids=["one machine", "with keys"])
+def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, until, tmp_path, monkeypatch, address):
     monkeypatch.setattr(module, "_FIRST_PAUSE", 0.1)
     path = tmp_path / "late.mp4"
-    with started(replace(spec, source=str(path)), store) as stream:
+    with started(replace(spec, source=str(path)), store, address=address) as stream:
         until(lambda: stream.report().status.state == "failed")
         assert "late.mp4" in stream.report().status.trouble
         assert any("late.mp4" in line for line in stream.logs(10)), "the log stays"
@@ -228,4 +229,5 @@ def test_a_move_loses_frames_and_the_time_in_which_the_fleet_is_down_does_not(
         status = second.report().status
     assert (status.lost_frames > 0, status.lost_seconds > 0) == (is_lost, is_lost)
     assert status.restarts == 0
-    assert numbers["n2"][0] == numbers["n1"][-1] + status.lost_frames + 1
+    left_out = numbers["n2"][0] - numbers["n1"][-1] - 1
+    assert 0 <= left_out - status.lost_frames <= 5, "only those that the pipeline tracked while it ended"
