@@ -22,6 +22,7 @@ from catstream.cli.output import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
 from catstream.errors import FleetError, ServiceError, SilenceError
+from catstream.fleet.timing import SHOW_SECONDS, UP_SECONDS
 from catstream.messages import storage
 from catstream.messages.kinds import FleetStatus
 from catstream.messages.names import UNNAMED, split_name
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 __all__ = ["fleet"]
 
 _STARTED = ("running", "waiting", "paused", "ended", "failed", "unplaced")
-_UP_SECONDS = 120.0  # limit for the streams to start
-_LOOK_SECONDS = 0.5
 
 
 class _InOrder(click.Group):
@@ -134,13 +133,13 @@ def _up(fleet: Fleet, **options: Any) -> list[str]:
 
 def _watch(console: Console, fleet: Fleet) -> None:
     """Show the streams until all have started."""
-    deadline = time.monotonic() + _UP_SECONDS
+    deadline = time.monotonic() + UP_SECONDS
     status = fleet.status()
     try:
         with Live(console=console, transient=True) as live:
             while not all(each.state in _STARTED for each in status.streams.values()) and time.monotonic() < deadline:
                 live.update(Group(*_tables(status)))
-                time.sleep(_LOOK_SECONDS)
+                time.sleep(SHOW_SECONDS)
                 status = fleet.status()
     finally:
         if not fleet.is_owner:
@@ -155,13 +154,13 @@ def _watch_until_its_end(console: Console, fleet: Fleet) -> None:
     fleet.disconnect()
     status = FleetStatus(fleet.name, 0.0)
     try:
-        with Registry(fleet.name, timeout=_UP_SECONDS) as registry, Live(console=console, transient=True) as live:
-            registry.timeout = _LOOK_SECONDS
+        with Registry(fleet.name, timeout=UP_SECONDS) as registry, Live(console=console, transient=True) as live:
+            registry.timeout = SHOW_SECONDS
             while fleet.is_running:
                 with suppress(SilenceError):  # Ray starts the controller again
                     status = registry.streams()
                 live.update(Group(*_tables(status)))
-                time.sleep(_LOOK_SECONDS)
+                time.sleep(SHOW_SECONDS)
     finally:
         _show(console, status)
     click.echo(f"the fleet {fleet.name} was ended from elsewhere")

@@ -15,13 +15,12 @@ from collections.abc import Mapping
 
 from catstream.errors import FleetError, require_extra
 from catstream.fleet.life import Node
+from catstream.fleet.timing import REACH_SECONDS
 
 __all__ = ["NAMESPACE", "actor_name", "actors", "connect", "disconnect", "fleets", "is_local", "nodes"]
 
 #: Namespace of the named actors of all fleets.
 NAMESPACE = "catstream"
-
-_REACH_SECONDS = 3.0
 
 
 def connect(address: str, variables: Mapping[str, str] | None = None) -> None:
@@ -47,7 +46,7 @@ def connect(address: str, variables: Mapping[str, str] | None = None) -> None:
     os.environ.update(changed)
     host, _, port = address.rpartition(":")
     try:
-        socket.create_connection((host, int(port)), _REACH_SECONDS).close()
+        socket.create_connection((host, int(port)), REACH_SECONDS).close()
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or "no answer"
         raise FleetError(

@@ -28,6 +28,7 @@ from catstream.fleet.life import NODE_ID, Node, Order, Seen, Step, Wanted
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.fleet.stream import Place, Report, Stream, given_model
+from catstream.fleet.timing import CLIENTS_SECONDS, LOGS_SECONDS, QUESTION_SECONDS, QUIET_SECONDS, TURN_SECONDS
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
 from catstream.services.start_server import share_start_server, start_server
 from catstream.video.frames import without_password
@@ -37,12 +38,6 @@ __all__ = ["Controller"]
 
 #: Contents of saved models, by stream and object.
 Models = dict[tuple[str, str], bytes]
-
-_TURN_SECONDS = 0.5  # between two looks at the actors
-_QUESTION_SECONDS = 0.1  # between two looks at the questions of the registry
-_CLIENTS_SECONDS = 5.0  # between two looks at the keys of the clients
-_QUIET_SECONDS = 5.0  # after which it is a trouble that a stream does not answer
-_ANSWER_SECONDS = 10.0  # limit for a stream to answer a call that a person waits for
 
 _log = logging.getLogger(__name__)
 
@@ -192,7 +187,7 @@ class Controller:
             raise FleetError(f"{name} runs on no node now, so its log cannot be read: see catstream fleet status")
         import ray
 
-        logged: list[str] = ray.get(known.handle.logs.remote(lines), timeout=_ANSWER_SECONDS)
+        logged: list[str] = ray.get(known.handle.logs.remote(lines), timeout=LOGS_SECONDS)
         return logged
 
     def close(self) -> int:
@@ -233,11 +228,11 @@ class Controller:
     def _serve(self) -> None:
         """Answer the registry, without the store."""
         while self._registry is not None and not self._over.is_set():
-            self._registry.turn(_QUESTION_SECONDS)
+            self._registry.turn(QUESTION_SECONDS)
 
     def _run(self) -> None:
         logged = ""
-        while not self._over.wait(_TURN_SECONDS):
+        while not self._over.wait(TURN_SECONDS):
             try:
                 if self._trouble is None:
                     self._turn()
@@ -254,7 +249,7 @@ class Controller:
         with self._lock:
             self._nodes = self._desired.with_draining(found)
             if self._keys is not None and time.monotonic() >= self._clients_due:
-                self._clients_due = time.monotonic() + _CLIENTS_SECONDS
+                self._clients_due = time.monotonic() + CLIENTS_SECONDS
                 self._clients = allowed(self._keys)  # the next reports tell the streams
             self._warm_nodes()
             for name in existing | self._desired.spec.streams.keys():
@@ -383,7 +378,7 @@ class Controller:
         last = replace(last, node=self._node_name(known.seen.node))
         if known.seen.state == "working":
             quiet = time.monotonic() - known.seen.answered
-            trouble = f"it has not answered for {quiet:.0f} s" if quiet > _QUIET_SECONDS else last.trouble
+            trouble = f"it has not answered for {quiet:.0f} s" if quiet > QUIET_SECONDS else last.trouble
             return replace(last, trouble=trouble)
         last = replace(last, endpoint="", server="", rate=0.0, trouble="")
         if known.ended == self._desired.spec.streams[name].digest:

@@ -34,16 +34,13 @@ from catstream.fleet.local import LocalCluster
 from catstream.fleet.merge import Merged, merge_streams
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
+from catstream.fleet.timing import ANSWER_SECONDS, DOWN_SECONDS, ENDED_SECONDS
 from catstream.messages.kinds import FleetStatus
 from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import lock
 from catstream.run.learned import Learned
 
 __all__ = ["Fleet"]
-
-_ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
-_DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
-_TURN_SECONDS = 0.2
 
 
 class Fleet:
@@ -205,9 +202,9 @@ class Fleet:
         if self._local is not None and not self._local.running:
             raise FleetError(f"no fleet {self.name!r} of yours runs on this machine: see catstream fleet status")
         self.is_owner = False
-        deadline = time.monotonic() + _DOWN_SECONDS
+        deadline = time.monotonic() + DOWN_SECONDS
         while self._ask("close") and time.monotonic() < deadline:
-            time.sleep(_TURN_SECONDS)
+            time.sleep(ENDED_SECONDS)
         self._ask("end")
         self._kill_controller()
         self.disconnect()
@@ -345,7 +342,7 @@ class Fleet:
                     f"there is no fleet {self.name!r} on this cluster: start it with catstream fleet up"
                 ) from None
         try:
-            return ray.get(getattr(self._controller, method).remote(*arguments, **options), timeout=_ANSWER_SECONDS)
+            return ray.get(getattr(self._controller, method).remote(*arguments, **options), timeout=ANSWER_SECONDS)
         except RayTaskError as error:
             if isinstance(error.cause, CatstreamError):
                 raise error.cause from None

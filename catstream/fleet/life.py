@@ -10,11 +10,11 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
+from catstream.fleet.timing import ADOPTED_SECONDS, PAUSE_SECONDS, SILENT_SECONDS, STOPPING_SECONDS
+
 __all__ = [
     "EVENTS",
     "NODE_ID",
-    "PAUSE_SECONDS",
-    "SILENT_SECONDS",
     "STATES",
     "TABLE",
     "Action",
@@ -71,10 +71,8 @@ TABLE: dict[tuple[State, Event], tuple[State, Action]] = {
     ("stopping", "gone"): ("absent", ""),
 }
 
-#: Seconds after which an actor in a state counts as silent: a busy machine may be slow to answer.
-SILENT_SECONDS: dict[State, float] = {"working": 120.0, "stopping": 30.0}
-PAUSE_SECONDS = 5.0  # between two starts of one actor, at least: one may die each time, or be superseded
-_ADOPTED_SECONDS = 30.0  # within which an actor that an earlier controller started says what it was started for
+#: Seconds after which an actor in a state counts as silent.
+_SILENT: dict[State, float] = {"working": SILENT_SECONDS, "stopping": STOPPING_SECONDS}
 
 #: Label that Ray gives to each node: its id.
 NODE_ID = "ray.io/node-id"
@@ -217,7 +215,7 @@ def event(wanted: Wanted | None, seen: Seen, nodes: Collection[Node], now: float
     if seen.happened == "gone":
         return "gone"
     last = seen.since if seen.state == "stopping" else seen.answered
-    is_silent = now - last > SILENT_SECONDS.get(seen.state, float("inf"))
+    is_silent = now - last > _SILENT.get(seen.state, float("inf"))
     if seen.state != "stopping" and (wanted is None or not _is_as_wanted(wanted, seen, nodes, now)):
         return "unwanted"
     return seen.happened or ("silent" if is_silent else None)
@@ -226,7 +224,7 @@ def event(wanted: Wanted | None, seen: Seen, nodes: Collection[Node], now: float
 def _is_as_wanted(wanted: Wanted, seen: Seen, nodes: Collection[Node], now: float) -> bool:
     """Whether an actor was started for what is wanted, and is, or will be placed, where it may be."""
     if seen.order is None:
-        return now - seen.since < _ADOPTED_SECONDS
+        return now - seen.since < ADOPTED_SECONDS
     order = wanted.order(nodes)
     if (seen.order.digest, seen.order.cores) != (order.digest, order.cores):
         return False

@@ -20,16 +20,22 @@ from pathlib import Path
 from typing import Any
 
 from catstream.errors import FleetError
+from catstream.fleet.timing import (
+    CLUSTER_END_SECONDS,
+    CLUSTER_LOOK_SECONDS,
+    CLUSTER_START_SECONDS,
+    HEALTH_ANSWER_SECONDS,
+    HEALTH_DELAY_SECONDS,
+    HEALTH_FAILURES,
+    HEALTH_SECONDS,
+    NODES_SECONDS,
+)
 from catstream.messages.storage import is_locked, lock, write_atomically
 from catstream.services import start
 from catstream.wire.endpoint import private_folder
 
 __all__ = ["LocalCluster", "main"]
 
-_START_SECONDS = 150.0  # on a machine that is busy
-_END_SECONDS = 30.0
-_LOOK_SECONDS = 0.5  # between two looks at the nodes
-_TURN_SECONDS = 0.05
 _HEAD_DIED = 3  # exit code
 _STORE_BYTES = 80 << 20  # of Ray's object store: only models and states that are merged go through it
 
@@ -73,8 +79,13 @@ class LocalCluster:
         loopback = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_USAGE_STATS_ENABLED": "0"}
         quiet = {"RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
         # A dead node is noticed after two seconds, one that hangs after six.
-        health = {"RAY_health_check_initial_delay_ms": "1000", "RAY_health_check_period_ms": "500"}
-        health |= {"RAY_health_check_timeout_ms": "1500", "RAY_health_check_failure_threshold": "3"}
+        limits = {
+            "initial_delay": HEALTH_DELAY_SECONDS,
+            "period": HEALTH_SECONDS,
+            "timeout": HEALTH_ANSWER_SECONDS,
+        }
+        health = {f"RAY_health_check_{name}_ms": f"{1000 * seconds:.0f}" for name, seconds in limits.items()}
+        health["RAY_health_check_failure_threshold"] = str(HEALTH_FAILURES)
         # A worker of Ray has a lower priority by default: other programs would starve the streams.
         workers = {"RAY_worker_niceness": "0", "RAY_OBJECT_STORE_ALLOW_SLOW_STORAGE": "1"}
         return token | loopback | quiet | health | workers
@@ -114,7 +125,7 @@ class LocalCluster:
                 start_new_session=True,
             )
         self._process = process  # with the pipe
-        deadline = time.monotonic() + _START_SECONDS
+        deadline = time.monotonic() + CLUSTER_START_SECONDS
         try:
             while not self.address:
                 if process.poll() is not None or time.monotonic() > deadline:
@@ -123,20 +134,20 @@ class LocalCluster:
                         f"Ray does not start on this machine: {lines[-1] if lines else 'it printed nothing'}\n"
                         f"See {self.folder / 'log'}"
                     )
-                time.sleep(_TURN_SECONDS)
+                time.sleep(CLUSTER_LOOK_SECONDS)
         except BaseException:
             self.stop()
             raise
 
     def stop(self) -> None:
         """End the cluster, and wait until it has ended."""
-        deadline = time.monotonic() + _END_SECONDS
+        deadline = time.monotonic() + CLUSTER_END_SECONDS
         while self.running:
             with suppress(OSError, ValueError):
                 pid = int((self.folder / "pid").read_text())
                 os.kill(pid, signal.SIGTERM if time.monotonic() < deadline else signal.SIGKILL)
                 os.kill(pid, signal.SIGCONT)
-            time.sleep(_TURN_SECONDS)
+            time.sleep(CLUSTER_LOOK_SECONDS)
         if self._process is not None:
             self._process.communicate()  # closes the pipe
             self._process = None
@@ -182,7 +193,7 @@ def _keep(folder: Path, count: int, cores: int, ends: threading.Event) -> None:
     try:
         nodes = {number: cluster.add_node(**options(number)) for number in range(2, count + 1)}
         write_atomically(folder / "address", cluster.address.encode(), 0o600)
-        while not ends.wait(_LOOK_SECONDS) and not _has_died(cluster.head_node):
+        while not ends.wait(NODES_SECONDS) and not _has_died(cluster.head_node):
             for number, node in nodes.items():
                 if _has_died(node):
                     print(f"node-{number} has died, and is started again", flush=True)

@@ -17,14 +17,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from catstream.errors import FleetError, StoreError, require_extra
+from catstream.fleet.timing import ABANDONED_SECONDS, CONNECT_SECONDS, READ_SECONDS, STORE_SECONDS
 from catstream.messages import storage
 
 __all__ = ["Objects"]
 
-_SECONDS = 10  # limit of a whole call
-_CONNECT_SECONDS = 3
-_READ_SECONDS = 5  # without any byte from the server
-_ABANDONED_SECONDS = 600  # after which nothing writes a part of a file any more
 _PROBE = "created-exclusively"
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _CODE = re.compile(r"\w{1,64}")
@@ -49,7 +46,7 @@ class Objects:
         self._url = self._root if self._local else f"s3://{self._root}"
         self._fs = _local() if self._local else _s3()
         #: Argument of each call of fsspec: it limits calls over a network, which run in a thread of fsspec.
-        self._limit: dict[str, Any] = {} if self._local else {"timeout": _SECONDS}
+        self._limit: dict[str, Any] = {} if self._local else {"timeout": STORE_SECONDS}
         self._checked = False
 
     def __repr__(self) -> str:
@@ -92,7 +89,7 @@ class Objects:
         if self._local:
             with self._path(folder, "tidied") as path:
                 for each in {found.parent for found in Path(path).rglob(".*.part")}:
-                    storage.remove_parts(each, _ABANDONED_SECONDS)
+                    storage.remove_parts(each, ABANDONED_SECONDS)
 
     def _check(self) -> None:
         """Raise StoreError if the store is not there, or does not create objects exclusively."""
@@ -168,7 +165,7 @@ def _s3() -> Any:
 
     for library in ("botocore", "aiobotocore"):  # at the level DEBUG they log session tokens
         logging.getLogger(library).setLevel(logging.INFO)
-    limits = {"connect_timeout": _CONNECT_SECONDS, "read_timeout": _READ_SECONDS, "retries": {"total_max_attempts": 1}}
+    limits = {"connect_timeout": CONNECT_SECONDS, "read_timeout": READ_SECONDS, "retries": {"total_max_attempts": 1}}
     fs = fsspec.filesystem("s3", skip_instance_cache=True, use_listings_cache=False, config_kwargs=limits)
     fs.retries = 1
     return fs
@@ -188,7 +185,7 @@ def _trouble(error: Exception, code: str) -> str:
     if code:
         return f"the server answered {code}: check the bucket and its permissions"
     if isinstance(error, TimeoutError):
-        return f"no answer within {_SECONDS} s: check the network and the server"
+        return f"no answer within {STORE_SECONDS:g} s: check the network and the server"
     number = error.errno if isinstance(error, OSError) else None
     if number in _FULL:
         return f"{os.strerror(number)}: free some space there"

@@ -35,6 +35,14 @@ from catstream.errors import (
 from catstream.fleet.life import Order
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Generation, Store
+from catstream.fleet.timing import (
+    BEGIN_SECONDS,
+    FIRST_PAUSE_SECONDS,
+    FORGOTTEN_SECONDS,
+    LONGEST_PAUSE_SECONDS,
+    RATE_SECONDS,
+    TRACKS_SECONDS,
+)
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
@@ -47,15 +55,10 @@ from catstream.wire.keys import Client, ensure, public_key, synchronise
 
 __all__ = ["Place", "Report", "Stream", "given_model"]
 
-_TURN_SECONDS = 0.1
-_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 60.0  # before a stream that failed starts again, in seconds; doubled each time
-_FORGOTTEN_SECONDS = 60.0  # of running, after which earlier failures do not count
-_RATE_SECONDS = 5.0  # interval of the rates
 _LATE = 3.0  # a state that is older than so many intervals is a trouble
 _SKIPPED_SHARE = 0.1  # of the frames of a live source, from which its node counts as too slow
 _LOG_LINES = 1000
 _PORTS = range(21000, 32000)  # below those that the kernel gives to connections
-_START_SECONDS = 2.0  # from the claim of a stream to its first frame: they count as lost, too
 #: What a pipeline reports if no frames are tracked, as the state of a stream.
 _HOLDING: dict[str, StreamState] = {"waiting": "waiting", "paused": "paused"}
 _TICKS = os.sysconf("SC_CLK_TCK")
@@ -113,7 +116,7 @@ class _Rates:
     def update(self, processor: Callable[[], float], skipped: int) -> None:
         """Compute the rates if the interval is over."""
         passed = time.monotonic() - self.since
-        if passed < _RATE_SECONDS:
+        if passed < RATE_SECONDS:
             return
         used, missed = processor(), max(0, skipped - self.skipped)
         self.rate = self.frames / passed
@@ -216,7 +219,7 @@ class Stream:
         """Run the pipeline, again after each failure, until the stream ends, is stopped, or is superseded."""
         handler = _Lines(self._lines)
         logging.getLogger("catstream").addHandler(handler)
-        pause = _FIRST_PAUSE
+        pause = FIRST_PAUSE_SECONDS
         try:
             while not self._stop.is_set():
                 began = time.monotonic()
@@ -228,9 +231,9 @@ class Stream:
                     if not isinstance(error, CatstreamError):
                         _log.exception("The stream %s failed.", self._spec.name)
                     self._fail(str(error) if isinstance(error, CatstreamError) else f"{type(error).__name__}: {error}")
-                pause = _FIRST_PAUSE if time.monotonic() - began > _FORGOTTEN_SECONDS else pause
+                pause = FIRST_PAUSE_SECONDS if time.monotonic() - began > FORGOTTEN_SECONDS else pause
                 self._stop.wait(pause)
-                pause = min(2 * pause, _LONGEST_PAUSE)
+                pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
         finally:
             logging.getLogger("catstream").removeHandler(handler)
 
@@ -284,7 +287,7 @@ class Stream:
 
     def _take_all(self, pipeline: Pipeline) -> bool:
         """Take the tracks until the source ends, or the stream is to stop; returns whether the source has ended."""
-        for tracks in pipeline.by_frame(_TURN_SECONDS):
+        for tracks in pipeline.by_frame(TRACKS_SECONDS):
             self._take(pipeline, tracks)
             if self._stop.is_set():
                 return False
@@ -322,7 +325,7 @@ class Stream:
 
     def _count_lost(self, pipeline: Pipeline, state: Path, facts: Metadata) -> None:
         """Count the frames of a live source since the last state as lost: their numbers are not used again."""
-        seconds = max(0.0, time.time() - facts["time"]) + _START_SECONDS
+        seconds = max(0.0, time.time() - facts["time"]) + BEGIN_SECONDS
         tracked = max(facts["seq"], position(state).seq)
         lost = skip(state, pipeline.settings, tracked + math.ceil(seconds * max(pipeline.rate, facts["rate"])))
         if facts["holds"]:

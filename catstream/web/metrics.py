@@ -119,7 +119,7 @@ def _of_streams(status: FleetStatus) -> Iterator[_Row]:
         (_COUNTER, "frames_skipped", lambda one: one.skipped, "Frames of a live source that were skipped."),
         (_COUNTER, "restarts", lambda one: one.restarts, "Times that a stream was started again after a failure."),
         (_COUNTER, "frames_lost", lambda one: one.lost_frames,
-         "Frames of a live source lost because of failures and moves."),
+         "Frames of a live source from the last state in the store to the first one after a failure or a move."),
         (_COUNTER, "lost_seconds", lambda one: one.lost_seconds, "Duration of the lost frames."),
         (_GAUGE, "up", lambda one: one.state in RUNNING, "Whether the pipeline of the stream runs."),
         (_GAUGE, "frame", lambda one: one.frame, "Number of the newest frame that was tracked."),

@@ -9,7 +9,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from catstream.fleet import life
+from catstream.fleet import life, timing
 from catstream.fleet.desired import objection, shortage
 from catstream.fleet.life import TABLE, Node, Order, Seen, Step, Wanted, diff, event
 
@@ -114,10 +114,10 @@ def test_a_stream_whose_node_died_is_left_to_ray_and_stays_elsewhere_if_the_node
 def test_one_that_hangs_is_started_again_and_one_that_does_not_stop_is_killed():
     wanted = Wanted("a1")
     running = Seen("working", order=wanted.order([]), answered=10.0)
-    assert event(wanted, running, [], 10.0 + life.SILENT_SECONDS["working"]) is None
-    assert event(wanted, running, [], 11.0 + life.SILENT_SECONDS["working"]) == "silent"
+    assert event(wanted, running, [], 10.0 + timing.SILENT_SECONDS) is None
+    assert event(wanted, running, [], 11.0 + timing.SILENT_SECONDS) == "silent"
     stopping = replace(running, state="stopping", since=10.0)
-    assert event(wanted, stopping, [], 11.0 + life.SILENT_SECONDS["stopping"]) == "silent"
+    assert event(wanted, stopping, [], 11.0 + timing.STOPPING_SECONDS) == "silent"
     assert event(wanted, replace(running, state="pending"), [], 1e6) is None, "Ray waits for a node"
 
 
@@ -129,8 +129,8 @@ def test_one_that_an_earlier_controller_started_may_say_for_what():
 
 def test_one_that_is_gone_at_once_is_started_again_after_a_pause():
     wanted = Wanted("a1")
-    assert event(wanted, Seen("absent", since=10.0), [], 10.0 + life.PAUSE_SECONDS / 2) is None
-    assert event(wanted, Seen("absent", since=10.0), [], 10.0 + life.PAUSE_SECONDS) == "wanted"
+    assert event(wanted, Seen("absent", since=10.0), [], 10.0 + timing.PAUSE_SECONDS / 2) is None
+    assert event(wanted, Seen("absent", since=10.0), [], 10.0 + timing.PAUSE_SECONDS) == "wanted"
 
 
 @given(st.dictionaries(IDS, WANTED), st.dictionaries(IDS, seen()), NODES)

@@ -99,7 +99,7 @@ def test_a_stream_that_has_ended_and_was_changed_begins_anew(spec, store, until)
 
 @pytest.mark.parametrize("address", ["", "127.0.0.1"], ids=["one machine", "with keys"])
 def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, until, tmp_path, monkeypatch, address):
-    monkeypatch.setattr(module, "_FIRST_PAUSE", 0.1)
+    monkeypatch.setattr(module, "FIRST_PAUSE_SECONDS", 0.1)
     path = tmp_path / "late.mp4"
     with started(replace(spec, source=str(path)), store, address=address) as stream:
         until(lambda: stream.report().status.state == "failed")

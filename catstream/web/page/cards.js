@@ -3,8 +3,8 @@
 import { add, duration, Items, many, write } from "./dom.js";
 import { Pictures } from "./pictures.js";
 
-const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping", failed: "absent",
-  unplaced: "absent", alive: "present", dead: "absent" };
+const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping",
+  stopping: "bootstrapping", failed: "absent", unplaced: "absent", alive: "present", dead: "absent" };
 const WORDS = { waiting: "waiting for a box" };
 const WIDE = matchMedia("(min-width: 75rem)");
 const byNumber = new Intl.Collator("en", { numeric: true }).compare; // cam-9 before cam-10
