@@ -112,12 +112,16 @@ def forks(record: Record) -> Iterator[Table]:
 
 
 def robustness(record: Record) -> Iterator[Table]:
-    """Select the means of all trackers and starts, the AUC of each tracker by attribute, and the losses."""
+    """Select the means of all trackers and starts, and the AUC of each tracker by attribute."""
     yield from select(0)(record)
     columns = record["tables"][1]["columns"]
     yield from select(1, columns=[*columns[:6], *(column for column in columns[6:] if column.endswith(" AUC"))])(record)
-    if len(record["tables"]) > 2:  # the parts of which losses are counted were run
-        yield from select(2)(record)
+
+
+def losses(record: Record) -> Iterator[Table]:
+    """Select the means of all starts, and the losses."""
+    yield from select(0)(record)
+    yield from select(2)(record)
 
 
 def load(record: Record) -> Iterator[Table]:
@@ -273,10 +277,9 @@ _STARTS = """
     OPE is one run of each sequence; TRE starts it from several frames; jitter changes the first box by at most 2 %,
     and SRE, of which the first 120 frames are tracked, by 10 to 20 %. Each sequence counts once, with the mean over its
     runs; ± is the standard error over the sequences. F is that of the sequences in which the object is absent in some
-    frames. A sequence flips if its success differs by more than 0.25 between the jittered boxes. The check sequences
-    are not used to choose anything. The first record and the third are of the code before
-    [decision 65](../docs/decisions/parameters.md), the others are of the code after it. The tables of attributes
-    have the runs of OPE; [Evaluate on your own
+    frames. A sequence flips if its success differs by more than 0.25 between the jittered boxes. A run is lost if fewer
+    than half of the frames in its last quarter have an overlap above 0.5. The check sequences are not used to choose
+    anything. The table of attributes has the runs of OPE; [Evaluate on your own
     video](../docs/how-to/evaluate.md#6-see-what-is-difficult) defines them."""
 _FORKS = """
     Each sequence is followed from seven first boxes that differ by at most 2 %. It flips if the success of these runs
@@ -452,10 +455,9 @@ ROBUSTNESS = (
         "Starts and first boxes",
         _STARTS,
         (
-            Shown("robustness-before", robustness),
             Shown("robustness", robustness),
-            Shown("shifts-before", select(0)),
             Shown("shifts", select(0)),
+            Shown("losses", losses),
         ),
     ),
     Section("Forks", _FORKS, (Shown("forks", forks),)),

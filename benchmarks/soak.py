@@ -30,7 +30,6 @@ from catstream.errors import ServiceError
 from catstream.messages.heads import APPEARANCE, GROUPS
 from catstream.messages.kinds import End, Features, ObjectFeatures, TrainingRows
 from catstream.messages.names import UNNAMED
-from catstream.services.start import service_command
 from catstream.settings import Settings
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES
@@ -146,7 +145,7 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
     """Measure the compressor process: a row for each fifth of the messages."""
     rows = []
     with private_folder() as folder:
-        command = service_command("compressor")
+        command = [sys.executable, "-m", "catstream.services", "compressor"]
         options = ["--set", f"run.endpoint={folder}", "--state", folder / "state"]
         with (
             subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL) as process,

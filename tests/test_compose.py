@@ -18,7 +18,7 @@ from catstream.cli import group
 from catstream.client.subscription import subscribe
 from catstream.messages.kinds import Health
 from catstream.services.__main__ import main
-from catstream.services.start import environment, service_command
+from catstream.services.start import environment
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.web.app import pipeline_site
@@ -186,7 +186,11 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
             for there, place in here.items():
                 variables = {key: value.replace(there, place) for key, value in variables.items()}
                 line = [word.replace(there, place) for word in line]
-            stack.enter_context(ended(subprocess.Popen(service_command(*line), env=environment() | variables)))
+            stack.enter_context(
+                ended(
+                    subprocess.Popen([sys.executable, "-m", "catstream.services", *line], env=environment() | variables)
+                )
+            )
         with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=60) as tracks:
             assert next(tracks).box is not None
         first = int(tcp.rpartition(":")[2])
