@@ -240,7 +240,7 @@ class StartServer:
         return all(process.poll() is not None for process in self._processes)
 
     def start(self, request: StartRequest, log: int, watchdog: int) -> StartedProcess:
-        """StartRequest a process, and return without waiting for its start.
+        """Request a process, and return without waiting for its start.
 
         Parameters
         ----------

@@ -237,7 +237,7 @@ def test_a_stopped_server_is_a_store_error_and_the_next_write_succeeds(s3_server
 
 def test_a_server_that_never_answers_is_a_store_error_after_the_time_limit(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        monkeypatch.setattr(objects, "_SECONDS", 0.2)
+        monkeypatch.setattr(objects, "STORE_SECONDS", 0.2)
         monkeypatch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*silent.getsockname()))
         for name, value in SECRETS.items():
             monkeypatch.setenv(name, value)

@@ -306,19 +306,22 @@ def test_a_shared_server_that_was_killed_is_replaced_by_another_one(sharing, unt
 
 
 def test_a_shared_server_that_a_signal_has_stopped_is_killed_if_a_process_waits_for_its_start(
-    server, start, monkeypatch
+    server, start, monkeypatch, until
 ):
     server.close()
     with subprocess.Popen(["sleep", "600"]) as node:
-        monkeypatch.setattr(module, "_shared_with", node.pid)
-        shared = psutil.Process(start()[0].pid).parent()
-        assert shared.pid == start_server().pid != node.pid
-        shared.suspend()
-        process, _, _ = start()
-        assert process.pid == 0
-        assert process.poll() == -signal.SIGKILL
-        assert psutil.Process(start()[0].pid).ppid() == start_server().pid != shared.pid
-        node.kill()
+        try:
+            monkeypatch.setattr(module, "_shared_with", node.pid)
+            shared = psutil.Process(start()[0].pid).parent()
+            assert shared.pid == start_server().pid != node.pid
+            shared.suspend()
+            process, _, _ = start()
+            assert process.pid == 0
+            assert process.poll() == -signal.SIGKILL
+            until(lambda: has_ended(shared))
+            assert psutil.Process(start()[0].pid).ppid() == start_server().pid != shared.pid
+        finally:
+            node.kill()
 
 
 def test_a_shared_server_whose_process_has_ended_before_it_started_ends_too():
