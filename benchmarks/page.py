@@ -118,12 +118,6 @@ def robustness(record: Record) -> Iterator[Table]:
     yield from select(1, columns=[*columns[:6], *(column for column in columns[6:] if column.endswith(" AUC"))])(record)
 
 
-def losses(record: Record) -> Iterator[Table]:
-    """Select the means of all starts, and the losses."""
-    yield from select(0)(record)
-    yield from select(2)(record)
-
-
 def load(record: Record) -> Iterator[Table]:
     """Summarise a load test over all its streams."""
     streams, track, model = record["streams"], record["latency"]["track"], record["latency"]["model"]
@@ -344,9 +338,8 @@ _FOUND = """
     machine was busy: of the times, only the ratios count. See [Find objects in other
     videos](../docs/how-to/find.md)."""
 _INGREDIENTS = """
-    The loss of AUC without one component; the largest losses of each run. A loss of less than two standard errors
-    may be chance. The first run is on the tuning sequences, with three first boxes each; the second is on the first 20
-    sequences, before decision 49."""
+    The loss of AUC without one component, on the tuning sequences with three first boxes each; the largest losses. A
+    loss of less than two standard errors may be chance."""
 _PAPER = """
     `defaults` is catstream as it is, `cat25` and `cat10` are the tracker of the paper, implemented from its text. The
     columns and rows with the name of the paper are its printed figures, on other videos. Most of these sequences are
@@ -457,11 +450,11 @@ ROBUSTNESS = (
         (
             Shown("robustness", robustness),
             Shown("shifts", select(0)),
-            Shown("losses", losses),
+            Shown("losses", select(2)),
         ),
     ),
     Section("Forks", _FORKS, (Shown("forks", forks),)),
-    Section("Ablation", _INGREDIENTS, (Shown("ablation", strongest(9)), Shown("ablation-whole", strongest(1)))),
+    Section("Ablation", _INGREDIENTS, (Shown("ablation", strongest(9)))),
 )
 
 SCALE = (
