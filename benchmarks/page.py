@@ -454,7 +454,7 @@ ROBUSTNESS = (
         ),
     ),
     Section("Forks", _FORKS, (Shown("forks", forks),)),
-    Section("Ablation", _INGREDIENTS, (Shown("ablation", strongest(9)))),
+    Section("Ablation", _INGREDIENTS, (Shown("ablation", strongest(9)),)),
 )
 
 SCALE = (
