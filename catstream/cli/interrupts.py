@@ -1,4 +1,4 @@
-"""What Ctrl-C, SIGTERM and the loss of the terminal do: each ends a command, between two frames."""
+"""Ctrl-C, SIGTERM and the loss of the terminal end a command, between two frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all commands print alike: tables, the progress in one line, and errors."""
+"""The output that all commands share: tables, the progress in one line, and errors."""
 
 from __future__ import annotations
 

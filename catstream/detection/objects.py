@@ -146,14 +146,6 @@ class Detectors:
         if (detector := self.detectors.get(model.object)) is not None:
             detector.adopt(model)
 
-    def newest_versions(self, seq: int) -> dict[str, int]:
-        """Version of the newest model that arrived of each object that had begun by message `seq`, by name."""
-        return {
-            name: detector.newest_version
-            for name, detector in self.detectors.items()
-            if detector.state is not None and detector.state.first_frame < seq
-        }
-
 
 def prepare(settings: Settings) -> None:
     """Import what `Detectors.begin` needs, if that takes long."""

@@ -16,7 +16,7 @@ UPDATE_SECONDS = 0.1  #: between two updates
 KEEP_ALIVE_SECONDS = 5.0  #: without an update, after which a comment is sent, which detects closed connections
 RETRY_SECONDS = 1.0  #: after which a page whose connection broke connects again
 
-# What the page of a pipeline shows.
+# The page of a pipeline.
 POINT_SECONDS = 0.25  #: between two points of the charts
 RATE_SECONDS = 2.0  #: over which frames per second are counted
 APART_SECONDS = 1.0  #: in the video, between two surprising frames, because neighbouring frames are similar
