@@ -283,8 +283,8 @@ def kill_controller(trial: Trial, status: FleetStatus) -> None:
 
 
 def kill_head(trial: Trial, status: FleetStatus) -> None:
+    trial.fleet.disconnect()  # Ray ends a program that is connected to a raylet that dies
     trial.send(signal.SIGKILL, "node-1")
-    trial.fleet.close()  # Ray ends a program that stays connected to a dead head for a minute
     while trial.local.running:
         sleep(0.05)
     begin = monotonic()
