@@ -4,8 +4,8 @@ Nodes are killed or frozen with all of their processes, also two at once; the he
 it, and `up` continues it; the process of a stream and the controller are killed; nobody can reach the store, which is a
 real S3 server. Three streams are live, and three are short films in lockstep: whenever a film ends, its trees must be
 equal, bit for bit, to those of a run in one process without faults, and it begins anew. Recovery is the time until the
-next track of a stream, from the fault, and from the moment at which Ray has noticed it, both as the registry shows them,
-which it learns twice a second.
+next track of a stream, from the fault, and from the moment at which Ray has noticed it, both as the registry shows it:
+the controller looks twice a second.
 """
 
 from __future__ import annotations
