@@ -240,8 +240,8 @@ def _choice(found: Mapping[str, Record]) -> str:
     three, one = rates["catstream, three processes"][1], rates["catstream, one core"][1]
     (start,) = (row for table in found["startup"]["tables"] for row in table["rows"] if row[0] == "warm")
     return filled(f"""
-        On {found["speed"]["machine"]["cores"]} cores, three processes follow {three:.0f} frames/s, and a `Tracker`
-        {one:.0f}. The first track of `catstream track` is there {start[2]:.1f} s after the command.""")
+        On {found["speed"]["machine"]["cores"]} cores, three processes track {three:.0f} frames/s, and a `Tracker`
+        {one:.0f}. The first track of `catstream track` arrives {start[2]:.1f} s after the command.""")
 
 
 _HEAD = """
