@@ -40,7 +40,7 @@ with_endpoint = combined(
 )
 
 with_wait = click.option(
-    "--wait", default=30.0, metavar="SECONDS", help="How long to wait for a pipeline that has not started."
+    "--wait", default=30.0, show_default=True, metavar="SECONDS", help="Longest wait for the pipeline at --endpoint."
 )
 
 

@@ -46,9 +46,9 @@ class _InOrder(click.Group):
 def fleet() -> None:
     """Run many streams on one machine or on many, and change them while they run.
 
-    A fleet keeps each stream running on some node, continues it elsewhere from
-    its last state if the node dies, and is found by the names of its streams.
-    Ray places and watches the processes: pip install "catstream[fleet]".
+    A fleet keeps each stream running on some node, and continues it elsewhere
+    from its last state if the node dies. Clients find a stream by its name. Ray
+    places and watches the processes: pip install "catstream[fleet]".
 
     \b
     EXAMPLES
@@ -98,7 +98,8 @@ def up(running: Fleet, replace: bool, **options: Any) -> None:
     returns once the streams run. Otherwise it starts Ray on this machine, and
     ends it and the streams on Ctrl-C; with --detach they run on. The next `up`
     continues from the last states. A stream that runs and is unchanged is not
-    touched. If a stream can run on no node, nothing is changed.
+    touched. If a stream can run on no node, nothing is changed. The name of the
+    fleet is the one in FILE, or the name of FILE; --name replaces it.
 
     \b
     EXAMPLES
@@ -167,16 +168,14 @@ def _watch_until_its_end(console: Console, fleet: Fleet) -> None:
 
 
 @fleet.command()
-@click.option(
-    "--fleet", "place", default="", metavar="ADDRESS", help="Registry; not needed for a fleet of this machine."
-)
-@click.option("--keys", default="", metavar="DIR", help="Folder of your keys, for a fleet on other machines.")
+@click.option("--fleet", "place", default="", metavar="ADDRESS", help="HOST:PORT or name; not needed if only one runs.")
+@click.option("--keys", default="", metavar="DIR", help="Folder of keys, if the fleet requires keys.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def status(place: str, keys: str, as_json: bool) -> None:
     """Show all streams and nodes of a fleet.
 
-    Exit code 1 if something is wrong with a stream: each line below the table
-    says what, for example that it has failed or skips frames.
+    The exit code is 1 if something is wrong with a stream: each line below the
+    table says what, for example that it has failed or skips frames.
 
     \b
     EXAMPLES

@@ -65,9 +65,9 @@ def allow_(folder: Path, name: str, role: Role, output: Path | None, public: str
 
     \b
     ROLE
-      watch     subscribe to tracks, models, samples and health
-      control   watch, and send commands to a running pipeline
-      pipeline  everything: another machine that runs processes of this pipeline
+      watch     subscribe to all channels
+      control   the same, and send commands to a running pipeline
+      pipeline  everything: for another machine that runs processes of this pipeline
 
     \b
     EXAMPLES

@@ -25,7 +25,7 @@ __all__ = ["replay"]
 @click.argument("recording", type=PATH)
 @click.option("--endpoint", default="", metavar="PLACE", help="Endpoint for subscribers; a new one by default.")
 @click.option("--keys", default="", metavar="DIR", help="Folder of keys; subscribers then need keys.")
-@click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Factor to the speed of recording.")
+@click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Multiple of the recorded speed.")
 @click.option("--fast", is_flag=True, help="Play without pauses.")
 @click.option("--wait", is_flag=True, help="Start when the tracks have a subscriber.")
 @click.option("--learn", "learns", is_flag=True, help="Train from the recorded features again.")

@@ -41,7 +41,7 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
 
     \b
     Prints
-      state      following, paused, or waiting for a box
+      state      tracking, paused, or waiting for a box
       frames     number of processed frames, and frames per second
       learning   messages that the compressor has not received, or not stored
       model      version of the model that the detector uses
@@ -129,7 +129,7 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
 def _state(detector: dict[str, float]) -> str | None:
     if not detector:
         return None
-    return "waiting for a box" if detector.get("waiting") else "paused" if detector.get("paused") else "following"
+    return "waiting for a box" if detector.get("waiting") else "paused" if detector.get("paused") else "tracking"
 
 
 def _objects(reports: dict[str, list[Health]]) -> dict[str, dict[str, Any]]:

@@ -66,7 +66,7 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
     "--fleet",
     default="",
     metavar="ADDRESS",
-    help="HOST:PORT of the fleet, or the name of one of yours; not needed if only one runs.",
+    help="HOST:PORT or name of the fleet; not needed if only one runs.",
 )
 @click.option("--keys", default="", metavar="DIR", help="Folder of keys, if the fleet requires keys.")
 @_with_listen
