@@ -296,16 +296,16 @@ def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
         given = Endpoint.parse(text, keys)
         return replace(given, source=_source_at(given))
     endpoints = running()
-    if source:
-        found = [endpoint for endpoint in endpoints if _follows(endpoint, source)]
-        if not found:
-            raise ServiceError(f"no pipeline of yours follows {source!r}{_listed(endpoints)}")
-        if len(found) > 1:
-            raise ServiceError(f"{len(found)} pipelines follow {source!r}: say which (--endpoint){_listed(found)}")
-        return found[0]
     if not endpoints:
         list(_endpoints(_NOTE, strict=True))  # one whose keys cannot be read is running: say so
         raise ServiceError("no pipeline of yours is running: start one (catstream track), or give its --endpoint")
+    if source:
+        found = [endpoint for endpoint in endpoints if _follows(endpoint, source)]
+        if not found:
+            raise ServiceError(f"no pipeline of yours tracks {source!r}: give one of these{_listed(endpoints)}")
+        if len(found) > 1:
+            raise ServiceError(f"{len(found)} pipelines track {source!r}: say which (--endpoint){_listed(found)}")
+        return found[0]
     if len(endpoints) > 1:
         raise ServiceError(
             f"{len(endpoints)} pipelines are running: say which (--endpoint or --source){_listed(endpoints)}"

@@ -94,7 +94,7 @@ def test_a_pipeline_can_be_selected_by_its_source(pipeline, tmp_path, monkeypatc
         assert said("pause", "--source", name).exit_code == 0
     assert said("stop", "--source", "rtsp://10.0.0.7/street").exit_code == 0
     assert (walk, street) == (["pause"] * 3, ["stop"])
-    assert "no pipeline of yours follows 'other.mp4'" in str(said("stop", "--source", "other.mp4").exception)
+    assert "no pipeline of yours tracks 'other.mp4'" in str(said("stop", "--source", "other.mp4").exception)
     assert said("stop", "--source", "walk.mp4", "--endpoint", tmp_path).exit_code == 2
 
 

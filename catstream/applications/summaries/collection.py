@@ -61,9 +61,10 @@ class Collection:
                 else:
                     raise VideoError("not an image that can be read")
             except VideoError as error:
+                reason = f"{name}: {str(error).partition(': give')[0]}"  # a stream cannot be given here
                 if len(self.names) == 1:
-                    raise VideoError(f"{name}: {error}: give a folder of images, or a video file") from None
-                self.skipped.append(f"{name}: {error}")
+                    raise VideoError(f"{reason}: give a folder of images, or a video file") from None
+                self.skipped.append(reason)
 
     def _frames(self, path: Path, name: str) -> Iterator[tuple[Origin, np.ndarray]]:
         with open_source(path, skip_damaged=True) as source:

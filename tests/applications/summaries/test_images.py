@@ -71,7 +71,7 @@ def test_every_frame_of_a_video_is_an_image_and_a_file_that_is_no_video_is_named
     [
         ("", "hold neither images nor videos"),
         ("gone", "there is no file or folder"),
-        ("notes.txt", "give a folder of images, or a video file"),
+        ("notes.txt", r"is not a video that can be read \([^:]*\): give a folder of images, or a video file$"),
         ("torn.jpg", "torn.jpg: not an image that can be read: give a folder"),
     ],
 )
