@@ -80,4 +80,4 @@ class VideoSink:
         for frame in self._frames:
             if frame.number == number:
                 return frame
-        raise VideoError(f"the source has no frame {number}: is it what the pipeline follows?")
+        raise VideoError(f"the source has no frame {number}: give the one that the pipeline tracks")

@@ -68,9 +68,9 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
     if image.dtype.kind == "u" and image.itemsize == 2:
         return (image >> 8).astype(np.uint8)
     if image.dtype == bool:
-        raise FrameError(f"{_EXPECTED}, got bool: a mask is no picture, 255 * frame.astype(np.uint8) would be one")
+        raise FrameError(f"{_EXPECTED}, got bool: a mask is not a picture, 255 * frame.astype(np.uint8) is one")
     if image.dtype.kind not in "fui":
-        raise FrameError(f"{_EXPECTED}, got {image.dtype}, which is no brightness: check where the frame comes from")
+        raise FrameError(f"{_EXPECTED}, got {image.dtype}: check where the frame comes from")
     if image.dtype.kind != "f":
         raise FrameError(
             f"{_EXPECTED}, got {image.dtype}: frame.astype(np.uint8) if its values are brightness from 0 to 255"

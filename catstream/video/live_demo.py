@@ -56,7 +56,7 @@ class _Parameters:
         size = re.fullmatch(r"(\d{1,5})x(\d{1,5})", values.pop("size", f"{_SIZE[0]}x{_SIZE[1]}"))
         rate = re.fullmatch(r"\d{1,4}(\.\d{1,6})?", values.pop("rate", str(RATE)))
         if not re.fullmatch(r"\d{1,9}", seed) or values or size is None or rate is None:
-            raise VideoError(f"{text!r} is no live demo: expected demo:SEED, or demo:SEED?size=640x480&rate=25")
+            raise VideoError(f"{text!r} is not a live demo: expected demo:SEED, or demo:SEED?size=640x480&rate=25")
         width, height = int(size[1]), int(size[2])
         if not all(_SMALLEST <= side <= _LARGEST for side in (width, height)) or not 0 < float(rate[0]) <= _FASTEST:
             raise VideoError(

@@ -95,7 +95,7 @@ def test_the_first_box_is_that_of_an_object_which_is_whole_and_not_occluded(seed
 
 @pytest.mark.parametrize("text", ["demo:", "demo:x", "demo:-1", "demo:1?size=64", "demo:1?speed=2", "demo:1?rate=1e9"])
 def test_a_text_that_names_no_live_demo_is_an_error_that_shows_one(text):
-    with pytest.raises(VideoError, match=r"is no live demo: expected demo:SEED, or demo:SEED\?size=640x480&rate=25"):
+    with pytest.raises(VideoError, match=r"is not a live demo: expected demo:SEED, or demo:SEED\?size=640x480&rate=25"):
         open_source(text)
 
 

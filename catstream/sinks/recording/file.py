@@ -360,7 +360,7 @@ def _open(path: Path) -> BinaryIO:
         raise RecordingError(f"cannot read the recording {path}: {error.strerror}") from None
     if file.read(len(MAGIC)) != MAGIC:
         file.close()
-        raise RecordingError(f"{path} is no recording of this catstream: `catstream record` makes one")
+        raise RecordingError(f"{path} is not a recording of this version of catstream: `catstream record` makes one")
     return file
 
 
