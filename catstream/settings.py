@@ -293,8 +293,8 @@ class ExtentSettings(_Group):
     colour_slack: Annotated[
         float,
         _about(
-            "Drift of the colours' centroid, in windows, beyond its first place or the middle of the window, from "
-            "which the box is moved after it (1: never).",
+            "How far the centroid of the object's colours may lie beyond its first place and the middle of the window, "
+            "in windows; farther, the box is moved after it (1: never).",
             ge=0,
             le=1,
         ),
