@@ -15,6 +15,7 @@ from catstream.cli.output import complain, screen, table
 from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health
+from catstream.messages.names import counted
 from catstream.services.options import with_json
 from catstream.wire.channels import CHANNELS
 
@@ -161,7 +162,7 @@ def _format(summary: dict[str, Any]) -> str:
 
     history = (f"{name} {of['seconds_ago']:.1f} s ago" for name, of in summary["processes"].items())
     size = "-" if summary["bytes"] is None else f"{summary['bytes'] / 1e6:.1f}"
-    lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "there"
+    lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "available"
     source = f"source     {lost}, {shown('skipped')} frames skipped"
     if summary["reopened"] is not None:  # a demo is never lost
         source += f", reopened {shown('reopened')} times"
@@ -174,7 +175,7 @@ def _format(summary: dict[str, Any]) -> str:
             f"model      {shown('model_version')}",
             f"trees      {shown('leaves')} leaves, {shown('nodes')} nodes, level {shown('level')}, {size} MB",
             *([source] if summary["skipped"] is not None else []),  # None for a file
-            f"rejected   {sum(summary['rejected'].values())} messages",
+            f"rejected   {counted(sum(summary['rejected'].values()), 'message')}",
             f"reports    {', '.join(history)}",
             *(f"trouble    {name}: {trouble}" for name, trouble in summary["trouble"].items()),
         )
