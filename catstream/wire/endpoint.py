@@ -325,8 +325,8 @@ def is_deserted(endpoint: Endpoint) -> bool:
     hand is not known here, so the answer is wrong while its detector is restarted.
     """
     folder = endpoint.folder
-    is_left = folder is not None and folder.is_dir() and not endpoint.taken(CHANNELS["control"])
-    return is_left and _running_at(endpoint) is None
+    is_unknown = folder is not None and folder.is_dir() and _running_at(endpoint) is None
+    return is_unknown and not endpoint.taken(CHANNELS["control"])  # asked last: a detector counts it as a rejected peer
 
 
 def _source_at(endpoint: Endpoint) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import stat
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import Endpoint, Note, find, meeting_place, private_folder, running
+from catstream.wire.endpoint import Endpoint, Note, find, is_deserted, meeting_place, private_folder, running
 from catstream.wire.keys import Keys, create
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
@@ -156,6 +157,21 @@ def test_a_running_pipeline_is_found_until_it_ends(folder):
         assert endpoint in running()
         assert find(str(endpoint)) == endpoint
     assert endpoint not in running()
+
+
+def test_a_pipeline_of_this_user_is_known_to_run_without_a_connection_to_it(folder):
+    """Its detector would count a peer that says nothing as a rejected one."""
+    with (
+        private_folder() as private,
+        meeting_place(str(folder / "run"), private) as endpoint,
+        socket.socket(socket.AF_UNIX) as detector,
+    ):
+        detector.bind(endpoint.address(CHANNELS["control"]).removeprefix("ipc://"))
+        detector.listen()
+        detector.setblocking(False)
+        assert not is_deserted(endpoint)
+        with pytest.raises(BlockingIOError):
+            detector.accept()
 
 
 @pytest.mark.parametrize("place", ["", "tcp://127.0.0.1:5999"], ids=["a folder of its own", "tcp"])
