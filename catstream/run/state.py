@@ -148,7 +148,7 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
         raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
     try:
         if not storage.lock(handle, seconds):
-            raise ServiceError(f"a pipeline that runs keeps its state in {str(folder)!r}: stop it, or {_HELP}")
+            raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or {_HELP}")
         yield folder
     finally:
         os.close(handle)

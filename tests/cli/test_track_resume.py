@@ -125,7 +125,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
     for word, command in refusals.items():
         assert word in fail(*command)
     with Pipeline(resume=kept):
-        assert "a pipeline that runs keeps its state" in fail("track", "--resume", kept)
+        assert "a running pipeline uses the state" in fail("track", "--resume", kept)
 
 
 def test_settings_that_are_given_again_change_and_all_others_stay(video, said, succeed, monkeypatch, tmp_path):
