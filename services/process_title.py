@@ -7,10 +7,12 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["is_suspended", "process_fields", "set_process_title"]
+__all__ = ["is_ending", "is_suspended", "process_fields", "set_process_title"]
 
 _SET_NAME = 15  # PR_SET_NAME
-_STATE, _ARGUMENTS = 3, slice(48, 50)  # fields of /proc/PID/stat: the state; the addresses of the command's arguments
+#: Fields of /proc/PID/stat: the state, the flags, and the addresses of the command's arguments.
+_STATE, _FLAGS, _ARGUMENTS = 3, 9, slice(48, 50)
+_EXITING = 0x4  # PF_EXITING, one of the flags
 
 
 def process_fields(pid: int) -> list[str]:
@@ -30,6 +32,14 @@ def is_suspended(pid: int) -> bool:
     with suppress(OSError):  # it has ended
         return process_fields(pid)[_STATE] == "T"
     return False
+
+
+def is_ending(pid: int) -> bool:
+    """Whether a process has ended, or the kernel is ending it: its sockets may be open a little longer."""
+    try:
+        return bool(int(process_fields(pid)[_FLAGS]) & _EXITING)
+    except OSError:  # it has ended
+        return True
 
 
 def set_process_title(name: str) -> None:

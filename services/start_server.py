@@ -19,9 +19,11 @@ The kernel kills these processes when the server ends, and the server ends with 
 server is killed, its processes are restarted like any that died, by a new server. A server that a signal has stopped is
 killed as soon as one of its processes stands still or waits for its start.
 
+A process that nobody waits for any more is killed: its program has ended, or has closed the socket for the answers.
+
 Several programs can share a server, such as the streams of a fleet on one node (`share_start_server`). It ends with a
-process that outlives them; if one of the programs ends, the server kills the processes of that one. A program finds the
-server by the name of its socket, and both check that the other is of the same user.
+process that outlives them. A program finds the server by the name of its socket, and both check that the other is of
+the same user.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ from weakref import WeakSet
 from catstream.errors import ServiceError
 from catstream.numerics.threads import limit_process
 from catstream.services.process_log import ProcessLog
-from catstream.services.process_title import is_suspended, process_fields, set_process_title
+from catstream.services.process_title import is_ending, is_suspended, process_fields, set_process_title
 from catstream.services.start import environment, import_path, python_command
 from catstream.services.timing import KILLED_SECONDS, LOOK_SECONDS, SHARED_SECONDS, STOPPED_SECONDS
 
@@ -197,8 +199,8 @@ class StartServer:
     Attributes
     ----------
     pid : its process id
-    log : what it logged: that kernels are compiled, that it cannot fork; a shared one logs to the standard error of the
-        program that has started it
+    log : what it logged: that kernels are compiled, that it cannot fork; a shared one logs to the program that has
+        started it
 
     Raises
     ------
@@ -207,18 +209,18 @@ class StartServer:
     """
 
     def __init__(self, shared_with: int | None = None) -> None:
-        self._program, self._imports, self.shared_with = os.getpid(), _imports(), shared_with
+        self._program, self._imports = os.getpid(), _imports()
         self._processes: WeakSet[StartedProcess] = WeakSet()
         self._process: subprocess.Popen[bytes] | None = None
-        if shared_with is not None:
-            self._requests = _connected(shared_with)
-            self.pid = _other_end(self._requests)[0]
         self.log = ProcessLog("start server", cast(BinaryIO, tempfile.TemporaryFile()))  # noqa: SIM115
         if shared_with is None:
             self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
                 self._process = _start(theirs, self._program, self.log.fileno())
             self.pid = self._process.pid
+        else:
+            self._requests = _connected(shared_with, self.log.fileno())
+            self.pid = _other_end(self._requests)[0]
 
     @property
     def is_owned(self) -> bool:
@@ -228,11 +230,7 @@ class StartServer:
     @property
     def is_usable(self) -> bool:
         """Whether it runs, and has imported what this program would import now."""
-        if self._process is not None:
-            runs = self._process.poll() is None
-        else:
-            runs = not select.select([self._requests], [], [], 0)[0]  # it sends nothing: that would be its end
-        return self.is_owned and self._imports == _imports() and runs
+        return self.is_owned and self._imports == _imports() and not is_ending(self.pid)
 
     @property
     def is_idle(self) -> bool:
@@ -279,15 +277,13 @@ def _imports() -> tuple[list[str], dict[str, str]]:
     return import_path(), {name: value for name, value in environment().items() if name.startswith(_READ_BY_IMPORTS)}
 
 
-def _start(requests: socket.socket, program: int, log: int | None, first: str = "") -> subprocess.Popen[bytes]:
+def _start(requests: socket.socket, program: int, log: int, first: str = "") -> subprocess.Popen[bytes]:
     """Start the process of a server, which runs the statement `first` before anything else."""
     main = f"{first}from catstream.services.start_server import main; main({requests.fileno()}, {program})"
     return _run(python_command(main), requests.fileno(), log, "/", environment())
 
 
-def _run(
-    command: list[str], passed: int, log: int | None, folder: str, variables: dict[str, str]
-) -> subprocess.Popen[bytes]:
+def _run(command: list[str], passed: int, log: int, folder: str, variables: dict[str, str]) -> subprocess.Popen[bytes]:
     """Run a command that inherits one descriptor and the log."""
     return subprocess.Popen(
         command,
@@ -301,7 +297,7 @@ def _run(
     )
 
 
-def _connected(program: int) -> socket.socket:
+def _connected(program: int, log: int) -> socket.socket:
     """A connection to the server that ends with a program and has imported what this process would; it may be new."""
     os.close(os.pidfd_open(program))  # it lives, and the server will see its end
     began = process_fields(program)[_BEGAN]
@@ -312,8 +308,11 @@ def _connected(program: int) -> socket.socket:
         requests = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             requests.connect(name)
-            if _other_end(requests)[1] != os.getuid():
+            server, user = _other_end(requests)
+            if user != os.getuid():
                 raise PermissionError(errno.EPERM, "the start server is of another user")
+            if is_ending(server):  # it was killed just now, and its socket is open a little longer
+                raise ConnectionRefusedError(errno.ECONNREFUSED, "the start server is ending")
             return requests
         except ConnectionRefusedError:  # nobody listens, or not yet
             requests.close()
@@ -329,7 +328,7 @@ def _connected(program: int) -> socket.socket:
                 time.sleep(LOOK_SECONDS)
                 continue
             # The server is no child of this process, whose end may be that of all its children.
-            _start(listener, program, None, "import os; os.fork() and os._exit(0); ").wait()
+            _start(listener, program, log, "import os; os.fork() and os._exit(0); ").wait()
 
 
 def _other_end(channel: socket.socket) -> tuple[int, int]:
@@ -398,12 +397,11 @@ class _Server:
     """
 
     def __init__(self, requests: socket.socket, program: int) -> None:
-        self._requests = requests
-        self._is_shared = bool(requests.getsockname())
-        if self._is_shared:
-            requests.listen()  # by the server itself: so a program that connects knows its process id
-        self._clients = {} if self._is_shared else {requests.fileno(): requests}
-        self._processes: dict[int, tuple[socket.socket, int]] = {}  # answers and client of those that run, by id
+        self._listener = requests if requests.getsockname() else None
+        if self._listener is not None:
+            self._listener.listen()  # by the server itself: so a program that connects knows its process id
+        self._clients = {} if self._listener is not None else {requests.fileno(): requests}
+        self._processes: dict[int, socket.socket] = {}  # sockets for the answers about those that run, by their ids
         self._ended, ended = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(ended)
         signal.signal(signal.SIGCHLD, lambda *_: None)  # wakes `poll` up
@@ -415,7 +413,7 @@ class _Server:
             self._descriptors.append(program_end := os.pidfd_open(program))
             self._poll.register(program_end, select.POLLIN)
         except OSError:  # a kernel before 5.3: then only the end of the socket shows the end of the program
-            if self._is_shared:  # it has ended meanwhile
+            if self._listener is not None:  # it has ended meanwhile
                 raise SystemExit(0) from None
         self._logged = False
 
@@ -432,67 +430,62 @@ class _Server:
             if self._ended in ready:
                 os.read(self._ended, 4096)
                 self._reap()
+            elif unwanted := next((pid for pid, each in self._processes.items() if each.fileno() in ready), None):
+                os.kill(unwanted, signal.SIGKILL)
+                self._poll.unregister(self._processes[unwanted])
             elif client := next((self._clients[each] for each in ready if each in self._clients), None):
                 try:
                     data, descriptors, _, _ = socket.recv_fds(client, 16, 4)
                 except ConnectionError:
                     data, descriptors = b"", []
-                if not data and self._is_shared:
-                    self._lose(client)
-                    continue
-                if not data:
+                if not data and self._listener is None:
                     return None
+                if not data:
+                    self._poll.unregister(client)
+                    del self._clients[client.fileno()]
+                    client.close()
+                    continue
                 file, log, watchdog, answers = descriptors
                 with os.fdopen(file, "rb") as content:
                     request = StartRequest(**json.loads(content.read()))
                 if request.name in to_import:
                     to_import.remove(request.name)
                     _import(request.name)
-                if self._start(request, log, watchdog, answers, client):
+                if self._start(request, log, watchdog, socket.socket(fileno=answers)):
                     return request, watchdog
-            elif self._is_shared and self._requests.fileno() in ready:
-                self._accept()
+            elif self._listener is not None and self._listener.fileno() in ready:
+                self._accept(self._listener)
             elif ready:
                 return None
             else:
                 _import(to_import.pop(0))
 
-    def _accept(self) -> None:
+    def _accept(self, listener: socket.socket) -> None:
         """Accept a program that shares this server."""
-        client, _ = self._requests.accept()
+        client, _ = listener.accept()
         if _other_end(client)[1] != os.getuid():
             client.close()
             return
         self._clients[client.fileno()] = client
         self._poll.register(client, select.POLLIN)
 
-    def _lose(self, client: socket.socket) -> None:
-        """Kill the processes of a program that has ended."""
-        for pid, (_, owner) in self._processes.items():
-            if owner == client.fileno():
-                os.kill(pid, signal.SIGKILL)
-        self._poll.unregister(client)
-        del self._clients[client.fileno()]
-        client.close()
-
-    def _start(self, request: StartRequest, log: int, watchdog: int, answers: int, client: socket.socket) -> bool:
+    def _start(self, request: StartRequest, log: int, watchdog: int, answers: socket.socket) -> bool:
         """Start a process, and send its process id; returns whether this is the new process."""
-        channel = socket.socket(fileno=answers)
         try:
             pid = os.fork() if self._can_fork() else _spawn(request, log, watchdog)
         except (OSError, ServiceError) as error:
             os.write(log, f"{request.name}: cannot start a process: {error}\n".encode())
-            _answer(channel, 0)
-            _answer(channel, 1)
-            channel.close()
+            _answer(answers, 0)
+            _answer(answers, 1)
+            answers.close()
         else:
             if not pid:
-                channel.close()
+                answers.close()
                 self._leave(log, request)
                 return True
-            self._processes[pid] = channel, client.fileno()
-            if not _answer(channel, pid):  # the program no longer wants it
-                os.kill(pid, signal.SIGKILL)
+            self._processes[pid] = answers
+            self._poll.register(answers, 0)  # only its end is reported: nobody waits for the process any more
+            _answer(answers, pid)
         os.close(log)
         os.close(watchdog)
         return False
@@ -509,9 +502,9 @@ class _Server:
         """Keep nothing of the server in the process that it has forked."""
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        answers = (channel for channel, _ in self._processes.values())
-        for channel in (self._requests, *self._clients.values(), *answers):
-            channel.close()
+        for each in (self._listener, *self._clients.values(), *self._processes.values()):
+            if each is not None:
+                each.close()
         for descriptor in self._descriptors:
             os.close(descriptor)
         os.setsid()
@@ -532,16 +525,16 @@ class _Server:
             pid, status = os.waitpid(-1, os.WNOHANG)
             if not pid:
                 return
-            channel, _ = self._processes.pop(pid)
-            with channel:
-                _answer(channel, os.waitstatus_to_exitcode(status))
+            with self._processes.pop(pid) as answers:
+                with suppress(KeyError):  # it was killed, because nobody waits for it
+                    self._poll.unregister(answers)
+                _answer(answers, os.waitstatus_to_exitcode(status))
 
 
-def _answer(channel: socket.socket, number: int) -> bool:
-    """Send an answer; returns False if nobody receives it."""
+def _answer(answers: socket.socket, number: int) -> None:
+    """Send an answer, if somebody waits for it."""
     with suppress(OSError):
-        return bool(channel.send(_ANSWER.pack(number)))
-    return False
+        answers.send(_ANSWER.pack(number))
 
 
 def _import(name: str) -> None:

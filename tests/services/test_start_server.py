@@ -152,6 +152,33 @@ def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_
     assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
 
 
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_start_right_after_a_server_was_killed_does_not_reach_that_server(server, start, monkeypatch, shared):
+    """Its sockets are open until the kernel has closed them all."""
+    with subprocess.Popen(["sleep", "600"]) as node:
+        try:
+            if shared:
+                server.close()
+                monkeypatch.setattr(module, "_shared_with", node.pid)
+            for _ in range(3):
+                process, killed = start()[0], start_server().pid
+                assert process.pid
+                os.kill(killed, signal.SIGKILL)
+                assert process.wait(60)
+                assert start()[0].pid
+                assert start_server().pid != killed
+        finally:
+            node.kill()
+
+
+def test_a_process_that_nobody_waits_for_any_more_is_killed(start, until):
+    process, watchdog, _ = start()
+    until(lambda: watchdog.turns > 0)
+    running = psutil.Process(process.pid)
+    process._answers.shutdown(socket.SHUT_RDWR)
+    until(lambda: not running.is_running())
+
+
 def test_a_process_has_the_environment_and_the_folder_that_its_program_has_now(
     server, start, monkeypatch, tmp_path, until
 ):
@@ -340,7 +367,7 @@ def test_a_start_server_of_another_user_is_not_used(monkeypatch):
     with subprocess.Popen(["sleep", "600"]) as node:
         monkeypatch.setattr(module, "_shared_with", node.pid)
         with pytest.raises(PermissionError, match="of another user"):
-            module._connected(node.pid)
+            module._connected(node.pid, subprocess.DEVNULL)
         own = start_server()
         assert psutil.Process(own.pid).ppid() == os.getpid()
         own.close()
