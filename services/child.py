@@ -29,7 +29,7 @@ class Child:
     Attributes
     ----------
     due : moment at which the process is to be started again, if it does not run
-    seen : moment at which it was last seen running
+    apart : seconds since it has ended, in which the detector has neither ended nor delivered anything
     killed : whether it hung and was killed
     restarts : moments of its restarts
     log : what it logged
@@ -37,7 +37,7 @@ class Child:
 
     def __init__(self, name: str, job: Path, folder: Path) -> None:
         self.name, self._job = name, job
-        self.due = self.seen = 0.0
+        self.due = self.apart = 0.0
         self.killed = False
         self.restarts: deque[float] = deque()
         self.silent = 0.0  #: seconds since the count of turns last changed
@@ -52,12 +52,11 @@ class Child:
         self._end_process()
         self._watchdog.close()
         self._watchdog, self.killed = Watchdog(), False
-        self._turns = self.silent = self._stopped = 0.0
-        self.seen = time.monotonic()
+        self._turns = self.silent = self._stopped = self.apart = 0.0
         request = StartRequest.here(self.name, self._job, restarted=bool(self.restarts))
         try:
             self._process = start_server().start(request, self.log.fileno(), self._watchdog.handle)
-        except OSError:  # the server has ended just now
+        except ConnectionError:  # the server has ended just now
             self._process = start_server().start(request, self.log.fileno(), self._watchdog.handle)
 
     def schedule(self, due: float) -> None:
@@ -86,11 +85,10 @@ class Child:
         return self.code in (0, SOURCE_FAILED)
 
     def count_turns(self, seconds: float) -> None:
-        """Note whether the loop of the process has turned since the last call, which was `seconds` ago."""
+        """Note whether the loop of the process has turned since the last call, for which so many seconds count."""
         if (turns := self._watchdog.turns) != self._turns:
             self._turns, self.silent, self._stopped = turns, 0.0, 0.0
             return
-        seconds = min(seconds, STEP_SECONDS)
         self.silent += seconds
         self._stopped = self._stopped + seconds if self.silent > STEP_SECONDS and self._is_suspended else 0.0
 

@@ -100,7 +100,7 @@ class RunReader:
             tracks = self._receive()
             if (now := monotonic()) - self._checked > TURN_SECONDS:
                 self._checked = now
-                self._check_processes()
+                self._check_processes(delivers=tracks is not None)
             if tracks is not None:
                 return tracks.tracks
             if now >= deadline:
@@ -157,14 +157,14 @@ class RunReader:
         while self._incoming.receive(0) is not None:
             self._incoming.acknowledge(Position(self._incoming.window.taken))
 
-    def _check_processes(self) -> None:
+    def _check_processes(self, *, delivers: bool) -> None:
         """Receive the health, restart processes that died, and log warnings for the user."""
         self.receive_health()
-        self.supervisor.check_children()
+        self.supervisor.check_children(delivers=delivers)
         for line in [*start_server_lines(), *(self.supervisor.new_lines("detector") if self._live else ())]:
             _log.warning("%s", line)  # kernels are compiled; a live source was lost or is available again
-        if self.supervisor.finished and self.end is None:
-            raise ServiceError("a signal ended the detector before its first frame: start the run again, or resume it")
+        if self.supervisor.finished and self.end is None and not delivers and not self._incoming.pending():
+            raise ServiceError("a signal ended the detector, which has sent no end: start the run again, or resume it")
 
     def _exit(self) -> Generator[Wait, None, None]:
         """Wait until the detector has exited; it does so once its last message is acknowledged."""

@@ -23,6 +23,7 @@ from catstream.services.timing import (
     RESTART_SECONDS,
     RESTARTS,
     SHUTDOWN_SECONDS,
+    STEP_SECONDS,
     TURN_SECONDS,
 )
 from catstream.video.frames import without_password
@@ -51,9 +52,14 @@ class Supervisor:
         since = time.monotonic() if job.since is None else job.since
         file = replace(job, state=job.state or folder, since=since, run=token_hex(8)).save(folder)
         self._checked = time.monotonic()
-        self._children = {name: Child(name, file, folder) for name in NAMES}
-        for child in self._children.values():
-            child.start()
+        self._children: dict[str, Child] = {}
+        try:
+            for name in NAMES:
+                self._children[name] = Child(name, file, folder)
+                self._children[name].start()
+        except BaseException:
+            self.stop()
+            raise
 
     @property
     def pids(self) -> dict[str, int]:
@@ -80,8 +86,12 @@ class Supervisor:
         """The lines that a child has logged since the last call."""
         return self._children[name].log.new_lines()
 
-    def check_children(self) -> None:
+    def check_children(self, *, delivers: bool = False) -> None:
         """Restart the children that died, and kill those that hang; both are logged.
+
+        Parameters
+        ----------
+        delivers : whether a message of the detector has just been received: it ends once its owner has all of them
 
         Raises
         ------
@@ -91,17 +101,18 @@ class Supervisor:
         if self.finished:
             return
         before, self._checked = self._checked, time.monotonic()
+        seconds = min(self._checked - before, STEP_SECONDS)
         for child in self._children.values():
             now = time.monotonic()
             if child.waits:
                 if now >= child.due:
                     child.start()
             elif child.code is None:
-                child.seen = now
-                self._check_hanging(child, self._checked - before)
+                self._check_hanging(child, seconds)
             elif child.finished:
                 # Only this child was asked to end, or the detector died after it sent its end and has to repeat it.
-                if now - child.seen > APART_SECONDS:
+                child.apart = 0.0 if delivers else child.apart + seconds
+                if child.apart > APART_SECONDS:
                     child.start()
             else:
                 self._restart(child, child.code, now)

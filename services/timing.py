@@ -18,7 +18,7 @@ SAVED_MODEL_SECONDS = 1.0  #: shortest time between two files of one object, for
 STUCK_SECONDS = 2.5  #: without a turn, after which a loop with short turns counts as stuck
 LONGEST_STUCK_SECONDS = 60.0  #: the most of these that follows from slow turns
 STOPPED_SECONDS = 2.0  #: after which a process that SIGSTOP has stopped counts as stuck
-STEP_SECONDS = 0.5  #: the most that counts between two looks at a watchdog, as the parent may have been suspended
+STEP_SECONDS = 0.5  #: the most that counts between two looks at a process, as the parent may have been suspended
 
 # What a turn may take that the process has announced to its watchdog.
 START_SECONDS = 120.0  #: for imports and compiling kernels
@@ -40,7 +40,7 @@ FEATURES_END_SECONDS = 10.0  #: limit for the end of the features to be stored, 
 RESULTS_END_SECONDS = 0.5  #: the same for the end of the tracks to be received by the owner of the run
 SENDER_SECONDS = 5.0  #: limit for the detector to send the end, once the compressor was asked to end
 TRACKS_END_SECONDS = 5.0  #: limit for the end of the tracks to be recorded, once the detector has disconnected
-APART_SECONDS = 3.0  #: the most between the end of another process and that of the detector, if both end well
+APART_SECONDS = 3.0  #: the most between the end of another process and that of the detector that delivers nothing more
 SHUTDOWN_SECONDS = 12.0  #: limit for all processes to end before they are killed
 EXIT_SECONDS = 12.0  #: limit for the detector to exit after the end of the stream was received
 KILLED_SECONDS = 5.0  #: limit for the end of a process that was killed
@@ -57,14 +57,7 @@ ORDER: tuple[tuple[float, float, str], ...] = (
     (RESTART_SECONDS * 2**RESTARTS, RECENT_SECONDS, "a process that dies after each start is restarted for ever"),
     (LOOK_SECONDS, SHARED_SECONDS, "a program does not wait for the shared server that another one is starting"),
     (KILLED_SECONDS, LOCK_SECONDS, "a compressor fails because the one before it has just been killed"),
-    (
-        RESULTS_END_SECONDS,
-        APART_SECONDS,
-        "a compressor is restarted while the detector waits for the owner",
-    ),
-    (
-        FEATURES_END_SECONDS + RESULTS_END_SECONDS,
-        SHUTDOWN_SECONDS,
-        "a detector is killed while its end is stored",
-    ),
+    (STEP_SECONDS, APART_SECONDS, "a process is started again because its parent was suspended once"),
+    (RESULTS_END_SECONDS, APART_SECONDS, "a compressor is restarted while the detector waits for the owner"),
+    (FEATURES_END_SECONDS + RESULTS_END_SECONDS, SHUTDOWN_SECONDS, "a detector is killed while its end is stored"),
 )

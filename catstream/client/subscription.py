@@ -16,7 +16,6 @@ continues if the stream moves to another node.
 from __future__ import annotations
 
 from collections.abc import Generator
-from pathlib import Path
 from time import monotonic
 from typing import Any, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
 
@@ -39,7 +38,7 @@ _SUBSCRIBABLE = {
 }
 
 #: ZeroMQ connects again only while the subscriber reads: the end is lost if it did not read since a restart.
-_GONE = "its folder was removed, and this subscriber did not receive its end"
+_GONE = "its sockets were removed, and this subscriber did not receive its end"
 
 #: A message of any channel that can be subscribed to.
 AnyMessage = Track | Model | Health | Sample | Features | Preview
@@ -101,7 +100,7 @@ class Subscription(Generic[Message]):
     ----------
     end : End or None
         The last message of the pipeline, or the reason why the stream of a fleet has ended; None before that. A
-        pipeline whose own folder is gone has ended too.
+        pipeline whose sockets are gone from its folder has ended too.
     endpoint : str
         Endpoint of the pipeline, or the address of the stream.
     keys : str
@@ -142,14 +141,13 @@ class Subscription(Generic[Message]):
         self._close_time = float("inf")  # until which messages may still arrive after the end
         self._rejected = 0  # by the connections before this one
         self._connection: _Connection | None = None
-        self._folder: Path | None = None  # of the pipeline, if there was one already
+        self._had_sockets = False  # whether those of the pipeline were in its folder
         self._stream = follow(endpoint, keys)
         if self._stream is not None:
             self._follow()
         else:
             place = locate(endpoint, keys)
             self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
-            self._folder = place.folder if place.folder is not None and place.folder.exists() else None
             early = self._channel.keeps == "every"
             self._connection = _Connection(self._channel, place, self._only, self._about, early)
 
@@ -223,8 +221,8 @@ class Subscription(Generic[Message]):
                 if self._channel.keeps == "every" and self._about is None and self.end.seq:
                     self._gaps.take(self.end.seq)
                 return None
-            if self.end is None and self._folder is not None and not self._folder.exists():
-                self._pipeline_ended(End(0, _GONE), monotonic() + DRAIN_SECONDS)
+            if self.end is None and self._stream is None:
+                self._look_for_sockets()
             yield Wait(self._sockets(), self._wait_seconds(deadline))
         return message
 
@@ -279,6 +277,12 @@ class Subscription(Generic[Message]):
         elif (moved or self._connection is None) and (place := self._stream.place.endpoint) is not None:
             self._disconnect()
             self._connection = _Connection(self._channel, place, self._only, self._about)
+
+    def _look_for_sockets(self) -> None:
+        """End if the pipeline has removed its sockets from its folder, which it does once it has ended."""
+        had, self._had_sockets = self._had_sockets, self.place is not None and self.place.has_sockets()
+        if had and not self._had_sockets:
+            self._pipeline_ended(End(0, _GONE), monotonic() + DRAIN_SECONDS)
 
     def _disconnect(self) -> None:
         if self._connection is not None:

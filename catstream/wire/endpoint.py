@@ -94,10 +94,8 @@ class Endpoint:
         if "://" in text:
             raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT, got {text!r}")
         folder = Path(text)
-        for channel in CHANNELS.values():
-            for sender in channel.senders:
-                if len(os.fsencode(folder / _file(channel, sender))) > _MAX_PATH_BYTES:
-                    raise ServiceError(f"the name of the folder {text!r} is too long for a Unix socket: give another")
+        if any(len(os.fsencode(file)) > _MAX_PATH_BYTES for file in _files(folder)):
+            raise ServiceError(f"the name of the folder {text!r} is too long for a Unix socket: give another")
         return cls(folder=folder, keys=known)
 
     @classmethod
@@ -148,6 +146,10 @@ class Endpoint:
         with socket.socket(socket.AF_UNIX) as probe:
             return probe.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
 
+    def has_sockets(self) -> bool:
+        """Whether it is a folder with a socket of a pipeline, which removes all of them at its end."""
+        return self.folder is not None and any(file.exists() for file in _files(self.folder))
+
 
 #: Processes that listen, the name of `hosts`.
 _LISTENERS = {
@@ -181,6 +183,11 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 def _file(channel: Channel[object], sender: str) -> str:
     return channel.name if len(channel.senders) == 1 else f"{channel.name}-{sender}"
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """The socket of each channel in a folder, that of the registry too."""
+    return (folder / _file(channel, each) for channel in (*CHANNELS.values(), REGISTRY) for each in channel.senders)
 
 
 @contextlib.contextmanager
@@ -241,9 +248,8 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
             with _noted(endpoint, default, source, fleet):
                 yield endpoint
         finally:
-            for channel in (*CHANNELS.values(), REGISTRY):
-                for sender in channel.senders:
-                    (folder / _file(channel, sender)).unlink(missing_ok=True)
+            for file in _files(folder):
+                file.unlink(missing_ok=True)
     finally:
         os.close(handle)
 

@@ -13,6 +13,9 @@ import pytest
 from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
+from catstream.services import supervisor
+from catstream.services.child import Child
+from catstream.services.start_server import NAMES
 from catstream.services.timing import TRACKS_END_SECONDS
 from catstream.settings import Settings
 from catstream.sinks.recording.file import Recording
@@ -49,9 +52,24 @@ def test_a_recording_has_its_end_although_the_owner_is_slower_than_every_limit(v
     assert recording.files == [tmp_path / "run.mcap"]
 
 
-def test_a_subscriber_that_reads_nothing_from_a_restart_to_the_end_does_not_wait_for_ever(video):
+@pytest.mark.parametrize("record", [False, True])
+@pytest.mark.parametrize("pace", ["a pause", "slow frames"])
+def test_no_process_is_started_again_at_the_end_because_the_owner_is_slow(video, tmp_path, monkeypatch, record, pace):
+    """The compressor and the trainer end as soon as all is stored, the detector once its owner has all tracks."""
+    start, started = Child.start, []
+    monkeypatch.setattr(Child, "start", lambda child: started.append(child.name) or start(child))
+    monkeypatch.setattr(supervisor, "APART_SECONDS", 0.6)
+    with Pipeline(video[0], video[1][0], record=tmp_path / "run.mcap" if record else None) as pipeline:
+        for track in pipeline:
+            time.sleep(0.1 if pace == "slow frames" else 5 * (track.frame == 0))
+    assert tuple(started) == NAMES
+
+
+@pytest.mark.parametrize("stays", [False, True], ids=["private folder", "folder of the user"])
+def test_a_subscriber_that_reads_nothing_from_a_restart_to_the_end_does_not_wait_for_ever(video, folder, stays):
     """Its subscription is sent to the restarted detector only once it reads."""
-    with Pipeline(video[0], video[1][0]) as pipeline, subscribe(pipeline.endpoint, "tracks") as tracks:
+    settings = Settings(run={"endpoint": str(folder) if stays else ""})
+    with Pipeline(video[0], video[1][0], settings) as pipeline, subscribe(pipeline.endpoint, "tracks") as tracks:
         list(islice(pipeline, 3))
         first = next(tracks)
         os.kill(pipeline.pids["detector"], signal.SIGKILL)
